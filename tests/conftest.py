@@ -1,0 +1,75 @@
+"""Fixtures shared by all tests: the variant, and small scenes built from dictionaries."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+VARIANT = "llvm_ad_rgb"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def variant():
+    """Every test starts in the same variant, with the plugins registered."""
+    mi.set_variant(VARIANT)
+    import integrators  # noqa: F401
+
+    return VARIANT
+
+
+@pytest.fixture
+def restore_variant():
+    """For tests that change the variant."""
+    yield
+    mi.set_variant(VARIANT)
+
+
+def sensor(size=32, spp=4, **more):
+    """A camera on the z axis that looks at the origin from a distance of 4; box filter."""
+    return {
+        "type": "perspective",
+        "fov": 40,
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
+        "sampler": {"type": "independent", "sample_count": spp},
+        **more,
+    }
+
+
+def wall(translate, rotate_axis, angle, scale=1.0, reflectance=(0.5, 0.5, 0.5), bsdf=None):
+    """A square wall of half-size ``scale``."""
+    transform = mi.ScalarTransform4f().translate(translate).rotate(rotate_axis, angle).scale(scale)
+    material = bsdf or {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(reflectance)}}
+    return {"type": "rectangle", "to_world": transform, "bsdf": material}
+
+
+def closed_box(emitters, size=32, spp=4, scale=1.0, **more):
+    """A closed diffuse box of side 2 (times ``scale``), seen from inside; ``emitters``: dictionary of plugins."""
+    camera = sensor(size, spp, fov=95)
+    camera["to_world"] = mi.ScalarTransform4f().look_at([0, 0, 0.95 * scale], [0, 0, 0], [0, 1, 0])
+    camera |= {"near_clip": 1e-3 * scale, "far_clip": 1e3 * scale}
+    s = scale
+    return {
+        "type": "scene",
+        "sensor": camera,
+        "floor": wall([0, -s, 0], [1, 0, 0], -90, s),
+        "ceiling": wall([0, s, 0], [1, 0, 0], 90, s),
+        "left": wall([-s, 0, 0], [0, 1, 0], 90, s, (0.6, 0.1, 0.1)),
+        "right": wall([s, 0, 0], [0, 1, 0], -90, s, (0.1, 0.5, 0.1)),
+        "back": wall([0, 0, -s], [0, 1, 0], 0, s),
+        "front": wall([0, 0, s], [0, 1, 0], 180, s),
+        **emitters,
+        **more,
+    }
+
+
+def area_light(scale=1.0, radiance=(4.0, 4.0, 4.0)):
+    """A small square lamp below the ceiling of the closed box."""
+    transform = mi.ScalarTransform4f().translate([0, 0.9 * scale, 0]).rotate([1, 0, 0], 90).scale(0.3 * scale)
+    radiance = {"type": "rgb", "value": list(radiance)}
+    return {"type": "rectangle", "to_world": transform, "emitter": {"type": "area", "radiance": radiance}}
+
+
+def render(scene, integrator, spp=4, seed=0, **more):
+    """Render to NumPy, (height, width, channels) float64."""
+    plugin = mi.load_dict({"type": integrator, **more}) if isinstance(integrator, str) else integrator
+    return np.array(mi.render(scene, integrator=plugin, spp=spp, seed=seed), dtype=np.float64)

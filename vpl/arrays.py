@@ -1,0 +1,53 @@
+"""Moving arrays between NumPy and Dr.Jit, in the only two ways that are safe.
+
+On the LLVM backend ``mi.Float(ndarray)`` aliases NumPy's memory, and kernels read it in whole packets, past the end
+when the length is no multiple of the packet width.  Memory that Dr.Jit allocated is padded, so every upload goes
+through :func:`upload`.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+_NUMPY_DTYPES = {dr.VarType.Float32: np.float32, dr.VarType.UInt32: np.uint32, dr.VarType.Int32: np.int32}
+
+
+def upload(array_type, values):
+    """Copy a NumPy array into memory that Dr.Jit owns.
+
+    Parameters: ``array_type``, a flat Dr.Jit type such as ``mi.Float``; ``values``, any array, which is flattened in C
+    order and converted to the type's precision.  Returns an evaluated array of ``values.size`` entries.
+    """
+    plain_type = dr.detached_t(array_type)
+    flat = np.ascontiguousarray(values, dtype=_NUMPY_DTYPES[dr.type_v(plain_type)]).reshape(-1)
+    if flat.size == 0:
+        return array_type()
+    if dr.backend_v(plain_type) != dr.JitBackend.LLVM:
+        result = plain_type(flat)
+        dr.eval(result)
+        return array_type(result)
+    result = dr.empty(plain_type, flat.size)
+    dr.eval(result)
+    dr.sync_thread()
+    result.numpy()[:] = flat
+    return array_type(result)
+
+
+def download(values):
+    """Copy a Dr.Jit array to NumPy: ``(n,)`` for flat types, ``(n, k)`` for vectors of k entries."""
+    dr.eval(values)
+    dr.sync_thread()
+    array = np.array(values.numpy(), copy=True)
+    return array.T.copy() if array.ndim == 2 else array
+
+
+def spectrum_to_rgb(spectrum) -> mi.Color3f:
+    """Widen an unpolarized spectrum of one or three channels to three (mono: the same value three times)."""
+    return mi.Color3f(spectrum[0]) if dr.size_v(mi.Spectrum) == 1 else mi.Color3f(spectrum)
+
+
+def rgb_to_spectrum(rgb):
+    """The inverse of :func:`spectrum_to_rgb`."""
+    return mi.Spectrum(rgb[0]) if dr.size_v(mi.Spectrum) == 1 else mi.Spectrum(rgb)

@@ -1,0 +1,165 @@
+"""Rays that leave the emitters: the first edge of every light path.
+
+Emitters are taken group by group (points and spots, areas, directional, and each of the others by itself); every group
+gets paths in proportion to its power, and inside a group an emitter is chosen by power with stratified numbers.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .arrays import download, rgb_to_spectrum, upload
+from .lights import Emitters, VirtualLights, finite_or_zero
+from .shading import spot_falloff
+
+
+class Choice:
+    """Choose a row with probability proportional to a weight; exact zero weights are never chosen.
+
+    ``weight`` (n,) float64, not negative, with a positive sum.  ``pmf`` (n,) float64 sums to one.
+    """
+
+    def __init__(self, weight: np.ndarray):
+        total = weight.sum(dtype=np.float64)
+        if not (np.isfinite(total) and total > 0):
+            raise ValueError(f"weights must be finite with a positive sum, got a sum of {total}")
+        self.pmf = weight / total
+        cumulative = np.cumsum(self.pmf)
+        last = np.flatnonzero(self.pmf)[-1]
+        cumulative[last:] = np.inf  # rounding must not let u = 1 - eps fall past the last row with weight
+        self._cumulative = upload(mi.Float, cumulative)
+        self._pmf = upload(mi.Float, self.pmf)
+        self.count = len(weight)
+
+    def row(self, sample):
+        """Row for a uniform number in [0, 1): the first whose cumulative probability exceeds it."""
+        return dr.binary_search(0, self.count, lambda i: dr.gather(mi.Float, self._cumulative, i) <= sample)
+
+    def probability(self, row, active=True):
+        """Probability of a row (0 where not active)."""
+        return dr.gather(mi.Float, self._pmf, row, active)
+
+
+def solid_angle_radiance(emitter, center, count: int = 4096) -> float:
+    """Integral of an emitter's radiance over all directions as seen from ``center``; mean over channels."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, count)
+    reference = dr.zeros(mi.Interaction3f, count)
+    reference.p = mi.Point3f(center)
+    _, weight = emitter.sample_direction(reference, sampler.next_2d())
+    return float(download(finite_or_zero(weight)).mean(dtype=np.float64))
+
+
+def other_power(emitter, bounding_sphere) -> float:
+    """Power of an emitter that only its own routines know, estimated from rays that it emits."""
+    if emitter.is_environment():
+        return solid_angle_radiance(emitter, bounding_sphere.center) * np.pi * bounding_sphere.radius**2
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 4096)
+    _, weight = emitter.sample_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
+    return float(download(finite_or_zero(weight)).mean(dtype=np.float64))
+
+
+def bounding_sphere(scene):
+    """Sphere around the scene's box: the same one that clamping distances are measured by."""
+    return scene.bbox().bounding_sphere()
+
+
+class OmniEmission:
+    """Rays from point lights and spots."""
+
+    def __init__(self, points: VirtualLights, spots: VirtualLights):
+        lights = VirtualLights.concatenate([points, spots])
+        solid_angle = 2 * np.pi * (1 - np.cos(lights.cone[:, 0].astype(np.float64)))
+        self.power = lights.intensity.mean(1, dtype=np.float64) * solid_angle
+        self._choice = Choice(self.power)
+        self._position = upload(mi.Float, lights.position)
+        self._axis = upload(mi.Float, lights.direction)
+        self._intensity = upload(mi.Float, lights.intensity)
+        self._cone = upload(mi.Float, lights.cone)
+
+    def sample(self, stratified, position_sample, direction_sample):
+        """Ray and weight (radiant intensity over the density of the ray)."""
+        row = self._choice.row(stratified)
+        cone = dr.gather(mi.Vector2f, self._cone, row)
+        cosine = 1 - direction_sample.x * (1 - dr.cos(cone.x))
+        sine, angle = dr.safe_sqrt(1 - dr.square(cosine)), dr.two_pi * direction_sample.y
+        local = mi.Vector3f(sine * dr.cos(angle), sine * dr.sin(angle), cosine)
+        frame = mi.Frame3f(dr.gather(mi.Normal3f, self._axis, row))
+        density = self._choice.probability(row) / (dr.two_pi * (1 - dr.cos(cone.x)))
+        intensity = dr.gather(mi.Color3f, self._intensity, row) * spot_falloff(cosine, cone)
+        ray = mi.Ray3f(dr.gather(mi.Point3f, self._position, row), frame.to_world(local))
+        return ray, rgb_to_spectrum(intensity) / density
+
+
+class AreaEmission:
+    """Rays from area emitters: a point by area, a direction by the cosine."""
+
+    def __init__(self, area):
+        self._area = area
+        self.power = area.power
+        self._choice = Choice(self.power)
+
+    def sample(self, stratified, position_sample, direction_sample):
+        """Ray and weight (power per path)."""
+        row = self._choice.row(stratified)
+        ps = self._area.shape(row).sample_position(0, position_sample)
+        direction = mi.Frame3f(ps.n).to_world(mi.warp.square_to_cosine_hemisphere(direction_sample))
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(row))
+        si.p, si.n, si.uv, si.wi = ps.p, ps.n, ps.uv, mi.Vector3f(0, 0, 1)
+        radiance = self._area.emitted(row, si)
+        return si.spawn_ray(direction), radiance * dr.pi / (ps.pdf * self._choice.probability(row))
+
+
+class DirectionalEmission:
+    """Parallel rays through the scene's bounding sphere."""
+
+    def __init__(self, suns: VirtualLights, sphere):
+        self._sphere = sphere
+        self.power = suns.intensity.mean(1, dtype=np.float64) * np.pi * float(sphere.radius) ** 2
+        self._choice = Choice(self.power)
+        self._direction = upload(mi.Float, suns.direction)
+        self._irradiance = upload(mi.Float, suns.intensity)
+
+    def sample(self, stratified, position_sample, direction_sample):
+        """Ray and weight (power per path)."""
+        row = self._choice.row(stratified)
+        direction = dr.gather(mi.Vector3f, self._direction, row)
+        disk = mi.warp.square_to_uniform_disk_concentric(position_sample)
+        radius = mi.Float(self._sphere.radius)
+        offset = mi.Frame3f(direction).to_world(mi.Vector3f(disk.x, disk.y, -1))
+        irradiance = rgb_to_spectrum(dr.gather(mi.Color3f, self._irradiance, row))
+        weight = irradiance * (dr.pi * dr.square(radius)) / self._choice.probability(row)
+        return mi.Ray3f(mi.Point3f(self._sphere.center) + offset * radius, direction), weight
+
+
+class OtherEmission:
+    """Rays from one emitter, by its own sampling routine."""
+
+    def __init__(self, emitter, sphere):
+        self._emitter = emitter
+        self.power = np.array([other_power(emitter, sphere)])
+
+    def sample(self, stratified, position_sample, direction_sample):
+        """Ray and weight (power per path)."""
+        ray, weight = self._emitter.sample_ray(0.0, stratified, position_sample, direction_sample)
+        return mi.Ray3f(ray.o, ray.d), weight
+
+
+def emission_groups(scene, emitters: Emitters) -> list:
+    """The groups of emitters that radiate at all."""
+    sphere = bounding_sphere(scene)
+    groups = []
+    if emitters.points.count + emitters.spots.count:
+        groups.append(OmniEmission(emitters.points, emitters.spots))
+    if emitters.area.power.sum() > 0:
+        groups.append(AreaEmission(emitters.area))
+    if emitters.directional.count:
+        groups.append(DirectionalEmission(emitters.directional, sphere))
+    single = [emitter for _, emitter in emitters.others]
+    if emitters.environment is not None:
+        single.append(emitters.environment)
+    groups += [OtherEmission(emitter, sphere) for emitter in single]
+    return [group for group in groups if group.power.sum() > 0]

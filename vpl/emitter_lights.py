@@ -1,0 +1,57 @@
+"""Emitters that have an extent, turned into virtual lights as the many-light papers do (``direct="vpl"``)."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .arrays import download, spectrum_to_rgb
+from .emission import Choice, bounding_sphere
+from .lights import Emitters, VirtualLights, finite_or_zero
+
+
+def _stratified(sampler, count: int):
+    """One uniform number in each of ``count`` equal parts of [0, 1)."""
+    sample = (mi.Float(dr.arange(mi.UInt32, count)) + sampler.next_1d()) / dr.opaque(mi.Float, count)
+    return dr.minimum(sample, dr.one_minus_epsilon(mi.Float))
+
+
+def area_lights(emitters: Emitters, count: int, seed: int) -> VirtualLights:
+    """``count`` points on area emitters as oriented lights, chosen by power and then by area."""
+    area = emitters.area
+    choice = Choice(area.power)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, count)
+    row = choice.row(_stratified(sampler, count))
+    ps = area.shape(row).sample_position(0, sampler.next_2d())
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.p, si.n, si.uv, si.wi = ps.p, ps.n, ps.uv, mi.Vector3f(0, 0, 1)
+    intensity = spectrum_to_rgb(area.emitted(row, si)) / (ps.pdf * choice.probability(row) * count)
+    return VirtualLights.of("oriented", download(ps.p), download(ps.n), download(intensity))
+
+
+def environment_lights(scene, emitters: Emitters, count: int, seed: int) -> VirtualLights:
+    """``count`` directions towards the environment as directional lights, by its own importance sampling."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, count)
+    reference = dr.zeros(mi.Interaction3f, count)
+    reference.p = mi.Point3f(bounding_sphere(scene).center)
+    ds, weight = emitters.environment.sample_direction(reference, sampler.next_2d())
+    irradiance = dr.zeros(mi.Color3f, count) + spectrum_to_rgb(finite_or_zero(mi.unpolarized_spectrum(weight))) / count
+    return VirtualLights.of("directional", None, download(-ds.d), download(irradiance))
+
+
+def lights_of_emitters(scene, emitters: Emitters, count: int, seed: int) -> list[VirtualLights]:
+    """Area emitters and the environment as ``count`` virtual lights each.
+
+    Raises a ValueError naming the first emitter that has no such form.
+    """
+    for name, _ in emitters.others:
+        raise ValueError(f'emitter of type "{name}" cannot become virtual lights: use direct="nee" with this scene')
+    lights = []
+    if np.any(emitters.area.power > 0):
+        lights.append(area_lights(emitters, count, seed))
+    if emitters.environment is not None:
+        lights.append(environment_lights(scene, emitters, count, seed))
+    return lights

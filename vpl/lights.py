@@ -1,0 +1,255 @@
+"""Reading the scene's emitters into flat arrays, once, without ever dispatching a kernel over emitter objects.
+
+A virtual call on emitter pointers makes Dr.Jit trace every emitter instance of the process: a minute of compilation
+for some thousands of lights.  Here points, spots, directional and area emitters become rows of arrays; the few that
+cannot (environment maps, projectors, textured spots) are called directly, one by one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .arrays import download, rgb_to_spectrum, upload
+
+# Kinds of virtual light. "point" and "spot" radiate from a point that the scene really has and are never clamped;
+# "oriented" lights stand for a piece of surface; "directional" ones lie at infinity.
+KINDS = ("point", "spot", "oriented", "directional")
+
+
+@dataclass
+class VirtualLights:
+    """Lights of one kind, as NumPy arrays of n rows.
+
+    ``position`` (n, 3) float32, world units (None for directional lights);
+    ``direction`` (n, 3) float32: surface normal, spot axis, or the direction in which the light travels;
+    ``intensity`` (n, 3) float32: radiant intensity of points and spots, exitant flux / pi of oriented lights (their
+    radiance times area), irradiance of directional lights;
+    ``depth`` (n,) uint32: edges of the light path that ends in the light, 0 for lights that stand for an emitter;
+    ``cone`` (n, 2) float32: cut-off angle and beam angle of spots in radians, (pi, pi) elsewhere.
+    """
+
+    kind: str
+    position: np.ndarray | None
+    direction: np.ndarray
+    intensity: np.ndarray
+    depth: np.ndarray
+    cone: np.ndarray
+
+    @property
+    def count(self) -> int:
+        return len(self.intensity)
+
+    @classmethod
+    def of(cls, kind, position, direction, intensity, depth=0, cone=None) -> VirtualLights:
+        """Convert any sequences to the documented shapes and types."""
+        intensity = np.asarray(intensity, np.float32).reshape(-1, 3)
+        count = len(intensity)
+        return cls(
+            kind,
+            None if position is None else np.asarray(position, np.float32).reshape(-1, 3),
+            np.asarray(direction, np.float32).reshape(-1, 3),
+            intensity,
+            np.broadcast_to(np.asarray(depth, np.uint32), (count,)).copy(),
+            np.full((count, 2), np.pi, np.float32) if cone is None else np.asarray(cone, np.float32).reshape(-1, 2),
+        )
+
+    def select(self, keep) -> VirtualLights:
+        """The rows picked by a mask or an index array."""
+        position = None if self.position is None else self.position[keep]
+        return VirtualLights(
+            self.kind, position, self.direction[keep], self.intensity[keep], self.depth[keep], self.cone[keep]
+        )
+
+    @staticmethod
+    def concatenate(parts: list[VirtualLights]) -> VirtualLights:
+        """Join lights of the same kind."""
+        columns = ("position", "direction", "intensity", "depth", "cone")
+        joined = [
+            None if getattr(parts[0], c) is None else np.concatenate([getattr(p, c) for p in parts]) for c in columns
+        ]
+        return VirtualLights(parts[0].kind, *joined)
+
+    def without_bad(self) -> tuple[VirtualLights, int]:
+        """Drop lights that carry nothing, and those with a value that is not finite; returns how many of the latter."""
+        finite = np.isfinite(self.intensity).all(1) & np.isfinite(self.direction).all(1) & (self.intensity >= 0).all(1)
+        if self.position is not None:
+            finite &= np.isfinite(self.position).all(1)
+        keep = finite & (self.intensity.sum(1, dtype=np.float64) > 0)
+        return (self if keep.all() else self.select(keep)), int((~finite).sum())
+
+
+@dataclass
+class AreaEmitters:
+    """Area emitters as rows: the shape's registry index, radiance (RGB), area; textured ones keep their object."""
+
+    shape_index: np.ndarray
+    radiance: np.ndarray
+    area: np.ndarray
+    textured: list = field(default_factory=list)
+
+    @property
+    def count(self) -> int:
+        return len(self.area)
+
+    @property
+    def power(self) -> np.ndarray:
+        """Emitted power up to a constant shared by all kinds: (n,) float64."""
+        return np.pi * self.area.astype(np.float64) * self.radiance.mean(1, dtype=np.float64)
+
+    def __post_init__(self):
+        size = int(self.shape_index.max(initial=0)) + 1
+        rows = np.zeros(size, np.uint32)
+        rows[self.shape_index] = np.arange(1, self.count + 1)
+        self._row_of_shape = upload(mi.UInt32, rows)
+        self._radiance = upload(mi.Float, self.radiance)
+        self._shapes = upload(mi.UInt32, self.shape_index)
+
+    def row(self, si, active=True):
+        """Row of the emitter that a hit lies on, plus one; 0 where it lies on none."""
+        index = dr.reinterpret_array(mi.UInt32, si.shape)
+        return dr.gather(mi.UInt32, self._row_of_shape, index, active & (index < dr.width(self._row_of_shape)))
+
+    def shape(self, row, active=True):
+        """The shape of a row (counted from 0) as a pointer array."""
+        return dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self._shapes, row, active))
+
+    def emitted(self, row, si, active=True):
+        """Radiance emitted at ``si`` towards ``si.wi`` by the emitter of ``row`` (counted from 0)."""
+        active = active & (mi.Frame3f.cos_theta(si.wi) > 0)
+        radiance = rgb_to_spectrum(dr.gather(mi.Color3f, self._radiance, row, active)) & active
+        for textured_row, emitter in self.textured:
+            here = active & (row == textured_row)
+            radiance = dr.select(here, emitter.eval(si, here), radiance)
+        return finite_or_zero(radiance)
+
+
+@dataclass
+class Emitters:
+    """All emitters of a scene, sorted by what can be done with them.
+
+    ``points``, ``spots``, ``directional``: virtual lights; ``area``: rows; ``environment``: the environment emitter or
+    None; ``others``: (name, emitter) of emitters that only their own sampling routines know.
+    """
+
+    points: VirtualLights
+    spots: VirtualLights
+    directional: VirtualLights
+    area: AreaEmitters
+    environment: object | None
+    others: list
+    dropped: int
+
+    @property
+    def count(self) -> int:
+        return (
+            self.points.count + self.spots.count + self.directional.count + self.area.count + len(self.others)
+            + (self.environment is not None)
+        )  # fmt: skip
+
+
+def finite_or_zero(spectrum):
+    """Replace values that are infinite or not a number, so that one bad texel cannot spoil an image."""
+    return dr.select(dr.isfinite(spectrum), spectrum, 0)
+
+
+def _constant_rgb(parameters, name):
+    """A spectrum parameter as RGB if it is the same everywhere, else None."""
+    value = parameters.get(f"{name}.value") if f"{name}.value" in parameters else None
+    if value is None:
+        return None
+    flat = np.array(value, np.float32).reshape(-1)
+    return np.repeat(flat, 3) if flat.size == 1 else flat[:3]
+
+
+def _scalar(value) -> float:
+    return float(np.array(value, np.float64).reshape(-1)[0])
+
+
+def _frame_of(to_world):
+    """Origin and z axis of an emitter's frame, as float64 vectors."""
+    matrix = np.array(to_world.matrix, np.float64).reshape(4, 4)
+    axis = matrix[:3, 2]
+    return matrix[:3, 3], axis / np.linalg.norm(axis)
+
+
+def _textured_radiance(emitter, shape) -> np.ndarray:
+    """Mean radiance of a textured area emitter, from a regular grid of surface samples."""
+    side = 64
+    u, v = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
+    sample = mi.Point2f(upload(mi.Float, u), upload(mi.Float, v))
+    position = shape.sample_position(0, sample)
+    si = dr.zeros(mi.SurfaceInteraction3f, side * side)
+    si.p, si.n, si.uv, si.wi = position.p, position.n, position.uv, mi.Vector3f(0, 0, 1)
+    radiance = download(finite_or_zero(emitter.eval(si))).reshape(side * side, -1)
+    return np.broadcast_to(radiance.mean(0, dtype=np.float64), (3,)).astype(np.float32)
+
+
+def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
+    """Area emitters, the number of rows with values that are not finite, and emitters that only look like areas."""
+    indices, radiances, textured, unusual = [], [], [], []
+    registry = download(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())) if scene.shapes() else []
+    glowing = [(i, shape) for i, shape in zip(registry, scene.shapes(), strict=True) if shape.is_emitter()]
+    # Mitsuba loads shapes in parallel, in an order that changes from run to run; the same seed must give the same image
+    glowing.sort(key=lambda row: (row[1].id(), *map(float, (*row[1].bbox().min, *row[1].bbox().max))))
+    for index, shape in glowing:
+        emitter = shape.emitter()
+        if emitter.class_name() != "AreaLight":
+            unusual.append((emitter.class_name(), emitter))
+            continue
+        radiance = _constant_rgb(mi.traverse(emitter), "radiance")
+        if radiance is None:
+            textured.append((len(indices), emitter))
+            radiance = _textured_radiance(emitter, shape)
+        indices.append(index)
+        radiances.append(radiance)
+    radiance = np.array(radiances, np.float32).reshape(-1, 3)
+    bad = ~np.isfinite(radiance).all(1)
+    radiance[bad] = 0
+    shape_index = np.array(indices, np.uint32)
+    area = np.zeros(len(indices), np.float32)
+    if len(indices):
+        pointers = dr.reinterpret_array(mi.ShapePtr, upload(mi.UInt32, shape_index))
+        area = download(pointers.surface_area())
+    return AreaEmitters(shape_index, radiance, area, textured), int(bad.sum()), unusual
+
+
+def read_emitters(scene) -> Emitters:
+    """Read all emitters of ``scene``.  Lights with values that are not finite are dropped, counted and reported."""
+    points, spots, suns, others = [], [], [], []
+    area, dropped, others_on_shapes = _read_areas(scene)
+    for emitter in scene.emitters():
+        name = emitter.class_name()
+        if emitter.is_environment() or name == "AreaLight":
+            continue
+        parameters = mi.traverse(emitter)
+        intensity = _constant_rgb(parameters, "irradiance" if name == "DirectionalEmitter" else "intensity")
+        if name == "PointLight" and intensity is not None:
+            points.append((np.array(parameters["position"], np.float64).reshape(3), (0, 0, 1), intensity))
+        elif name == "SpotLight" and intensity is not None and "texture.value" in parameters:
+            origin, axis = _frame_of(parameters["to_world"])
+            cutoff, beam = _scalar(parameters["cutoff_angle"]), _scalar(parameters["beam_width"])
+            spots.append((origin, axis, intensity, np.deg2rad([cutoff, beam])))
+        elif name == "DirectionalEmitter" and intensity is not None:
+            suns.append((_frame_of(parameters["to_world"])[1], intensity))
+        elif not any(emitter is known for _, known in others_on_shapes):
+            others.append((name, emitter))
+
+    def columns(rows, index):
+        rows.sort(key=lambda row: [float(x) for column in row for x in column])  # see _read_areas
+        return [row[index] for row in rows]
+
+    omni = VirtualLights.of("point", columns(points, 0), columns(points, 1), columns(points, 2))
+    spot = VirtualLights.of("spot", columns(spots, 0), columns(spots, 1), columns(spots, 2), 0, columns(spots, 3))
+    sun = VirtualLights.of("directional", None, columns(suns, 0), columns(suns, 1))
+    kept = []
+    for lights in (omni, spot, sun):
+        lights, bad = lights.without_bad()
+        dropped += bad
+        kept.append(lights)
+    if dropped:
+        mi.Log(mi.LogLevel.Warn, f"{dropped} emitter(s) with values that are not finite were dropped.")
+    return Emitters(*kept, area, scene.environment(), others + others_on_shapes, dropped)
