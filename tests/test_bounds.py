@@ -1,0 +1,119 @@
+"""A bound is an upper bound: for every light of a node, at every point, in double precision."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from vpl.arrays import download, upload
+from vpl.bounds import DeviceTree, contribution_bound
+from vpl.light_set import light_tree
+from vpl.light_tree import CONE_COS, build_light_tree
+from vpl.lights import VirtualLights
+from vpl.proxies import MaterialProxy
+
+POINTS = 400
+
+
+def unit(rng, count):
+    vectors = rng.normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def proxy_of(albedo, peak, exponent, axis):
+    """A proxy made of arrays: (n, 3) albedo / pi, (n, 3) peak, (n,) exponent, (n, 3) axis."""
+    color = [mi.Color3f(*(upload(mi.Float, values[:, k]) for k in range(3))) for values in (albedo, peak)]
+    direction = mi.Vector3f(*(upload(mi.Float, axis[:, k]) for k in range(3)))
+    no = dr.full(mi.Bool, False, len(albedo))
+    return MaterialProxy(*color, upload(mi.Float, exponent), direction, no, no, True, False)
+
+
+def exact(kind, position, normal, albedo, peak, exponent, axis, lights, clamp):
+    """Mean contribution of every light at every point, (points, lights) float64, for a BSDF equal to its proxy."""
+    if kind == "directional":
+        to_light = np.broadcast_to(-lights.direction.astype(np.float64), (len(position), lights.count, 3))
+        factor = np.ones(to_light.shape[:2])
+    else:
+        offset = lights.position[None].astype(np.float64) - position[:, None]
+        distance = np.linalg.norm(offset, axis=2)
+        to_light = offset / np.maximum(distance, 1e-300)[..., None]
+        emission = -np.sum(to_light * lights.direction[None], axis=2)
+        factor = 1 / np.maximum(distance, clamp if kind == "oriented" else 0) ** 2
+        if kind == "oriented":
+            factor = factor * np.maximum(emission, 0)
+        elif kind == "spot":
+            factor = factor * (emission >= np.cos(lights.cone[None, :, 0].astype(np.float64)))
+    cosine = np.maximum(np.sum(to_light * normal[:, None], axis=2), 0)
+    mirror = np.maximum(np.sum(to_light * axis[:, None], axis=2), 0)
+    lobe = (mirror ** exponent[:, None]) * (cosine > 0)
+    material = albedo[:, None] * cosine[..., None] + peak[:, None] * lobe[..., None]
+    return factor * np.mean(material * lights.intensity[None], axis=2)
+
+
+def scene_of(kind, rng, spread, count=64):
+    position = rng.uniform(-1, 1, (count, 3)) * spread
+    direction = unit(rng, count) * 0.3 + [0, 0, 1]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    cone = np.stack([rng.uniform(0.2, 0.9, count), np.full(count, 0.1)], axis=1)
+    where = None if kind == "directional" else position
+    return VirtualLights.of(kind, where, direction, rng.uniform(0, 1, (count, 3)) ** 4 + 1e-6, 0, cone)
+
+
+@pytest.mark.parametrize("kind", ["point", "spot", "oriented", "directional"])
+@pytest.mark.parametrize("spread", [(1, 1, 1), (1, 1, 0), (1, 0, 0), (0, 0, 0), (1e-3, 1, 1e-3)])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_light_exceeds_the_bound_of_its_ancestors(kind, spread, seed):
+    rng = np.random.default_rng(seed)
+    lights = scene_of(kind, rng, np.array(spread))
+    reference = build_light_tree(
+        lights.position, None if kind == "point" else lights.direction, lights.intensity, np.random.default_rng(5)
+    )
+    device = light_tree(lights, 5)
+    # Points in and around the lights' box, some exactly on a light's plane
+    position = rng.uniform(-2, 2, (POINTS, 3)) * np.maximum(spread, 0.3)
+    position[::7, 2] = 0
+    position = position.astype(np.float32).astype(np.float64)
+    normal, axis = unit(rng, POINTS), unit(rng, POINTS)
+    albedo, peak = rng.uniform(0, 0.3, (POINTS, 3)), rng.uniform(0, 5, (POINTS, 3)) * (rng.random((POINTS, 1)) < 0.5)
+    exponent = 10 ** rng.uniform(0, 3, POINTS)
+    clamp = 0.05 if kind == "oriented" else 0.0
+    truth = exact(kind, position, normal, albedo, peak, exponent, axis, lights, clamp)
+
+    def vectors(values):
+        return mi.Vector3f(*(upload(mi.Float, values[:, k]) for k in range(3)))
+
+    proxy = proxy_of(albedo, peak, exponent, axis)
+    leaves = np.concatenate([[0], np.cumsum(reference.escape == np.arange(len(reference.records)) + 1)])
+    worst = 0.0
+    for node in range(len(reference.records)):
+        below = reference.leaf_order[leaves[node] : leaves[reference.escape[node]]]
+        fetched = device.gather(dr.full(mi.UInt32, node, POINTS))
+        bound = contribution_bound(kind, mi.Point3f(vectors(position)), vectors(normal), proxy, fetched, clamp)
+        bound = download(bound).astype(np.float64)
+        assert not np.isnan(bound).any() and (bound >= 0).all()
+        # The cluster's whole intensity at the place of its best light, and the sum of its lights
+        total = truth[:, below].sum(1)
+        worst = max(worst, float(np.max(total / np.maximum(bound, 1e-300) * (total > 1e-12 * truth.max()))))
+    # A cosine rounded by 2^-21 to a power of up to 1000 is off by 5e-4
+    assert worst <= 1 + 1e-3
+    assert worst > 0.5, "bounds that are never nearly reached would not find an error in this test"
+
+
+def test_a_bound_that_is_too_small_would_be_found():
+    """The harness above notices a cone that is too narrow."""
+    rng = np.random.default_rng(0)
+    lights = scene_of("oriented", rng, np.ones(3))
+    tree = build_light_tree(lights.position, lights.direction, lights.intensity, np.random.default_rng(5))
+    tree.records[:, CONE_COS] = 1.0
+    narrow = DeviceTree("oriented", tree).gather(dr.zeros(mi.UInt32, POINTS))
+    position, normal = rng.uniform(-3, 3, (POINTS, 3)), unit(rng, POINTS)
+    zeros = np.zeros((POINTS, 3))
+    albedo = np.full((POINTS, 3), 0.3)
+    truth = exact("oriented", position, normal, albedo, zeros, np.ones(POINTS), normal, lights, 0.05).sum(1)
+    proxy = proxy_of(albedo, zeros, np.ones(POINTS), normal)
+
+    def vectors(values):
+        return mi.Vector3f(*(upload(mi.Float, values[:, k]) for k in range(3)))
+
+    bound = contribution_bound("oriented", mi.Point3f(vectors(position)), vectors(normal), proxy, narrow, 0.05)
+    assert np.any(truth > download(bound) * 1.001)

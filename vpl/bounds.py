@@ -1,0 +1,126 @@
+"""Upper bounds on what a cluster of lights can contribute to a gather point [LC section 4.1; IC section 4].
+
+bound = material × geometry × intensity, each factor at its largest over the cluster, and visibility taken as 1.
+
+Departure from the papers: the largest cosine between an axis and the vectors to a box is bounded without rotating the
+box.  With c the vector to the box centre and e its half extents, the largest component along a unit axis n is exactly
+z = n·c + |n|·e, the distance from the axis is at least ρ = |c - (n·c) n| - |e|, so that the cosine is at most
+z / sqrt(z² + ρ²) and at most z / d with d the distance to the box.  It is as tight for small boxes and costs half.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .arrays import upload
+from .light_tree import LightTree
+from .proxies import MaterialProxy
+
+
+@dataclass
+class Node:
+    """Nodes of a light tree in a kernel: one per lane."""
+
+    box_min: object
+    box_max: object
+    axis: object
+    cosine: object
+    intensity: object
+    escape: object
+    representative: object
+
+
+class DeviceTree:
+    """A light tree's packed records on the device."""
+
+    def __init__(self, kind: str, tree: LightTree):
+        self.kind = kind
+        self.count = len(tree.records)
+        self._records = upload(mi.Float, tree.records)
+
+    def gather(self, index, active=True) -> Node:
+        """Fetch one node per lane; see :mod:`vpl.light_tree` for the layout of the record."""
+        a, b, c, d = (dr.gather(mi.Vector4f, self._records, index * 4 + k, active) for k in range(4))
+        return Node(
+            mi.Point3f(a.x, a.y, a.z),
+            mi.Point3f(a.w, b.x, b.y),
+            mi.Vector3f(b.z, b.w, c.x),
+            c.y,
+            mi.Color3f(c.w, d.x, d.y),
+            dr.reinterpret_array(mi.UInt32, d.z),
+            dr.reinterpret_array(mi.UInt32, d.w),
+        )
+
+    def summed_intensity(self, index, active=True):
+        """Scalar intensity of a node: the mean over channels of the sum over its lights."""
+        return dr.gather(mi.Float, self._records, index * 16 + 10, active)
+
+    def representative(self, index, active=True):
+        """Index of a node's representative light."""
+        return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._records, index * 16 + 15, active))
+
+
+def cosine_to_box(axis, center, extent, distance2, radius):
+    """Largest cosine between a unit axis and any vector to a point of a box; exact sign, see the module's note.
+
+    ``center``, ``extent``: vector to the box's centre and half extents; ``distance2``: squared distance to the box;
+    ``radius``: norm of ``extent``.  Negative when the whole box lies behind the axis.
+    """
+    along = dr.dot(axis, center)
+    z = along + dr.dot(dr.abs(axis), extent)
+    away = dr.sqrt(dr.maximum(dr.squared_norm(center) - dr.square(along), 0))
+    rho = dr.select(z >= 0, dr.maximum(away - radius, 0), away + radius)
+    length2 = dr.square(z) + dr.square(rho)
+    length2 = dr.select(z >= 0, dr.maximum(length2, distance2), length2)
+    return dr.select(length2 > 0, dr.minimum(z * dr.rsqrt(length2), 1), 1)
+
+
+def cosine_less_angle(cosine, cone_cosine):
+    """cos(max(φ - β, 0)) for angles given by their cosines; 1 inside the cone."""
+    sines = dr.sqrt(dr.maximum((1 - dr.square(cosine)) * (1 - dr.square(cone_cosine)), 0))
+    return dr.select(cosine >= cone_cosine, 1, cosine * cone_cosine + sines)
+
+
+def contribution_bound(kind: str, position, normal, proxy: MaterialProxy, node: Node, smallest_distance):
+    """Upper bound of the mean over channels of a cluster's contribution to a gather point; 0 is exact.
+
+    ``normal``: shading normal on the side of the outgoing direction.
+    """
+    if kind == "directional":
+        # Directions towards the lights fill a cone around -axis: no distance, and cosines against a cone
+        receiver = dr.maximum(cosine_less_angle(-dr.dot(normal, node.axis), node.cosine), 0)
+        factor = mi.Float(1)
+        mirror = dr.maximum(cosine_less_angle(-dr.dot(proxy.axis, node.axis), node.cosine), 0) if proxy.glossy else None
+    else:
+        center = 0.5 * (node.box_min + node.box_max) - position
+        extent = 0.5 * (node.box_max - node.box_min)
+        radius = dr.norm(extent)
+        distance2 = dr.squared_norm(dr.maximum(dr.abs(center) - extent, 0))
+        receiver = dr.maximum(cosine_to_box(normal, center, extent, distance2, radius), 0)
+        mirror = dr.maximum(cosine_to_box(proxy.axis, center, extent, distance2, radius), 0) if proxy.glossy else None
+        factor = _geometry_bound(kind, node, center, extent, distance2, radius, smallest_distance)
+    if proxy.without_cosines:
+        receiver = dr.select(proxy.no_cosine, 1, receiver)
+    material = proxy.base * receiver
+    if proxy.glossy:
+        # The lobe exists only where the receiver's hemisphere can see the cluster
+        lobe = dr.select(receiver > 0, dr.power(mirror, proxy.exponent), 0)
+        material += proxy.peak * lobe
+    reflected = dr.mean(material * node.intensity)
+    # A point inside a flat box has an infinite factor and no cosine: that is nothing, not NaN
+    return dr.select(reflected > 0, factor * reflected, 0)
+
+
+def _geometry_bound(kind: str, node: Node, center, extent, distance2, radius, smallest_distance):
+    """Largest emission cosine (or spot test) over squared distance."""
+    if kind == "point":
+        return dr.rcp(distance2)
+    emission = cosine_less_angle(cosine_to_box(node.axis, -center, extent, distance2, radius), node.cosine)
+    if kind == "spot":
+        # The node's cone already includes the spots' cut-off angle: nothing is emitted outside it
+        return dr.select(emission >= 1, dr.rcp(distance2), 0)
+    clamped2 = dr.maximum(distance2, dr.square(smallest_distance))
+    return dr.select(emission > 0, emission / clamped2, 0)

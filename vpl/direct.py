@@ -1,0 +1,144 @@
+"""Direct light of emitters with an extent (areas, environments) and of those that only their own code can evaluate.
+
+One emitter sample and one BSDF sample, combined by the power heuristic as in Mitsuba's ``path``; a BSDF sample goes on
+through delta surfaces, so that lamps behind glass light the scene as they do there.  Emitters are chosen by power, with
+a uniform share.  Point lights, spots and directional emitters are not sampled here: they are virtual lights.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .emission import Choice, bounding_sphere, other_power
+from .gather import GatherPoints, emitted_towards
+from .lights import Emitters, finite_or_zero
+
+_UNIFORM_SHARE = 0.5
+
+
+def power_heuristic(pdf_a, pdf_b):
+    """Weight of a sample drawn with density a among densities a and b (power 2)."""
+    a, b = dr.square(pdf_a), dr.square(pdf_b)
+    return dr.select(pdf_a > 0, a / (a + b), 0)
+
+
+class ExtendedEmitters:
+    """Area emitters (rows first), then the environment, then the others: what emitter sampling chooses from."""
+
+    def __init__(self, scene, emitters: Emitters):
+        self.emitters = emitters
+        sphere = bounding_sphere(scene)
+        self.single = [emitter for _, emitter in emitters.others]
+        if emitters.environment is not None:
+            self.single.insert(0, emitters.environment)
+        power = np.concatenate([emitters.area.power, [other_power(emitter, sphere) for emitter in self.single]])
+        self.choice = None
+        if power.sum() > 0:
+            uniform = (power > 0) / np.count_nonzero(power)
+            self.choice = Choice((1 - _UNIFORM_SHARE) * power / power.sum() + _UNIFORM_SHARE * uniform)
+
+    def sample(self, si, row_sample, direction_sample, active):
+        """Choose an emitter and a direction: (direction sample, radiance over density, density, is delta)."""
+        row = self.choice.row(row_sample)
+        probability = self.choice.probability(row)
+        areas = self.emitters.area.count
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(si.p))
+        weight = dr.zeros(mi.UnpolarizedSpectrum, dr.width(si.p))
+        if areas:
+            here = active & (row < areas)
+            ds = self.emitters.area.shape(row, here).sample_direction(si, direction_sample, here)
+            facing = here & (dr.dot(ds.d, ds.n) < 0) & (ds.pdf > 0)
+            on_light = dr.zeros(mi.SurfaceInteraction3f, dr.width(si.p))
+            on_light.p, on_light.n, on_light.uv, on_light.wi = ds.p, ds.n, ds.uv, mi.Vector3f(0, 0, 1)
+            weight = dr.select(facing, self.emitters.area.emitted(row, on_light, facing) / ds.pdf, 0)
+        for number, emitter in enumerate(self.single):
+            here = active & (row == areas + number)
+            one, one_weight = emitter.sample_direction(si, direction_sample, here)
+            ds = dr.select(here, one, ds)
+            weight = dr.select(here, finite_or_zero(mi.unpolarized_spectrum(one_weight)), weight)
+        return ds, weight / probability, ds.pdf * probability
+
+    def density(self, si, hit, direction, active):
+        """Density with which :meth:`sample` would have chosen the emitter that a ray from ``si`` found."""
+        density = dr.zeros(mi.Float, dr.width(si.p))
+        areas = self.emitters.area.count
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(si.p))
+        ds.p, ds.n, ds.uv, ds.d = hit.p, hit.n, hit.uv, direction
+        ds.dist = dr.norm(hit.p - si.p)
+        if areas:
+            row = self.emitters.area.row(hit, active & hit.is_valid())
+            here = active & hit.is_valid() & (row > 0)
+            pdf = self.emitters.area.shape(row - 1, here).pdf_direction(si, ds, here)
+            density = dr.select(here, pdf * self.choice.probability(row - 1, here), 0)
+        if self.emitters.environment is not None:
+            here = active & ~hit.is_valid()
+            pdf = self.emitters.environment.pdf_direction(si, ds, here)
+            density = dr.select(here, pdf * self.choice.probability(mi.UInt32(areas), here), density)
+        return density
+
+
+@dr.syntax
+def _scattered_emission(scene, extended: ExtendedEmitters, traits, si, sample, depth, max_depth, sampler, active):
+    """Radiance of emitters along a BSDF sample, weighted against emitter sampling; beyond delta surfaces, in full."""
+    direction = si.to_world(sample.wo)
+    hit = scene.ray_intersect(si.spawn_ray(direction), active)
+    weight = power_heuristic(sample.pdf, extended.density(si, hit, direction, active))
+    radiance = emitted_towards(extended.emitters, hit, active) * weight
+    if dr.hint(traits.delta, mode="scalar"):
+        factor = dr.full(mi.UnpolarizedSpectrum, 1, dr.width(si.p))
+        depth = mi.UInt32(depth) + 1
+        going = active & hit.is_valid() & (depth < max_depth)
+        while dr.hint(going, exclude=[traits]):
+            onward, share = hit.bsdf().sample(
+                mi.BSDFContext(), hit, sampler.next_1d(going), sampler.next_2d(going), going
+            )
+            going &= mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
+            factor *= mi.unpolarized_spectrum(share)
+            hit = scene.ray_intersect(hit.spawn_ray(hit.to_world(onward.wo)), going)
+            radiance += dr.select(going, factor * emitted_towards(extended.emitters, hit, going), 0)
+            depth += 1
+            going &= hit.is_valid() & (depth < max_depth) & (dr.max(factor) > 0)
+    return finite_or_zero(radiance)
+
+
+@dr.syntax
+def direct_light(scene, extended: ExtendedEmitters, traits, points: GatherPoints, max_depth, samples: int, seed: int):
+    """Direct light at every gather point from emitters with an extent: (radiance, number of shadow rays).
+
+    ``samples``: pairs of an emitter sample and a BSDF sample per point.
+    """
+    si, bsdf = points.si, points.si.bsdf()
+    if dr.hint(extended.choice is None, mode="scalar"):
+        return dr.zeros(mi.UnpolarizedSpectrum, points.count), 0
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, points.count)
+    context = mi.BSDFContext()
+    limit = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF)))
+    total = dr.opaque(mi.UInt32, samples)
+    radiance, rays = dr.zeros(mi.UnpolarizedSpectrum, points.count), dr.zeros(mi.UInt32, points.count)
+    k = mi.UInt32(0)
+    while dr.hint(k < total, exclude=[traits]):
+        # ---- Emitter sampling
+        ds, weight, density = extended.sample(si, sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
+        active = dr.any(weight > 0)
+        wo = si.to_local(ds.d)
+        value, pdf = bsdf.eval_pdf(context, si, wo, active)
+        arriving = mi.unpolarized_spectrum(value) * weight
+        active &= dr.any(arriving > 0)
+        mis = dr.select(ds.delta, 1, power_heuristic(density, pdf))
+        blocked = scene.ray_test(si.spawn_ray_to(ds.p), active)
+        rays += dr.select(active, 1, 0)
+        radiance += dr.select(active & ~blocked, finite_or_zero(arriving * mis), 0)
+
+        # ---- BSDF sampling
+        sample, value = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d())
+        smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Smooth) & dr.any(mi.unpolarized_spectrum(value) > 0)
+        found = _scattered_emission(scene, extended, traits, si, sample, points.depth, limit, sampler, smooth)
+        radiance += dr.select(smooth, finite_or_zero(mi.unpolarized_spectrum(value) * found), 0)
+        k += 1
+    radiance /= mi.Float(total)
+    ray_count = dr.sum(rays)
+    dr.eval(radiance, ray_count)
+    return radiance, int(ray_count[0])

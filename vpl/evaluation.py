@@ -1,0 +1,84 @@
+"""Turning choices into radiance: here and only here pairs of a gather point and a light are shaded and traced."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .arrays import download
+from .emission import Choice
+from .gather import SceneTraits
+from .light_set import LightGroup, LightSet
+from .shading import contribution
+from .surfaces import Batch, Surface
+from .visibility import shadow_ray, transmittance
+
+# Lights whose contributions one kernel adds up in single precision; between kernels sums are in double precision
+_LIGHTS_PER_KERNEL = 4096
+
+
+def evaluate_pairs(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface: Surface, light, scale):
+    """Shade one (surface, light) pair per lane and trace its shadow ray, unless nothing would arrive.
+
+    ``light``: lights gathered from ``group``; ``scale``: factor on their intensity.
+    Returns (radiance with visibility, mask of the lanes whose ray was traced).
+    """
+    allowed = lights.allowed(surface.depth, light.depth)
+    value = contribution(group.kind, surface, light, lights.smallest_distance, allowed) * scale
+    traced = dr.any(value > 0)
+    ray = shadow_ray(group.kind, surface.interaction, light)
+    passed = transmittance(scene, traits, group.kind, light.depth == 0, ray, traced)
+    return dr.select(traced, value * passed, 0), traced
+
+
+@dr.syntax
+def _sum_lights(scene, traits, lights, group, batch, first: int, last: int):
+    """Sum over the lights first .. last - 1 of a group, for all points in step: (radiance, shadow rays per point)."""
+    end = dr.opaque(mi.UInt32, last)
+    j = dr.opaque(mi.UInt32, first, batch.count)
+    surface = batch.surfaces
+    radiance, rays = dr.zeros(mi.UnpolarizedSpectrum, batch.count), dr.zeros(mi.UInt32, batch.count)
+    while dr.hint(j < end, exclude=[traits, lights, group, surface]):
+        value, traced = evaluate_pairs(scene, traits, lights, group, surface, group.lights.gather(j), 1)
+        radiance += value
+        rays += dr.select(traced, 1, 0)
+        j += 1
+    dr.eval(radiance, rays)
+    return radiance, rays
+
+
+def sum_all_lights(scene, traits: SceneTraits, lights: LightSet, batch: Batch, stopped=lambda: False):
+    """Every light at every point of a batch: the oracle of all methods.
+
+    ``stopped``: asked between kernels; once true the sum ends early.  Returns (radiance, shadow rays per point).
+    """
+    precise = dr.float64_array_t(mi.UnpolarizedSpectrum)
+    total, rays = dr.zeros(precise, batch.count), dr.zeros(mi.UInt32, batch.count)
+    for group in lights.groups:
+        for first in range(0, group.count, _LIGHTS_PER_KERNEL):
+            if stopped():
+                break
+            last = min(first + _LIGHTS_PER_KERNEL, group.count)
+            radiance, traced = _sum_lights(scene, traits, lights, group, batch, first, last)
+            total += precise(radiance)
+            rays += traced
+            dr.eval(total, rays)
+    return mi.UnpolarizedSpectrum(total), rays
+
+
+def mean_radiance(scene, traits: SceneTraits, lights: LightSet, batch: Batch, seed: int, count: int = 1 << 15) -> float:
+    """Mean over points and channels of the light of ``lights``, from ``count`` random pairs per group.
+
+    Points are drawn uniformly, lights by intensity; the result only sets the scale of thresholds.
+    """
+    total = 0.0
+    for group in lights.groups:
+        choice = Choice(group.lights.scalar_intensity)
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(seed, count)
+        row = dr.minimum(mi.UInt32(sampler.next_1d() * batch.count), batch.count - 1)
+        index = choice.row(sampler.next_1d())
+        light, scale = group.lights.gather(index), dr.rcp(choice.probability(index))
+        value, _ = evaluate_pairs(scene, traits, lights, group, batch.surfaces_at(row), light, scale)
+        total += float(download(value).mean(dtype="float64"))
+    return total
