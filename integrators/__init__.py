@@ -1,0 +1,57 @@
+"""Many-light integrators for Mitsuba 3: ``import integrators`` and use them like any other plugin.
+
+The plugins are registered for the current variant, and again whenever ``mi.set_variant`` changes it.  They exist for
+the vectorised ``*_rgb`` and ``*_mono`` variants; elsewhere loading one fails with an error that says so.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+from vpl.backend import check_backend, import_drjit
+
+import_drjit()
+
+import mitsuba as mi  # noqa: E402  (after the check that turns its import error into advice)
+
+PLUGINS = ("vpl", "lightcuts")
+_SUPPORTED = (
+    "llvm_ad_rgb",
+    "llvm_ad_mono",
+    "cuda_ad_rgb",
+    "cuda_ad_mono",
+    "llvm_rgb",
+    "llvm_mono",
+    "cuda_rgb",
+    "cuda_mono",
+)
+
+
+def _refuse(name: str, variant: str):
+    def plugin(props):
+        raise RuntimeError(
+            f'the integrator "{name}" does not support the variant "{variant}": choose one of {", ".join(_SUPPORTED)}'
+        )
+
+    return plugin
+
+
+def _register(_old: str | None, variant: str) -> None:
+    """Register all plugins for ``variant``; classes are made anew because their base class belongs to the variant."""
+    if variant not in _SUPPORTED:
+        for name in PLUGINS:
+            mi.register_integrator(name, _refuse(name, variant))
+        return
+    check_backend(variant)
+    for name in ("common", *PLUGINS):
+        full_name = f"{__name__}.{name}"
+        if full_name in sys.modules:
+            importlib.reload(sys.modules[full_name])
+        else:
+            importlib.import_module(full_name)
+
+
+if mi.variant() is not None:
+    _register(None, mi.variant())
+mi.detail.add_variant_callback(_register)

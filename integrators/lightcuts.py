@@ -1,0 +1,174 @@
+"""Lightcuts: a few hundred clusters instead of all virtual lights, with a bound on the error of each."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from vpl.arrays import download, upload
+from vpl.cuts import cut_sizes, evaluate_cuts, limited_cuts
+
+from . import properties
+from .common import Clock, ManyLightIntegrator, Shaded, Shading
+
+# A point's radiance is estimated from coarse cuts at every eighth point, averaged over sixteen neighbours on the
+# Morton curve; bounds of these cuts are accepted up to this fraction of the image's mean.
+_ESTIMATE_STRIDE, _ESTIMATE_BLOCK, _ESTIMATE_ERROR = 8, 16, 0.05
+
+
+class LightcutsIntegrator(ManyLightIntegrator):
+    r"""
+    .. _integrator-lightcuts:
+
+    Lightcuts (:monosp:`lightcuts`)
+    -------------------------------
+
+    .. pluginparameters::
+
+     * - error
+       - |float|
+       - Largest bound of the error of one cluster, as a fraction of the radiance around the point: 0.01 is 1%.
+         0 refines to single lights. (Default: 0.01)
+
+     * - dark_floor
+       - |float|
+       - Points darker than this fraction of the image's mean are refined as if they had it; 0 holds the bound
+         everywhere, at several times the cost in dark corners. (Default: 0.25)
+
+     * - max_cut
+       - |int|
+       - Most clusters in the cut of a point; 0 is no limit. (Default: 1000)
+
+     * - max_depth
+       - |int|
+       - Longest path from camera to emitter, in edges, counted as Mitsuba's ``path`` counts them: 1 shows emitters
+         only, 2 adds direct light, and -1 is no limit. (Default: -1)
+
+     * - rr_depth
+       - |int|
+       - Edges after which paths may end by Russian roulette. (Default: 5)
+
+     * - hide_emitters
+       - |bool|
+       - Do not show area emitters and environments to the camera. (Default: no)
+
+     * - vpl_count
+       - |int|
+       - How many virtual point lights to aim for. (Default: 200000)
+
+     * - direct
+       - |string|
+       - Light that comes straight from emitters. ``nee``: area emitters and environments by emitter and BSDF sampling
+         with multiple importance sampling. ``vpl``: they become virtual lights, as in the papers. ``none``: left out.
+         Point lights, spots and directional emitters are virtual lights already, exact and never clamped, in both
+         ``nee`` and ``vpl``. (Default: ``nee``)
+
+     * - emitter_samples
+       - |int|
+       - Pairs of an emitter and a BSDF sample per gather point with ``direct="nee"``. (Default: 1)
+
+     * - direct_count
+       - |int|
+       - Virtual lights on area emitters, and as many for the environment, with ``direct="vpl"``. (Default: 4096)
+
+     * - clamping
+       - |float|
+       - Smallest distance to a virtual light that stands for a surface, as a fraction of the radius of the scene's
+         bounding sphere; light from nearer is dimmed instead of becoming a bright spot. 0 turns it off. (Default: 0.05)
+
+     * - lobe_limit
+       - |float|
+       - A glossy lobe stores virtual lights where its density is at most this, per steradian, as though it were
+         diffuse (which has at most 1/pi); 0 stores the light of diffuse lobes only. (Default: 1.0)
+
+     * - aovs
+       - |string|
+       - Comma-separated counters to return as channels, per camera ray and from the same pass: ``shadow_rays``,
+         ``upper_bounds``, ``cut_size``. (Default: none)
+
+    Walter et al. 2005, "Lightcuts: a scalable approach to illumination" [LC]. All virtual lights are clustered into
+    one tree per kind (point, spot, oriented, directional); every gather point is lit by a *cut*: clusters that together
+    hold each light once, each stood for by one representative light with the cluster's intensity. The cut is the
+    coarsest whose clusters all have an upper bound of their contribution of at most ``error`` times the radiance of the
+    point.
+
+    What is estimated: emission + direct + indirect light, over the paths that ``path`` counts for the same
+    ``max_depth``. Camera rays go on through mirrors, glass and masks. Left out are caustics and light that sharp lobes
+    send on from the second surface (they would need another kind of light), and what ``clamping`` cuts off.
+
+    - Surfaces only: a scene with a participating medium is refused.
+    - ``*_rgb`` and ``*_mono`` variants only. Not differentiable.
+    - Emitters: point, spot, directional, area on any shape, envmap, constant, sunsky; projectors and textured spots
+      with ``direct="nee"``.
+    - Shadow rays pass surfaces that do not scatter (masks, thin glass) with their transmission.
+
+    **Departures from the paper.** The radiance that bounds are compared with is not the running total of the cut but an
+    estimate made before, from coarse cuts of every eighth point and the direct light, averaged over sixteen
+    neighbouring points: thresholds are known in advance, so that cuts need no heap and no stack, and all shadow rays of
+    many points can be traced together. ``dark_floor`` is ours. The representative's colour is its own, not the
+    cluster's, so that the cut is unbiased for lights of different colours. Bounds and the cluster metric differ in
+    detail: see :mod:`vpl.bounds` and :mod:`vpl.light_tree`. There are no reconstruction cuts.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="lightcuts">
+                <integer name="max_depth" value="8"/>
+                <float name="error" value="0.01"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            import integrators
+            "integrator": {"type": "lightcuts", "max_depth": 8, "error": 0.01}
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.error = properties.number(props, "error", 0.01, 0)
+        self.dark_floor = properties.number(props, "dark_floor", 0.25, 0)
+        self.max_cut = properties.integer(props, "max_cut", 1000, 0)
+
+    def shade(self, job: Shading) -> Shaded:
+        """Choose a cut for every point of a batch and evaluate it."""
+        clock = Clock()
+        estimate, spent = self._estimate(job)
+        clock.lap("estimate")
+        wanted = upload(mi.Float, self.error * np.maximum(estimate, self.dark_floor * job.mean))
+        threshold, sizes, searched = limited_cuts(job.lights, job.batch, wanted, self.max_cut)
+        clock.lap("cut")
+        radiance, rays, collected = evaluate_cuts(job.scene, job.traits, job.lights, job.batch, threshold, sizes)
+        clock.lap("evaluate")
+        bounds = searched + collected + spent.upper_bounds
+        return Shaded(radiance, rays + spent.shadow_rays, bounds, sum(sizes.count), clock.seconds)
+
+    def _estimate(self, job: Shading):
+        """Mean over channels of the radiance around every point, (n,) float64, and what finding it cost per point."""
+        count = job.batch.count
+        rows = np.arange(0, count, _ESTIMATE_STRIDE)
+        index = upload(mi.UInt32, rows)
+        part = job.batch.select(index)
+        threshold = dr.full(mi.Float, _ESTIMATE_ERROR * job.mean, len(rows))
+        sizes = cut_sizes(job.lights, part, threshold)
+        radiance, rays, collected = evaluate_cuts(job.scene, job.traits, job.lights, part, threshold, sizes)
+        reflected = np.repeat(download(radiance).mean(1, dtype=np.float64), _ESTIMATE_STRIDE)[:count]
+        estimate = block_mean(reflected + download(job.direct).mean(1, dtype=np.float64), _ESTIMATE_BLOCK)
+        spent = Shaded(None, *(dr.zeros(mi.UInt32, count) for _ in range(3)))
+        dr.scatter(spent.shadow_rays, rays, index)
+        dr.scatter(spent.upper_bounds, collected + sum(sizes.visits), index)
+        return estimate, spent
+
+    def describe(self):
+        """All properties and their values."""
+        return super().describe() | {"error": self.error, "dark_floor": self.dark_floor, "max_cut": self.max_cut}
+
+
+def block_mean(values: np.ndarray, block: int) -> np.ndarray:
+    """Replace values by the mean over their block of consecutive ones; the last block may be shorter."""
+    start = np.arange(0, len(values), block)
+    length = np.diff(np.append(start, len(values)))
+    return np.repeat(np.add.reduceat(values, start) / length, length)
+
+
+mi.register_integrator("lightcuts", LightcutsIntegrator)

@@ -1,0 +1,54 @@
+"""Reading an integrator's properties with type and range checked: Mitsuba itself passes any type through."""
+
+from __future__ import annotations
+
+import math
+
+
+def _fail(props, name: str, allowed: str, value):
+    raise ValueError(f'{props.plugin_name()}: property "{name}" must be {allowed}, got {value!r}')
+
+
+def integer(props, name: str, default: int, minimum: int) -> int:
+    """An integer of at least ``minimum``; a ValueError names property, value and what is allowed."""
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
+        _fail(props, name, f"an integer of at least {minimum}", value)
+    return value
+
+
+def number(props, name: str, default: float, minimum: float, maximum: float = math.inf, exclusive=False) -> float:
+    """A finite number from ``minimum`` (excluded with ``exclusive``) to ``maximum``."""
+    value = props.get(name, default)
+    allowed = f"a number {'above' if exclusive else 'of at least'} {minimum:g}"
+    allowed += "" if math.isinf(maximum) else f" and at most {maximum:g}"
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        _fail(props, name, allowed, value)
+    if value < minimum or value > maximum or (exclusive and value == minimum):
+        _fail(props, name, allowed, value)
+    return float(value)
+
+
+def choice(props, name: str, default: str, allowed: tuple[str, ...]) -> str:
+    """One of a few words."""
+    value = props.get(name, default)
+    if value not in allowed:
+        _fail(props, name, "one of " + ", ".join(f'"{word}"' for word in allowed), value)
+    return value
+
+
+def words(props, name: str, allowed: tuple[str, ...]) -> tuple[str, ...]:
+    """A comma-separated list of words out of ``allowed``, each at most once; empty by default."""
+    value = props.get(name, "")
+    found = [word.strip() for word in value.split(",")] if isinstance(value, str) and value.strip() else []
+    if not isinstance(value, str) or any(word not in allowed for word in found) or len(set(found)) < len(found):
+        _fail(props, name, "a comma-separated list out of " + ", ".join(f'"{word}"' for word in allowed), value)
+    return tuple(found)
+
+
+def depth(props) -> float:
+    """``max_depth`` as Mitsuba's ``path`` has it: -1 (returned as infinity) or a count of at least 0."""
+    value = props.get("max_depth", -1)
+    if isinstance(value, bool) or not isinstance(value, int) or value < -1:
+        _fail(props, "max_depth", "-1 (no limit) or an integer of at least 0", value)
+    return math.inf if value == -1 else value

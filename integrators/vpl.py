@@ -1,0 +1,106 @@
+"""Every virtual point light at every gather point: the oracle of all other methods."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from vpl.evaluation import sum_all_lights
+
+from .common import ManyLightIntegrator, Shaded, Shading
+
+
+class VPLIntegrator(ManyLightIntegrator):
+    r"""
+    .. _integrator-vpl:
+
+    All virtual point lights (:monosp:`vpl`)
+    ----------------------------------------
+
+    .. pluginparameters::
+
+     * - max_depth
+       - |int|
+       - Longest path from camera to emitter, in edges, counted as Mitsuba's ``path`` counts them: 1 shows emitters
+         only, 2 adds direct light, and -1 is no limit. (Default: -1)
+
+     * - rr_depth
+       - |int|
+       - Edges after which paths may end by Russian roulette. (Default: 5)
+
+     * - hide_emitters
+       - |bool|
+       - Do not show area emitters and environments to the camera. (Default: no)
+
+     * - vpl_count
+       - |int|
+       - How many virtual point lights to aim for. (Default: 200000)
+
+     * - direct
+       - |string|
+       - Light that comes straight from emitters. ``nee``: area emitters and environments by emitter and BSDF sampling
+         with multiple importance sampling. ``vpl``: they become virtual lights, as in the papers. ``none``: left out.
+         Point lights, spots and directional emitters are virtual lights already, exact and never clamped, in both
+         ``nee`` and ``vpl``. (Default: ``nee``)
+
+     * - emitter_samples
+       - |int|
+       - Pairs of an emitter and a BSDF sample per gather point with ``direct="nee"``. (Default: 1)
+
+     * - direct_count
+       - |int|
+       - Virtual lights on area emitters, and as many for the environment, with ``direct="vpl"``. (Default: 4096)
+
+     * - clamping
+       - |float|
+       - Smallest distance to a virtual light that stands for a surface, as a fraction of the radius of the scene's
+         bounding sphere; light from nearer is dimmed instead of becoming a bright spot. 0 turns it off. (Default: 0.05)
+
+     * - lobe_limit
+       - |float|
+       - A glossy lobe stores virtual lights where its density is at most this, per steradian, as though it were
+         diffuse (which has at most 1/pi); 0 stores the light of diffuse lobes only. (Default: 1.0)
+
+     * - aovs
+       - |string|
+       - Comma-separated counters to return as channels, per camera ray and from the same pass: ``shadow_rays``,
+         ``upper_bounds``, ``cut_size``. (Default: none)
+
+    Instant radiosity without any approximation but the virtual lights themselves: every light, one shadow ray each, at
+    every gather point. It is what ``lightcuts`` and its relatives converge to, and slow: the time grows as pixels times
+    lights. With the same seed and parameters it uses the same lights as they do.
+
+    What is estimated: emission + direct + indirect light, over the paths that ``path`` counts for the same
+    ``max_depth``. Camera rays go on through mirrors, glass and masks. Left out are caustics and light that sharp lobes
+    send on from the second surface (they would need another kind of light), and what ``clamping`` cuts off.
+
+    - Surfaces only: a scene with a participating medium is refused.
+    - ``*_rgb`` and ``*_mono`` variants only. Not differentiable.
+    - Emitters: point, spot, directional, area on any shape, envmap, constant, sunsky; projectors and textured spots
+      with ``direct="nee"``.
+    - Shadow rays pass surfaces that do not scatter (masks, thin glass) with their transmission.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="vpl">
+                <integer name="max_depth" value="8"/>
+                <integer name="vpl_count" value="1000"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            import integrators
+            "integrator": {"type": "vpl", "max_depth": 8, "vpl_count": 1000}
+    """
+
+    needs_trees = False
+
+    def shade(self, job: Shading) -> Shaded:
+        """Sum over all lights; see :func:`vpl.evaluation.sum_all_lights`."""
+        count = job.batch.count
+        radiance, rays = sum_all_lights(job.scene, job.traits, job.lights, job.batch, job.stopped)
+        return Shaded(radiance, rays, dr.zeros(mi.UInt32, count), dr.full(mi.UInt32, job.lights.count, count))
+
+
+mi.register_integrator("vpl", VPLIntegrator)
