@@ -1,0 +1,128 @@
+"""What the two commands share: options of the form key=value, variants and integrators by name, errors in one line."""
+
+import argparse
+import re
+from importlib import metadata
+from pathlib import Path
+
+import mitsuba as mi
+
+
+class UsageError(Exception):
+    """The command cannot do what it was asked; its message says why. Exit status 2."""
+
+
+def value(text):
+    """Turn the text of a parameter into a bool (`true`, `false`), an int, a float, or leave it as it is."""
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return text
+
+
+def definition(text):
+    """Split `key=value`; an argparse type."""
+    key, separator, content = text.partition("=")
+    if not separator or not key:
+        raise argparse.ArgumentTypeError(f"'{text}' is not of the form key=value")
+    return key, content
+
+
+def parameter(text):
+    """Split `key=value` and give the value its type; an argparse type."""
+    key, content = definition(text)
+    return key, value(content)
+
+
+def positive(kind):
+    """Return an argparse type for positive numbers of a kind (int or float)."""
+
+    def convert(text):
+        try:
+            number = kind(text)
+        except ValueError:
+            number = 0
+        if not 0 < number < float("inf"):
+            raise argparse.ArgumentTypeError(f"'{text}' is not a positive {'whole ' if kind is int else ''}number")
+        return number
+
+    return convert
+
+
+def seed(text):
+    """Convert the text of a seed, 0 to 2^32 - 1; an argparse type."""
+    if not text.isdecimal() or int(text) >= 2**32:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to 4294967295")
+    return int(text)
+
+
+def add_common_options(parser):
+    """Add the options that both commands have."""
+    parser.add_argument(
+        "-D", "--define", action="append", type=definition, default=[], metavar="KEY=VALUE",
+        help="define a constant that the scene refers to as $KEY; repeat for more",
+    )  # fmt: skip
+    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="variant (default: llvm_ad_rgb)")
+    parser.add_argument("-t", "--threads", type=positive(int), metavar="N", help="number of threads (default: all)")
+    parser.add_argument("-v", "--verbose", action="store_true", help="log more, and show tracebacks of errors")
+
+
+def set_variant(name):
+    """Select a variant and register this project's integrators for it."""
+    if name not in mi.variants():
+        raise UsageError(f"unknown variant '{name}'; there are {', '.join(mi.variants())}")
+    mi.set_variant(name)
+    import integrators  # noqa: F401 (registers plugins; needs a variant)
+
+
+def own_integrators():
+    """Return the names of this project's integrators."""
+    import integrators
+
+    return integrators.PLUGINS
+
+
+def check_integrator(name):
+    """Raise UsageError, naming what exists, if there is no integrator of that name."""
+    try:
+        mi.PluginManager.instance().create_object(mi.Properties(name))
+    except RuntimeError as error:
+        if "not found" not in str(error):
+            return  # it exists, and needs parameters
+        manager, folder = mi.PluginManager.instance(), Path(mi.__file__).parent / "plugins"
+        names = {file.stem for file in folder.iterdir()}
+        builtin = sorted(name for name in names if manager.plugin_type(name) == mi.ObjectType.Integrator)
+        raise UsageError(
+            f"unknown integrator '{name}'; there are {', '.join(own_integrators())} and Mitsuba's {', '.join(builtin)}"
+        ) from None
+
+
+def check_scene(path):
+    """Raise UsageError if there is no such file."""
+    if not Path(path).is_file():
+        raise UsageError(f"no scene file '{path}'")
+
+
+def explain(error):
+    """Return the message of an error in one line: that of its first cause (Dr.Jit wraps what integrators raise),
+    without the place in Mitsuba's sources."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    message = re.sub(r"\[\w+\.cpp:\d+\] ", "", str(error))
+    return " ".join(message.split()) or type(error).__name__
+
+
+def versions():
+    """Return the versions (text) of what made an image."""
+    return {name: metadata.version(name) for name in ("mitsuba", "drjit", "numpy")} | {"manylights": own_version()}
+
+
+def own_version():
+    try:
+        return metadata.version("manylights")
+    except metadata.PackageNotFoundError:  # run from a source tree that is not installed
+        return "unknown"

@@ -1,0 +1,98 @@
+"""Images: EXR files with metadata, tone mapping, PNG files, false colours.
+
+EXR files are OpenEXR's matter rather than Mitsuba's, whose writer waits for ever where Dr.Jit has a single thread.
+"""
+
+import json
+import os
+from contextlib import contextmanager
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+
+# Perceptually increasing, from no error to a large one: black, indigo, magenta, orange, pale yellow.
+ERROR_COLOURS = np.array([(0, 0, 4), (60, 15, 112), (158, 44, 120), (236, 105, 60), (252, 190, 60), (252, 253, 200)])
+ERROR_RANGE = (0.01, 1.0)  # relative errors at the two ends of the false colours, which are logarithmic
+
+
+@contextmanager
+def replacing(path):
+    """Give a temporary path beside `path` that takes its place when the block ends without an error."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_exr(path, image, channels, metadata=None, half=False):
+    """Write an image, (height, width, channels), with the names of its channels; metadata that EXR attributes cannot
+    hold (lists, dicts, None, integers of more than 32 bits) become JSON text. `half` stores 16-bit numbers."""
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    for key, value in (metadata or {}).items():
+        header[key] = value if _fits_attribute(value) else json.dumps(value)
+    planes = np.moveaxis(np.asarray(image, np.float16 if half else np.float32), -1, 0)
+    with replacing(path) as temporary:
+        arrays = {name: np.ascontiguousarray(plane) for name, plane in zip(channels, planes, strict=True)}
+        with OpenEXR.File(header, arrays) as file:
+            file.write(str(temporary))
+
+
+def _fits_attribute(value):
+    if isinstance(value, int):
+        return not isinstance(value, bool) and -(2**31) <= value < 2**31
+    return isinstance(value, str | float)
+
+
+def read_exr(path):
+    """Return the image (height, width, channels) float32, the names of its channels (sorted), and its metadata: a dict
+    of numbers and strings."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = sorted(file.channels())
+        image = np.stack([file.channels()[name].pixels.astype(np.float32) for name in channels], axis=-1)
+        metadata = {key: value for key, value in file.header().items() if isinstance(value, int | float | str)}
+    return image, channels, metadata
+
+
+def colour(image, channels, layer=""):
+    """Return the colour of an image, (height, width, 3): its channels R, G, B (of a layer such as "se."), or Y for all
+    three. Raises ValueError if it has neither."""
+    for names in (("R", "G", "B"), ("Y", "Y", "Y")):
+        wanted = [layer + name for name in names]
+        if set(wanted) <= set(channels):
+            return image[..., [list(channels).index(name) for name in wanted]]
+    raise ValueError(f"no colour channels among {', '.join(channels)}")
+
+
+def automatic_exposure(rgb):
+    """Return the factor that brings the 95th percentile of the brightness to 0.8, or 1 for a black image. A
+    percentile, unlike a mean, ignores lamps in view; unlike a log average, it ignores a black background."""
+    brightness = np.nan_to_num(rgb, posinf=0, neginf=0).mean(axis=-1)
+    level = np.percentile(brightness, 95) or brightness.max()
+    return 0.8 / level if level > 0 else 1.0
+
+
+def tone_map(rgb, exposure):
+    """Multiply by `exposure`, clip and apply the sRGB curve; return (height, width, 3) uint8."""
+    linear = np.clip(np.nan_to_num(rgb, posinf=0, neginf=0) * exposure, 0, 1)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return (encoded * 255 + 0.5).astype(np.uint8)
+
+
+def false_colours(relative_error):
+    """Return the colours, (height, width, 3) uint8, of relative errors, (height, width), on a logarithmic scale."""
+    low, high = np.log(ERROR_RANGE)
+    position = (np.log(np.maximum(np.nan_to_num(relative_error, nan=np.inf), 1e-9)) - low) / (high - low)
+    position = np.clip(position, 0, 1) * (len(ERROR_COLOURS) - 1)
+    stops = np.arange(len(ERROR_COLOURS))
+    return np.stack([np.interp(position, stops, ERROR_COLOURS[:, i]) for i in range(3)], axis=-1).astype(np.uint8)
+
+
+def write_png(path, pixels):
+    """Write (height, width, 3) uint8 sRGB values."""
+    with replacing(path) as temporary:
+        mi.Bitmap(np.ascontiguousarray(pixels)).write(str(temporary))

@@ -1,0 +1,122 @@
+"""Progressive rendering: passes of different seeds and their average."""
+
+import time
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of one pass: it bounds memory, and the wait for the first image
+
+
+def pass_seed(seed, index):
+    """Return the seed of pass `index` of a render with seed `seed`: the seed itself for pass 0, so that a render of one
+    pass is `mi.render(scene, seed=seed)`, and otherwise a hash of both (32 bits)."""
+    if index == 0:
+        return seed
+    return int(np.random.SeedSequence((seed, index)).generate_state(1)[0])
+
+
+def pass_sizes(spp, pixels, pass_spp=None):
+    """Split `spp` samples per pixel into passes (a list of ints) of `pass_spp`, by default `largest_pass(pixels)`."""
+    size = pass_spp or largest_pass(pixels)
+    full, rest = divmod(spp, size)
+    return [size] * full + ([rest] if rest else [])
+
+
+def largest_pass(pixels):
+    """Return how many samples per pixel, at least one, make up to `MAXIMUM_PASS_SAMPLES` samples in all pixels."""
+    return max(1, MAXIMUM_PASS_SAMPLES // pixels)
+
+
+@dataclass
+class Pass:
+    """One finished pass: its seed, samples per pixel, wall-clock seconds, and what the integrator counted."""
+
+    seed: int
+    spp: int
+    seconds: float
+    statistics: dict = field(default_factory=dict)
+
+
+class Progressive:
+    """The running average of passes of one scene, weighted by their samples per pixel.
+
+    `channels` are the names of the image's channels ("R", "G", "B", and those of AOVs), known after the first pass.
+    """
+
+    def __init__(self, scene, seed, sensor=0):
+        self._scene, self.seed = scene, seed
+        self._sensor = scene.sensors()[sensor]
+        self.channels = []
+        self.restart()
+
+    def restart(self):
+        """Forget all passes."""
+        self.passes, self._sum = [], 0.0
+
+    def render(self, spp, seed=None, accept=lambda: True):
+        """Render one more pass of `spp` samples per pixel and return it (a `Pass`).
+
+        Its seed is `pass_seed(seed of the render, number of the pass)` unless `seed` is given. A pass that raises
+        leaves the average as it was, and so does one that `accept` refuses when it is finished (None is returned).
+        """
+        seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
+        begin = time.perf_counter()
+        image = mi.render(self._scene, sensor=self._sensor, seed=seed, spp=spp)
+        dr.eval(image)
+        dr.sync_thread()
+        seconds = time.perf_counter() - begin
+        if not accept():
+            return None
+        # Not the image that `mi.render` returned: it lacks channels of nested integrators, and names.
+        bitmap = self._sensor.film().bitmap()
+        self.channels = [entry.name for entry in bitmap.struct_()]
+        statistics = dict(getattr(self._scene.integrator(), "statistics", None) or {})
+        height, width = bitmap.size()[1], bitmap.size()[0]
+        # In double precision, as a long sum of floats would drift.
+        self._sum = self._sum + spp * np.array(bitmap, dtype=np.float64).reshape(height, width, -1)
+        self.passes.append(Pass(seed, spp, seconds, statistics))
+        return self.passes[-1]
+
+    @property
+    def pixels(self):
+        """Number of pixels of the image."""
+        return int(np.prod(self._sensor.film().crop_size()))
+
+    @property
+    def spp(self):
+        """Samples per pixel of all passes."""
+        return sum(one.spp for one in self.passes)
+
+    @property
+    def seconds(self):
+        """Wall-clock seconds of all passes."""
+        return sum(one.seconds for one in self.passes)
+
+    @property
+    def image(self):
+        """The average, (height, width, channels) float64."""
+        return self._sum / self.spp
+
+
+def total_statistics(passes):
+    """Add up the integrators' counters over passes; return {} if there are none.
+
+    Numbers are summed, nested dicts (such as "seconds") likewise; "lights" describes a set, so the last pass's stays.
+    """
+    total = {}
+    for statistics in (one.statistics for one in passes):
+        _add(total, statistics)
+    return total
+
+
+def _add(total, statistics):
+    for key, value in statistics.items():
+        if isinstance(value, dict) and key != "lights":
+            _add(total.setdefault(key, {}), value)
+        elif isinstance(value, int | float | np.number) and not isinstance(value, bool):
+            total[key] = total.get(key, 0) + (value.item() if isinstance(value, np.number) else value)
+        else:
+            total[key] = value

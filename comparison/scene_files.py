@@ -1,0 +1,122 @@
+"""Scene files: parse, change the integrator or the size of the image, fingerprint and load.
+
+The work is Mitsuba's own parser's, which substitutes `$parameters` and follows includes; changes are made to its nodes
+before any object is created, so a scene may name an integrator that is replaced before it could be missed.
+"""
+
+import hashlib
+import os
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+
+# What a replaced integrator hands on to its successor: it says which light is to be shown, not how it is computed.
+KEPT_PARAMETERS = ("max_depth", "rr_depth", "hide_emitters")
+
+
+class SceneFile:
+    """A parsed scene file. A variant must be set.
+
+    `path` is an XML file and `defines` maps the names of `$parameters` to text. Raises RuntimeError, with Mitsuba's
+    message, for what does not parse, and ValueError for a scene that cannot be rendered as it is.
+    """
+
+    def __init__(self, path, defines=None):
+        self.path = Path(path)
+        self._configuration = mi.parser.ParserConfig(mi.variant())
+        self._state = mi.parser.parse_file(self._configuration, str(path), **(defines or {}))
+        if not self._nodes(mi.ObjectType.Sensor):
+            raise ValueError(f"{path}: the scene has no sensor")
+
+    @property
+    def name(self):
+        """A short name: that of the file, or of its folder where the file is just called `scene.xml`."""
+        return self.path.resolve().parent.name if self.path.stem == "scene" else self.path.stem
+
+    @property
+    def integrator(self):
+        """The name (None if it has none) and the parameters (a dict of numbers, bools and strings) of the scene's
+        integrator."""
+        nodes = self._nodes(mi.ObjectType.Integrator)
+        if not nodes:
+            return None, {}
+        properties = mi.Properties(nodes[0].props)  # a copy: Mitsuba refuses properties that nobody has read
+        values = dict(properties.items())
+        plain = {key: value for key, value in values.items() if isinstance(value, bool | int | float | str)}
+        return properties.plugin_name(), plain
+
+    def set_integrator(self, name, parameters=None, keep=KEPT_PARAMETERS):
+        """Replace the scene's integrator. Of the old one's parameters it keeps those named by `keep` (None: all),
+        unless given anew, or unknown to the new one. Raises RuntimeError if the new one cannot be created."""
+        given, old = dict(parameters or {}), self.integrator[1]
+        kept = {key: old[key] for key in old if key not in given and (keep is None or key in keep)}
+        # Nothing lists the parameters of a plugin, but one that was created tells which it asked for.
+        tried = _properties(name, kept | given)
+        mi.PluginManager.instance().create_object(tried)
+        properties = _properties(name, {key: kept[key] for key in kept if tried.was_queried(key)} | given)
+        nodes = self._nodes(mi.ObjectType.Integrator)
+        if nodes:
+            nodes[0].props = properties
+        else:
+            node = mi.parser.SceneNode()
+            node.type, node.props = mi.ObjectType.Integrator, properties
+            self._state.nodes.append(node)
+            self._state.root.props["integrator"] = mi.Properties.ResolvedReference(len(self._state.nodes) - 1)
+
+    def set_max_depth(self, depth):
+        """Limit the paths to `depth`: by the integrator `path`, until another one is set that keeps it."""
+        self.set_integrator("path", {"max_depth": depth})
+
+    @property
+    def size(self):
+        """Width and height of the first film in pixels, as Mitsuba defaults them."""
+        films = self._nodes(mi.ObjectType.Film)
+        properties = mi.Properties(films[0].props if films else mi.Properties("hdrfilm"))
+        return properties.get("width", 768), properties.get("height", 576)
+
+    def set_width(self, width):
+        """Render `width` pixels wide, keeping the aspect of the first film."""
+        old_width, old_height = self.size
+        for film in self._nodes(mi.ObjectType.Film):
+            film.props["width"] = int(width)
+            film.props["height"] = max(1, round(old_height * width / old_width))
+
+    def fingerprint(self):
+        """Return a hash (hexadecimal) of everything that the image depends on, but for the samples per pixel and the
+        seed: variant, scene with all parameters, and the content of every file that it names."""
+        digest = hashlib.sha256(mi.variant().encode())
+        for node in self._state.nodes:
+            properties = mi.Properties(node.props)
+            digest.update(repr(properties).encode() if node.type != mi.ObjectType.Sampler else b"sampler")
+            for _, value in properties.items():
+                file = self.path.parent / value if isinstance(value, str) and value else None
+                if file is not None and file.is_file():
+                    digest.update(hashlib.sha256(file.read_bytes()).digest())
+        return digest.hexdigest()
+
+    def load(self, threads=None):
+        """Create the scene (a `mi.Scene`), once only, as it consumes what was parsed; `threads`, if given, limits what
+        is done from then on."""
+        if threads:
+            # Not yet: with a single thread Mitsuba waits for ever when it reads EXR files.
+            dr.set_thread_count(os.cpu_count() or 2)
+        resolver = mi.FileResolver(mi.file_resolver())
+        mi.file_resolver().prepend(str(self.path.parent))
+        try:
+            mi.parser.transform_all(self._configuration, self._state)
+            return mi.parser.instantiate(self._configuration, self._state)
+        finally:
+            mi.set_file_resolver(resolver)
+            if threads:
+                dr.set_thread_count(threads)
+
+    def _nodes(self, kind):
+        return [node for node in self._state.nodes if node.type == kind]
+
+
+def _properties(name, parameters):
+    properties = mi.Properties(name)
+    for key, value in parameters.items():
+        properties[key] = value
+    return properties

@@ -1,0 +1,207 @@
+"""Render and measure one integrator on one scene, in a process of its own: `python -m comparison.worker JOB RESULT`.
+
+In a fresh process with an empty kernel cache the first pass is honestly cold, the memory's peak is this integrator's,
+and a crash loses nothing else. The job is a JSON file (see `Job`), the result another (see `run`).
+"""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from dataclasses import asdict, dataclass, field
+from itertools import count
+from pathlib import Path
+
+from tqdm import tqdm
+
+from . import images
+from .command_line import explain, set_variant, versions
+from .rendering import Progressive, largest_pass, pass_seed, pass_sizes, total_statistics
+from .scene_files import SceneFile
+
+ROOT = Path(__file__).resolve().parent.parent
+LONG_PASS = 60.0  # seconds; with given samples, a first pass longer than this is no longer rendered twice
+PASSES_IN_BUDGET = 5  # or about so many, unless even passes of one sample per pixel take longer
+UNUSED_PASSES = 2**31  # passes that are not in the image are numbered from here, so that they share no lights with it
+
+
+@dataclass
+class Job:
+    """What to render: either for `budget` seconds or with `spp` samples per pixel, in passes of `pass_spp` (None
+    chooses). `output` is the EXR file to write;
+    `vpl_output`, if given, is where to write the same passes rendered by `vpl`, with the same virtual lights."""
+
+    label: str
+    integrator: str
+    scene: str
+    output: str
+    variant: str = "llvm_ad_rgb"
+    parameters: dict = field(default_factory=dict)
+    defines: dict = field(default_factory=dict)
+    width: int | None = None
+    max_depth: int | None = None
+    seed: int = 0
+    budget: float | None = None
+    spp: int | None = None
+    pass_spp: int | None = None
+    threads: int | None = None
+    vpl_output: str | None = None
+
+
+def run(job):
+    """Run a job in a new process and return its result: a dict with the keys of the job that identify it, and
+
+    `width`, `height`; `load_seconds`; `cold_seconds` (the first pass, compilation included); `warm_seconds` (mean of
+    the later passes that are in the image, None if there are none); `seconds`, `spp`, `passes` (of the image);
+    `pass_spp`; `cold_pass_kept`; `peak_memory_bytes`; `statistics` (the integrator's counters, added up, {} if it has
+    none); `rays_per_sample`, `bounds_per_sample`, `cut_size_per_sample` (per pixel sample, None if not counted).
+
+    After a failure it holds `error` (one line) and `traceback` instead.
+    """
+    result = asdict(job)
+    with tempfile.TemporaryDirectory(prefix="manylights-") as folder:
+        job_file, result_file = Path(folder) / "job.json", Path(folder) / "result.json"
+        job_file.write_text(json.dumps(result))
+        environment = os.environ | {"DRJIT_CACHE_DIR": folder}
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+        command = [sys.executable, "-m", "comparison.worker", str(job_file), str(result_file)]
+        status = subprocess.run(command, env=environment).returncode
+        if result_file.exists():
+            return result | json.loads(result_file.read_text())
+    if status < 0:
+        return result | {"error": f"the renderer was ended by {signal.Signals(-status).name}", "traceback": ""}
+    return result | {"error": f"the renderer ended with status {status}", "traceback": ""}
+
+
+def render(job):
+    """Do a job in this process; return the measurements (see `run`)."""
+    set_variant(job.variant)
+    begin = time.perf_counter()
+    file = _parse(job)
+    parameters, scene = file.integrator[1], file.load(job.threads)
+    load_seconds = time.perf_counter() - begin
+
+    progressive = Progressive(scene, job.seed)
+    with tqdm(total=job.budget or job.spp, desc=job.label, unit="s" if job.budget else "spp", disable=None) as bar:
+        cold, kept = _measure(progressive, job, bar)
+    passes, spp, pixels = progressive.passes, progressive.spp, progressive.pixels
+    warm = [one.seconds for one in passes[1 if kept else 0 :]]
+    statistics = total_statistics(passes)
+    result = {
+        "parameters": parameters,
+        "height": progressive.image.shape[0],
+        "width": progressive.image.shape[1],
+        "load_seconds": load_seconds,
+        "cold_seconds": cold,
+        "warm_seconds": sum(warm) / len(warm) if warm else None,
+        "seconds": progressive.seconds,
+        "spp": spp,
+        "passes": len(passes),
+        "pass_spp": max(one.spp for one in passes),
+        "cold_pass_kept": kept,
+        "peak_memory_bytes": _peak_memory(),
+        "statistics": statistics,
+    }
+    for key, counter in (("rays", "shadow_rays"), ("bounds", "bound_computations"), ("cut_size", "cut_size")):
+        result[f"{key}_per_sample"] = statistics[counter] / (pixels * spp) if counter in statistics else None
+
+    described = {key: result[key] for key in ("parameters", "spp", "passes", "seconds", "cold_seconds")}
+    described |= {"integrator": job.integrator, "scene": job.scene, "seed": job.seed, **versions()}
+    images.write_exr(job.output, progressive.image, progressive.channels, described)
+    if job.vpl_output:
+        _render_vpl(job, passes, described)
+    return result
+
+
+def _parse(job):
+    """Return the `SceneFile` of a job with its integrator."""
+    file = SceneFile(job.scene, job.defines)
+    if job.width:
+        file.set_width(job.width)
+    if job.max_depth is not None:
+        file.set_max_depth(job.max_depth)
+    file.set_integrator(job.integrator, job.parameters)
+    return file
+
+
+def _measure(progressive, job, bar):
+    """Render the passes of a job. Return the seconds of the first, cold pass, and whether it is in the image.
+
+    It is not, so that times are warm, unless it alone took more than the budget (or `LONG_PASS`): compilation is then
+    small next to it.
+    """
+    unused = (pass_seed(job.seed, index) for index in count(UNUSED_PASSES))
+    sizes = pass_sizes(job.spp, progressive.pixels, job.pass_spp) if job.spp else [job.pass_spp or 1]
+    cold = progressive.render(sizes[0], next(unused)).seconds
+    kept = cold > (job.budget or LONG_PASS)
+    if not kept:
+        progressive.restart()
+    if job.spp:
+        for spp in sizes[len(progressive.passes) :]:
+            progressive.render(spp)
+            bar.update(spp)
+    elif not kept:
+        spp = job.pass_spp or _samples_of_a_pass(progressive, job.budget / PASSES_IN_BUDGET, unused)
+        progressive.restart()
+        while not progressive.passes or progressive.seconds + progressive.passes[-1].seconds / 2 < job.budget:
+            one = progressive.render(spp)
+            bar.update(min(one.seconds, bar.total - bar.n))
+    return cold, kept
+
+
+def _samples_of_a_pass(progressive, seconds, seeds):
+    """Return the samples per pixel of passes of about the given time, found by rendering some.
+
+    One if that takes half of it: every pass has virtual lights of its own. More where the cost of starting a pass would
+    matter.
+    """
+    largest = largest_pass(progressive.pixels)
+    if largest < 4 or progressive.render(1, next(seeds)).seconds > seconds / 2:
+        return 1
+    spp = 4
+    progressive.render(spp, next(seeds))  # Mitsuba compiles other kernels for four samples and more
+    while spp < largest:
+        growth = seconds / progressive.render(spp, next(seeds)).seconds
+        if growth < 1.5:
+            break
+        spp = min(largest, int(spp * growth))
+    return spp
+
+
+def _render_vpl(job, passes, described):
+    """Render the passes of another integrator (same seeds and parameters, so same lights and camera rays) by `vpl`, and
+    write the image, which is all that the other one approximates."""
+    file = _parse(job)
+    file.set_integrator("vpl", keep=None)
+    parameters, progressive = file.integrator[1], Progressive(file.load(job.threads), job.seed)
+    for one in tqdm(passes, desc=f"{job.label}: reference by vpl", unit="pass", disable=None):
+        progressive.render(one.spp, one.seed)
+    described |= {"integrator": "vpl", "parameters": parameters, "seconds": progressive.seconds}
+    images.write_exr(job.vpl_output, progressive.image, progressive.channels, described)
+
+
+def _peak_memory():
+    """Return the largest memory that this process has had so far, in bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def main():
+    job_file, result_file = map(Path, sys.argv[1:])
+    try:
+        result = render(Job(**json.loads(job_file.read_text())))
+    except Exception as error:
+        result = {"error": explain(error), "traceback": traceback.format_exc()}
+    except KeyboardInterrupt:
+        return 130  # said by the process that waits for this one
+    result_file.write_text(json.dumps(result))
+    return 1 if "error" in result else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

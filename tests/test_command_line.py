@@ -1,0 +1,183 @@
+"""manylights.py: options, errors, files, and Ctrl-C."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import manylights
+from comparison import command_line, images
+
+ROOT = Path(__file__).resolve().parent.parent
+CORNELL = str(ROOT / "scenes" / "cornell.xml")
+TINY = ["-D", "resx=16", "-D", "resy=16"]
+
+
+def run(*arguments):
+    """Run the command in this process; return its exit status."""
+    try:
+        return manylights.main([str(argument) for argument in arguments])
+    except SystemExit as error:
+        return error.code
+
+
+def process(*arguments):
+    """Start the command in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / "manylights.py"), *map(str, arguments)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("3", 3), ("-1", -1), ("0.02", 0.02), ("1e-3", 1e-3), ("true", True), ("False", False), ("vpl", "vpl"), ("", "")],
+)
+def test_values_of_parameters(text, value):
+    found = command_line.value(text)
+    assert found == value and type(found) is type(value)
+
+
+def test_exr_file_says_how_it_was_made(tmp_path, capsys):
+    output = tmp_path / "a.exr"
+    assert run(CORNELL, *TINY, "-o", output, "--spp", 5, "--pass-spp", 2, "--seed", 3, "-p", "rr_depth=4") == 0
+    image, _, metadata = images.read_exr(output)
+    assert image.shape == (16, 16, 3) and image.mean() > 0
+    expected = {"integrator": "path", "seed": 3, "spp": 5, "passes": 3, "variant": "llvm_ad_rgb"}
+    assert {key: metadata[key] for key in expected} == expected
+    assert json.loads(metadata["parameters"]) == {"max_depth": 6, "rr_depth": 4}
+    assert metadata["mitsuba"] == mi.__version__ and metadata["render_seconds"] > 0
+    written = capsys.readouterr()
+    assert str(output) in written.out
+    assert written.err == ""  # no progress bar where nobody watches
+
+
+def test_one_pass_is_what_mitsuba_renders(tmp_path):
+    assert run(CORNELL, *TINY, "-o", tmp_path / "a.exr", "--spp", 4, "--seed", 9) == 0
+    expected = mi.render(mi.load_file(CORNELL, resx=16, resy=16), spp=4, seed=9).numpy()
+    image = images.colour(*images.read_exr(tmp_path / "a.exr")[:2])
+    np.testing.assert_allclose(image, expected, rtol=1e-5)
+
+
+def test_default_output_is_beside_the_scene(tmp_path):
+    scene = tmp_path / "box.xml"
+    scene.write_text(Path(CORNELL).read_text())
+    assert run(scene, *TINY, "-D", "spp=1") == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["box.exr", "box.xml"]
+
+
+@pytest.mark.parametrize("exposure", [[], ["--exposure", "1.5"]])
+def test_png_file_is_tone_mapped(tmp_path, exposure):
+    assert run(CORNELL, *TINY, "-o", tmp_path / "a.png", "--spp", 16, *exposure) == 0
+    pixels = np.array(mi.Bitmap(str(tmp_path / "a.png")))
+    assert pixels.shape == (16, 16, 3) and pixels.dtype == np.uint8
+    assert 40 < pixels.mean() < 230
+
+
+def test_integrator_is_replaced_and_its_channels_are_kept(tmp_path):
+    output = tmp_path / "a.exr"
+    parameters = ["-i", "vpl", "-p", "vpl_count=300", "-p", "aovs=shadow_rays", "-D", "max_depth=3"]
+    assert run(CORNELL, *TINY, "-o", output, "--spp", 1, *parameters) == 0
+    image, channels, metadata = images.read_exr(output)
+    assert channels == ["B", "G", "R", "shadow_rays"]
+    assert image[..., 3].max() > 0
+    assert json.loads(metadata["parameters"])["max_depth"] == 3
+
+
+def test_mono_variant(tmp_path):
+    with process(CORNELL, *TINY, "-o", tmp_path / "a.exr", "--spp", 1, "-m", "llvm_ad_mono") as mono:
+        assert mono.wait(60) == 0, mono.stderr.read()
+    assert images.read_exr(tmp_path / "a.exr")[1] == ["Y"]
+
+
+def test_single_thread_does_not_hang(tmp_path):
+    with process(CORNELL, *TINY, "-o", tmp_path / "a.exr", "--spp", 1, "-t", 1) as single:
+        assert single.wait(60) == 0, single.stderr.read()
+    assert (tmp_path / "a.exr").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["nosuch.xml"], 2, "no scene file 'nosuch.xml'"),
+        ([CORNELL, "-m", "bogus"], 2, "unknown variant 'bogus'; there are"),
+        ([CORNELL, "-D", "bogus"], 2, "'bogus' is not of the form key=value"),
+        ([CORNELL, "-D", "bogus=1"], 1, "$bogus=1"),
+        ([CORNELL, "-i", "nosuch"], 2, "unknown integrator 'nosuch'; there are vpl"),
+        ([CORNELL, "-i", "path", "-p", "bogus=1"], 1, '"bogus"'),
+        ([CORNELL, "-o", "nosuch/a.exr"], 2, "for the output"),
+        ([CORNELL, "-o", "a.jpg"], 2, "must be an .exr or a .png"),
+        ([CORNELL, "-s", "1"], 2, "no sensor 1: the scene has 1"),
+        ([CORNELL, "--spp", "0"], 2, "'0' is not a positive whole number"),
+        ([CORNELL, "--seed", "-1"], 2, "'-1' is not a whole number"),
+        (["SENSORLESS"], 1, "no sensor"),
+        (["NO_INTEGRATOR"], 2, "has no integrator"),
+        (["BROKEN"], 1, "Parsing of XML file"),
+    ],
+)
+def test_errors_are_one_line(tmp_path, monkeypatch, capsys, arguments, status, message):
+    monkeypatch.chdir(tmp_path)
+    for name, content in (
+        ("SENSORLESS", '<shape type="sphere"/></scene>'),
+        ("NO_INTEGRATOR", '<sensor type="perspective"/></scene>'),
+        ("BROKEN", '<sensor type="perspective">'),
+    ):
+        (tmp_path / name).write_text(f'<scene version="3.0.0">{content}')
+    assert run(*arguments) == status
+    written = capsys.readouterr()
+    assert message in written.err and "Traceback" not in written.err
+    assert written.out == ""
+    assert not list(tmp_path.glob("*.exr"))
+
+
+def test_message_of_an_integrator_is_not_hidden(capsys):
+    class Failing(mi.SamplingIntegrator):
+        def sample(self, *_):
+            raise ValueError("too many lights to count")
+
+        def to_string(self):
+            return "Failing"
+
+    mi.register_integrator("failing", Failing)
+    assert run(CORNELL, *TINY, "-i", "failing", "-o", os.devnull + ".exr") in (1, 2)
+    assert "too many lights to count" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("interruptions", "passes"), [([3], 2), ([3, 3], 2), ([1], 0)])
+def test_interruption_writes_what_is_there(tmp_path, monkeypatch, capsys, interruptions, passes):
+    """Ctrl-C comes during the pass of that number, once or twice."""
+    calls, original = [], mi.render
+
+    def render(*arguments, **keywords):
+        calls.append(1)
+        for _ in range(interruptions.count(len(calls))):
+            signal.raise_signal(signal.SIGINT)
+        return original(*arguments, **keywords)
+
+    monkeypatch.setattr(mi, "render", render)
+    assert run(CORNELL, *TINY, "-o", tmp_path / "a.exr", "--spp", 1000, "--pass-spp", 4) == 130
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    if passes:
+        assert f"interrupted; wrote {4 * passes} samples per pixel" in said
+        assert images.read_exr(tmp_path / "a.exr")[2]["spp"] == 4 * passes
+    else:
+        assert "nothing was written" in said and not list(tmp_path.iterdir())
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_interruption_reaches_a_process(tmp_path):
+    with process(CORNELL, "-o", tmp_path / "a.exr", "--spp", 10**6, "--pass-spp", 1) as rendering:
+        time.sleep(3)
+        rendering.send_signal(signal.SIGINT)
+        _, said = rendering.communicate(timeout=60)
+    assert rendering.returncode in (130, -signal.SIGINT)  # the latter where it had not even begun
+    assert rendering.returncode < 0 or "interrupted" in said
+    assert all(file.name == "a.exr" for file in tmp_path.iterdir())

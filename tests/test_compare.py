@@ -1,0 +1,302 @@
+"""compare.py and what it is made of: scene files, passes, images, references, workers, reports."""
+
+import json
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import compare
+from comparison import images, references, rendering, worker
+from comparison.scene_files import SceneFile
+
+ROOT = Path(__file__).resolve().parent.parent
+CORNELL = ROOT / "scenes" / "cornell.xml"
+
+
+def cornell(width=16, **defines):
+    file = SceneFile(CORNELL, defines)
+    file.set_width(width)
+    return file
+
+
+# --- Scene files ---
+
+
+def test_replacing_an_integrator_keeps_what_it_shows():
+    file = cornell(max_depth="4")
+    file.set_integrator("path", {"rr_depth": 3, "hide_emitters": True})
+    file.set_integrator("direct", {"emitter_samples": 2})
+    assert file.integrator == ("direct", {"hide_emitters": True, "emitter_samples": 2})  # it has no max_depth
+    file = cornell(max_depth="4")
+    file.set_integrator("volpath", {"rr_depth": 9})
+    assert file.integrator == ("volpath", {"max_depth": 4, "rr_depth": 9})
+    assert "max_depth = 4" in str(file.load().integrator())
+
+
+def test_unknown_parameters_are_refused_even_if_looked_at():
+    file = cornell()
+    file.set_integrator("path", {"bogus": 1})
+    assert file.integrator[1]["bogus"] == 1
+    file.fingerprint()
+    with pytest.raises(RuntimeError, match="bogus"):
+        file.load()
+
+
+def test_integrator_can_be_added(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text('<scene version="3.0.0"><sensor type="perspective"/><emitter type="constant"/></scene>')
+    file = SceneFile(path)
+    assert file.integrator == (None, {})
+    assert file.name == tmp_path.name
+    file.set_integrator("direct")
+    assert "DirectIntegrator" in str(file.load().integrator())
+
+
+def test_scene_without_sensor_is_refused(tmp_path):
+    (tmp_path / "scene.xml").write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
+    with pytest.raises(ValueError, match="no sensor"):
+        SceneFile(tmp_path / "scene.xml")
+
+
+def test_width_keeps_the_aspect():
+    file = SceneFile(CORNELL, {"resx": "640", "resy": "360"})
+    file.set_width(64)
+    assert file.size == (64, 36)
+
+
+def test_fingerprint_follows_everything_that_matters(tmp_path):
+    bitmap, scene = tmp_path / "light.pfm", tmp_path / "scene.xml"
+    bitmap.write_bytes(b"1")
+    scene.write_text(
+        '<scene version="3.0.0"><default name="spp" value="4"/><default name="depth" value="4"/>'
+        '<sensor type="perspective"><sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>'
+        '</sensor><integrator type="path"><integer name="max_depth" value="$depth"/></integrator>'
+        '<emitter type="envmap"><string name="filename" value="light.pfm"/></emitter></scene>'
+    )
+    before = SceneFile(scene).fingerprint()
+    assert SceneFile(scene, {"spp": "9"}).fingerprint() == before
+    assert SceneFile(scene, {"depth": "9"}).fingerprint() != before
+    bitmap.write_bytes(b"2")
+    assert SceneFile(scene).fingerprint() != before
+
+
+# --- Passes ---
+
+
+def test_pass_seeds_differ_and_begin_with_the_seed():
+    seeds = [rendering.pass_seed(seed, index) for seed in (0, 1, 2) for index in range(100)]
+    assert seeds[::100] == [0, 1, 2]
+    assert len(set(seeds)) == 300
+    assert all(0 <= seed < 2**32 for seed in seeds)
+
+
+def test_pass_sizes():
+    assert rendering.pass_sizes(5, 10**9) == [1] * 5
+    assert rendering.pass_sizes(100, 2**16) == [32, 32, 32, 4]
+    assert rendering.pass_sizes(3, 16) == [3]
+    assert rendering.pass_sizes(5, 16, pass_spp=2) == [2, 2, 1]
+
+
+def test_progressive_is_the_weighted_mean_of_its_passes():
+    scene = cornell().load()
+    progressive = rendering.Progressive(scene, seed=5)
+    for spp in (1, 3):
+        progressive.render(spp)
+    refused = progressive.render(8, accept=lambda: False)
+    assert refused is None
+    one, three = (mi.render(scene, seed=rendering.pass_seed(5, i), spp=spp).numpy() for i, spp in ((0, 1), (1, 3)))
+    np.testing.assert_allclose(progressive.image, (one + 3.0 * three) / 4, rtol=1e-5)
+    assert (progressive.spp, len(progressive.passes), progressive.channels) == (4, 2, ["R", "G", "B"])
+    assert progressive.seconds > 0
+
+
+def test_statistics_add_up():
+    statistics = [
+        {"shadow_rays": 3, "seconds": {"trace": 1.0}, "lights": {"omni": 7}},
+        {"shadow_rays": 4, "seconds": {"trace": 0.5, "cut": 1.0}, "lights": {"omni": 8}},
+    ]
+    total = rendering.total_statistics([rendering.Pass(0, 1, 1.0, one) for one in statistics])
+    assert total == {"shadow_rays": 7, "seconds": {"trace": 1.5, "cut": 1.0}, "lights": {"omni": 8}}
+    assert statistics[0]["seconds"] == {"trace": 1.0}
+
+
+# --- Images ---
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_exr_files_keep_channels_and_metadata(tmp_path, half):
+    image = np.random.default_rng(0).random((5, 7, 4))
+    metadata = {"spp": 4, "seconds": 1.5, "name": "path", "seed": 2**32 - 1, "parameters": {"a": 1}, "flag": True}
+    images.write_exr(tmp_path / "a.exr", image, ["R", "G", "B", "dd.T"], metadata, half)
+    read, channels, found = images.read_exr(tmp_path / "a.exr")
+    assert channels == ["B", "G", "R", "dd.T"]
+    np.testing.assert_allclose(images.colour(read, channels), image[..., :3], rtol=1e-3 if half else 1e-6)
+    np.testing.assert_allclose(read[..., 3], image[..., 3], rtol=1e-3 if half else 1e-6)
+    assert {key: found[key] for key in metadata} == metadata | {
+        "seed": "4294967295", "parameters": '{"a": 1}', "flag": "true",
+    }  # fmt: skip
+    assert [file.name for file in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_failed_write_leaves_the_old_file(tmp_path):
+    (tmp_path / "a.png").write_text("old")
+    with pytest.raises(RuntimeError), images.replacing(tmp_path / "a.png") as temporary:
+        temporary.write_text("new, but")
+        raise RuntimeError("disk full")
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("a.png", "old")]
+
+
+def test_tone_mapping():
+    rgb = np.zeros((20, 20, 3))
+    rgb[:2], rgb[2:4], rgb[4:] = 4.0, np.inf, 2.0
+    exposure = images.automatic_exposure(rgb)
+    assert exposure == pytest.approx(0.2)
+    mapped = images.tone_map(rgb, exposure)
+    assert mapped.dtype == np.uint8
+    assert mapped[0, 0, 0] == round(255 * (1.055 * 0.8 ** (1 / 2.4) - 0.055))
+    assert images.automatic_exposure(np.zeros((4, 4, 3))) == 1
+
+
+def test_false_colours_get_brighter_with_the_error():
+    errors = np.array([[0.0, 0.01, 0.05, 0.2, 0.7, 1.0, 50.0, np.nan]])
+    brightness = images.false_colours(errors).astype(int).sum(axis=-1)[0]
+    assert np.all(np.diff(brightness) >= 0)
+    assert brightness[0] == brightness[1] < brightness[2] < brightness[3] < brightness[4] < brightness[5]
+
+
+def test_colour_of_luminance_and_of_nothing():
+    assert images.colour(np.ones((2, 2, 1)), ["Y"]).shape == (2, 2, 3)
+    with pytest.raises(ValueError, match="no colour channels among depth"):
+        images.colour(np.ones((2, 2, 1)), ["depth"])
+
+
+# --- References ---
+
+
+def test_batches_are_mean_and_standard_error(tmp_path):
+    samples = np.random.default_rng(0).random((9, 4, 4, 3))
+    batches = references.Batches(batch_spp=3)
+    for image in samples[:5]:
+        batches.add(image)
+    batches.write(tmp_path / "a.exr", {"integrator": "path"})
+    batches = references.Batches.read(tmp_path / "a.exr")
+    for image in samples[5:]:
+        batches.add(image)
+    assert (batches.spp, batches.count) == (27, 9)
+    np.testing.assert_allclose(batches.mean, samples.mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(batches.standard_error, samples.std(axis=0, ddof=1) / 3, rtol=1e-5)
+
+
+def test_path_traced_references_are_kept_and_continued(tmp_path):
+    first = references.path_traced(cornell(), 32, tmp_path)
+    again = references.path_traced(cornell(), 16, tmp_path)
+    np.testing.assert_array_equal(first.image, again.image)
+    more = references.path_traced(cornell(), 128, tmp_path)
+    assert (first.description["spp"], more.description["spp"], first.size) == (32, 128, (16, 16))
+    assert np.median(more.standard_error / first.standard_error) == pytest.approx(0.5, rel=0.3)
+    at_once = references.path_traced(cornell(), 128, tmp_path / "other")
+    assert np.abs(more.image - at_once.image).sum() < 0.2 * at_once.image.sum()
+    assert len(list(tmp_path.glob("*.exr"))) == 1
+
+
+def test_shipped_reference_fits_the_shipped_hall():
+    path = ROOT / "scenes" / "hall_reference.exr"
+    reference = references.read(path)
+    assert path.stat().st_size < 300_000
+    assert reference.description["command"].startswith("python -m comparison.references scenes/hall.xml")
+    file = SceneFile(ROOT / "scenes" / "hall.xml")
+    assert reference.description["max_depth"] == file.integrator[1]["max_depth"]
+    file.set_width(reference.size[0])
+    assert file.size == reference.size
+    image = mi.render(file.load(), spp=64).numpy()
+    assert image.mean() == pytest.approx(reference.image.mean(), rel=0.03)
+
+
+# --- Workers ---
+
+
+def test_worker_measures_within_a_time_budget(tmp_path):
+    job = worker.Job("p", "path", str(CORNELL), str(tmp_path / "a.exr"), width=16, budget=0.5, max_depth=3)
+    result = worker.run(job)
+    assert "error" not in result
+    assert result["parameters"] == {"max_depth": 3}
+    assert 0.25 < result["seconds"]
+    assert result["cold_seconds"] > 0 and result["warm_seconds"] > 0
+    assert result["spp"] == result["passes"] * result["pass_spp"]
+    assert result["peak_memory_bytes"] > 1e7
+    assert result["rays_per_sample"] is None
+    image, _, metadata = images.read_exr(tmp_path / "a.exr")
+    assert image.shape == (16, 16, 3) and metadata["integrator"] == "path"
+
+
+def test_worker_that_dies_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.setattr(worker.sys, "executable", "/bin/false")
+    result = worker.run(worker.Job("p", "path", str(CORNELL), str(tmp_path / "a.exr"), spp=1))
+    assert result["error"] == "the renderer ended with status 1"
+
+
+# --- The command ---
+
+
+def test_comparison_reports_results_and_failures(tmp_path, capsys):
+    broken = tmp_path / "broken.xml"
+    broken.write_text("<scene version='3.0.0'>")
+    out = tmp_path / "out"
+    status = compare.main([
+        str(CORNELL), str(broken), "-i", "path,direct,bad=path", "-p", "bad.bogus=1", "--spp", "4", "--width", "16",
+        "--reference", "path:64", "--cache", str(tmp_path / "cache"), "-o", str(out), "--seed", "7",
+    ])  # fmt: skip
+    assert status == 1
+    printed = capsys.readouterr().out
+    assert "bad: FAILED" in printed and "broken: FAILED" in printed
+
+    results = json.loads((out / "results.json").read_text())
+    assert results["seed"] == 7 and results["versions"]["mitsuba"] and results["machine"]["cores"]
+    scene, failed = results["scenes"]
+    assert "error" in failed and scene["hash"] and scene["reference"]["spp"] == 64
+    path, direct, bad = scene["renders"]
+    assert "bogus" in bad["error"]
+    assert path["spp"] == 4 and path["errors"]["relmse"] > 0
+    assert direct["errors"]["bias"] < -0.1
+    for name in ("cornell.path.exr", "cornell.path.png", "cornell.direct.error.png", "cornell.reference.png"):
+        assert (out / name).is_file()
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 5
+    assert "http" not in page and "bogus" in page
+
+
+def test_reference_by_vpl_shares_the_lights(tmp_path, capsys):
+    status = compare.main([
+        str(CORNELL), "-i", "path,all=vpl", "-p", "all.vpl_count=300", "--spp", "1", "--width", "16",
+        "--max-depth", "3", "--reference", "vpl", "-o", str(tmp_path),
+    ])  # fmt: skip
+    assert status == 0, capsys.readouterr().out
+    path, every = json.loads((tmp_path / "results.json").read_text())["scenes"][0]["renders"]
+    assert "errors" not in path
+    assert every["errors"]["relative_l1"] < 1e-4
+    assert every["rays_per_sample"] > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "no scene given"),
+        (["nosuch.xml"], "no scene file 'nosuch.xml'"),
+        ([str(CORNELL), "-i", "nosuch"], "unknown integrator 'nosuch'; there are"),
+        ([str(CORNELL), "-i", "path,path"], "'path' is no name of its own"),
+        ([str(CORNELL), "-p", "vpl.error=1"], "LABEL is path or lightcuts"),
+        ([str(CORNELL), "-r", "path:many"], "not of the form path:SPP"),
+        ([str(CORNELL), "-r", "nosuch.exr"], "neither a file"),
+        ([str(CORNELL), "--spp", "1", "--time", "1"], "not allowed with"),
+        ([str(CORNELL), "-m", "bogus"], "unknown variant 'bogus'"),
+    ],
+)
+def test_usage_errors(arguments, message, capsys):
+    try:
+        status = compare.main(arguments)
+    except SystemExit as error:
+        status = error.code
+    assert status == 2
+    assert message in capsys.readouterr().err
