@@ -1,0 +1,223 @@
+"""Lightcuts against the sum of all lights, against bare shadow rays, and against ``path``.
+
+    ./run -- python benchmarks/lightcuts.py [--scenes NAME ...] [--parts brute rays cold path]
+
+brute  same VPLs, one run: time and error of ``lightcuts`` at 1% against plugin ``vpl``, whose sum is made for a fixed
+       random subset of points and its time scaled to all of them.
+rays   shadow rays per second of the whole cut evaluation, against the same rays traced alone in one batch.
+cold   first render in a fresh process with an empty kernel cache, against ``path``.
+path   error at equal time and time at equal error against the path-traced references.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+mi.set_variant("llvm_ad_rgb")
+
+import integrators  # noqa: E402, F401
+from benchmarks import scenes  # noqa: E402
+from comparison import references  # noqa: E402
+from comparison.metrics import compare  # noqa: E402
+from vpl.arrays import download, upload  # noqa: E402
+from vpl.cuts import collect_cuts, limited_cuts  # noqa: E402
+from vpl.evaluation import sum_all_lights  # noqa: E402
+from vpl.shading import contribution  # noqa: E402
+from vpl.visibility import shadow_ray  # noqa: E402
+
+DEPTH, VPLS, SUBSET = 6, 200_000, 4000
+
+
+def lightcuts(**more):
+    """The plugin with the settings that all parts share."""
+    return mi.load_dict({"type": "lightcuts", "max_depth": DEPTH, "vpl_count": VPLS, "error": 0.01, **more})
+
+
+def brute_force(names) -> None:
+    """Part "brute"."""
+    print(f"\n## lightcuts, error 1%, against all VPLs (width 256, {VPLS} VPLs, max_depth {DEPTH}, warm)")
+    print("scene | VPLs | lightcuts s | of it tree | rays/px | bounds/px | cut | rel. L1 | all VPLs s | ratio")
+    ratios = []
+    for name in names:
+        scene, plugin = scenes.load(name), lightcuts()
+        for _ in range(2):
+            scenes.timed(lambda: mi.render(scene, integrator=plugin, spp=1, seed=0))  # noqa: B023
+        seconds = []
+        for _ in range(3):
+            seconds.append(scenes.timed(lambda: mi.render(scene, integrator=plugin, spp=1, seed=0))[1])  # noqa: B023
+        found, ours = plugin.statistics, float(np.median(seconds))
+        error, brute = _error_and_brute_seconds(scene, plugin)
+        common = sum(found["seconds"].get(stage, 0) for stage in ("scene", "gather", "trace", "direct", "probe"))
+        points = found["gather_points"]
+        ratios.append((common + brute) / ours)
+        print(
+            f"{name} | {sum(found['lights'].values())} | {ours:.2f} | {found['seconds']['tree']:.2f} | "
+            f"{found['shadow_rays'] / points:.0f} | {found['bound_computations'] / points:.0f} | "
+            f"{found['cut_size'] / points:.0f} | {100 * error:.2f}% | {common + brute:.0f} | {ratios[-1]:.0f}",
+            flush=True,
+        )
+    print(f"geometric mean of the ratios: {scenes.geometric_mean(ratios):.0f}")
+
+
+def _error_and_brute_seconds(scene, plugin):
+    """Relative L1 of a cut render on a fixed random subset, and seconds of the sum of all lights for all points."""
+    prepared = plugin.prepare(scene, *scenes.camera_rays(scene, 0))
+    points = prepared.paths.points.count
+    difference = total = seconds = 0.0
+    for number, job in enumerate(prepared.jobs):
+        radiance = download(plugin.shade(job).radiance)
+        share = max(round(SUBSET * job.batch.count / points), min(job.batch.count, 64))
+        rows = np.sort(np.random.default_rng(number).choice(job.batch.count, min(share, job.batch.count), False))
+        part = job.batch.select(upload(mi.UInt32, rows))
+        few = job.batch.select(upload(mi.UInt32, rows[:16]))
+        sum_all_lights(job.scene, job.traits, job.lights, few)  # compiles the kernel
+        (exact, _), spent = scenes.timed(lambda: sum_all_lights(job.scene, job.traits, job.lights, part))  # noqa: B023
+        exact, direct = download(exact), download(job.direct)[rows]
+        scale = job.batch.count / len(rows)
+        seconds += spent * scale
+        difference += np.abs(radiance[rows] - exact).sum() * scale
+        total += (exact + direct).sum() * scale
+    return difference / total, seconds
+
+
+def ray_rates(names) -> None:
+    """Part "rays"."""
+    print("\n## shadow rays per second: the whole cut evaluation (estimate, cut, shading, rays) against the rays alone")
+    print("scene | rays, M | whole, M/s | alone, M/s | share")
+    for name in names:
+        scene, plugin = scenes.load(name), lightcuts()
+        prepared = plugin.prepare(scene, *scenes.camera_rays(scene, 0))
+        rays = whole = alone = 0.0
+        for job in prepared.jobs:
+            plugin.shade(job)
+            shaded, spent = scenes.timed(lambda: plugin.shade(job))  # noqa: B023
+            rays += float(download(shaded.shadow_rays).sum(dtype=np.int64))
+            whole += spent
+            alone += _seconds_alone(plugin, job) * float(download(shaded.shadow_rays).sum(dtype=np.int64))
+        rate, bare = rays / whole / 1e6, rays / alone / 1e6
+        print(f"{name} | {rays / 1e6:.1f} | {rate:.1f} | {bare:.1f} | {100 * rate / bare:.0f}%", flush=True)
+
+
+def _seconds_alone(plugin, job) -> float:
+    """Seconds per shadow ray of a job's cuts, traced alone in one batch."""
+    threshold = dr.full(mi.Float, plugin.error * job.mean, job.batch.count)
+    threshold, sizes, _ = limited_cuts(job.lights, job.batch, threshold, plugin.max_cut)
+    seconds = count = 0.0
+    for chunk in collect_cuts(job.lights, job.batch, threshold, sizes):
+        light, _ = chunk.representatives()
+        surface, kind = chunk.batch.surfaces_at(chunk.rows), chunk.group.kind
+        active = dr.any(contribution(kind, surface, light, job.lights.smallest_distance) > 0)
+        ray = shadow_ray(kind, surface.interaction, light)
+        dr.eval(ray, active)
+        lanes = dr.compress(active)
+        rays = dr.gather(mi.Ray3f, ray, lanes)
+        dr.eval(rays)
+        scene = job.scene
+        scenes.timed(lambda: scene.ray_test(rays))  # noqa: B023
+        _, spent = scenes.timed(lambda: scene.ray_test(rays))  # noqa: B023
+        seconds += spent
+        count += len(lanes)
+    return seconds / max(count, 1)
+
+
+_COLD = """
+import sys, time
+sys.path.insert(0, {project!r})
+import mitsuba as mi, drjit as dr
+mi.set_variant("llvm_ad_rgb")
+import integrators
+from benchmarks import scenes
+scene = scenes.load({name!r})
+integrator = mi.load_dict({plugin!r})
+print(scenes.timed(lambda: mi.render(scene, integrator=integrator, spp=1, seed=0))[1])
+"""
+
+
+def cold_starts(names) -> None:
+    """Part "cold"."""
+    print("\n## first render in a fresh process with an empty kernel cache (1 sample a pixel; loading not counted)")
+    print("scene | lightcuts s | path s | ratio")
+    for name in names:
+        seconds = {}
+        for plugin in ("lightcuts", "path"):
+            runs = []
+            for _ in range(3):
+                with tempfile.TemporaryDirectory() as cache:
+                    code = _COLD.format(
+                        project=str(scenes.PROJECT), name=name, plugin={"type": plugin, "max_depth": DEPTH}
+                    )
+                    environment = {**os.environ, "DRJIT_CACHE_DIR": cache}
+                    done = subprocess.run(
+                        [sys.executable, "-c", code], env=environment, check=True, capture_output=True, text=True
+                    )
+                    runs.append(float(done.stdout.split()[-1]))
+            seconds[plugin] = float(np.median(runs))
+        ratio = seconds["lightcuts"] / seconds["path"]
+        print(f"{name} | {seconds['lightcuts']:.1f} | {seconds['path']:.1f} | {ratio:.2f}", flush=True)
+
+
+def against_path(names, budget: float) -> None:
+    """Part "path": relMSE (0.1% trimmed, the reference's noise taken off) after ``budget`` seconds, warm."""
+    print(f"\n## against path at {budget:g} s, warm, relMSE trimmed by 0.1%, noise of the reference taken off")
+    print("scene | lightcuts relMSE (bias) | path relMSE | path's time for lightcuts' error, s | times slower")
+    for name in names:
+        if scenes.reference_file(name) is None:
+            continue
+        known = references.read(scenes.reference_file(name))
+        results = {}
+        for label, plugin in (("lightcuts", lightcuts()), ("path", mi.load_dict({"type": "path", "max_depth": DEPTH}))):
+            scene = scenes.load(name)
+            results[label] = _within(scene, plugin, budget, known.image, known.standard_error)
+        ours, path = results["lightcuts"], results["path"]
+        # The variance of path falls as 1 / time
+        needed = path["seconds"] * path["relmse_trimmed"] / max(ours["relmse_trimmed"], 1e-12)
+        mark = " (below the reference's noise)" if "relmse_trimmed" in ours["below_noise"] else ""
+        print(
+            f"{name} | {ours['relmse_trimmed']:.4f} ({100 * ours['bias']:+.1f}%){mark} | "
+            f"{path['relmse_trimmed']:.4f} | "
+            f"{needed:.0f} | {needed / ours['seconds']:.1f}",
+            flush=True,
+        )
+
+
+def _within(scene, plugin, budget: float, reference, noise) -> dict:
+    """Errors of the average of as many passes as fit into ``budget`` seconds, at least one."""
+    mi.render(scene, integrator=plugin, spp=1, seed=99)
+    seconds, total, count = 0.0, 0.0, 0
+    spp = 1 if plugin.class_name() != "PathIntegrator" else 8
+    while count == 0 or seconds * (count + 1) / count <= budget:
+        image, spent = scenes.timed(lambda: mi.render(scene, integrator=plugin, spp=spp, seed=count))  # noqa: B023
+        total, seconds, count = total + np.array(image, np.float64), seconds + spent, count + 1
+    return compare(total / count, reference, noise) | {"seconds": seconds}
+
+
+def main() -> None:
+    """Parse the command line and run the parts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(scenes.NAMES), choices=scenes.NAMES)
+    parser.add_argument("--parts", nargs="+", default=["brute", "rays", "cold", "path"])
+    parser.add_argument("--time", type=float, default=10.0, help="seconds of part path (default: 10)")
+    options = parser.parse_args()
+    names = scenes.available(options.scenes)
+    if "brute" in options.parts:
+        brute_force(names)
+    if "rays" in options.parts:
+        ray_rates(names)
+    if "cold" in options.parts:
+        cold_starts([name for name in ("kitchen", "everything8003") if name in names])
+    if "path" in options.parts:
+        against_path(names, options.time)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""The scenes that the benchmarks use: our own, and the real ones of other people where their folder is present."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+
+PROJECT = Path(__file__).resolve().parent.parent
+SHARED = PROJECT.parent / "shared"
+NAMES = (
+    "cornell", "kitchen", "sponza_crytek", "staircase2", "living_room", "dining_room", "bistro_interior",
+    "veach_ajar", "everything8003",
+)  # fmt: skip
+# Heights at a width of 256, by the aspect of the references
+_HEIGHTS = {"cornell": 256, "everything8003": 256, "bistro_interior": 192}
+
+
+def scene_file(name: str) -> Path:
+    """The XML file of a scene; FileNotFoundError with the reason where it is absent."""
+    if name in ("cornell", "hall"):
+        return PROJECT / "scenes" / f"{name}.xml"
+    path = SHARED / "scenes" / name / "scene.xml"
+    if not path.exists():
+        raise FileNotFoundError(f"{path} is absent: the scenes of other people are not part of this project")
+    return path
+
+
+def reference_file(name: str) -> Path | None:
+    """The path-traced reference of a scene at a width of 256, if there is one."""
+    path = SHARED / "references" / f"{name}.exr"
+    return path if path.exists() else None
+
+
+def load(name: str, width: int = 256):
+    """Load a scene at a width in pixels."""
+    height = round(_HEIGHTS.get(name, 144) * width / 256)
+    return mi.load_file(str(scene_file(name)), resx=width, resy=height)
+
+
+def available(names) -> list[str]:
+    """Those of the names whose files are present; prints the others with the reason."""
+    found = []
+    for name in names:
+        try:
+            scene_file(name)
+            found.append(name)
+        except FileNotFoundError as reason:
+            print(f"skipped {name}: {reason}")
+    return found
+
+
+def camera_rays(scene, seed: int, samples: int = 1):
+    """Sampler and camera rays as ``mi.render`` makes them for a box filter, ``samples`` of them a pixel."""
+    sensor = scene.sensors()[0]
+    width, height = sensor.film().crop_size()
+    sampler = sensor.sampler().clone()
+    sampler.seed(seed, int(width * height * samples))
+    index = dr.arange(mi.UInt32, int(width * height * samples)) // samples
+    pixel = mi.Point2f(mi.Float(index % int(width)), mi.Float(index // int(width)))
+    position = (pixel + sampler.next_2d()) / mi.Vector2f(float(width), float(height))
+    ray, _ = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
+    return sampler, mi.Ray3f(ray)
+
+
+def timed(function):
+    """(result, seconds), the device idle before and after."""
+    dr.sync_thread()
+    start = time.perf_counter()
+    result = function()
+    dr.eval(result)
+    dr.sync_thread()
+    return result, time.perf_counter() - start
+
+
+def geometric_mean(values) -> float:
+    """Geometric mean of positive numbers."""
+    product = 1.0
+    for value in values:
+        product *= value ** (1 / len(values))
+    return product
