@@ -51,3 +51,9 @@ def spectrum_to_rgb(spectrum) -> mi.Color3f:
 def rgb_to_spectrum(rgb):
     """The inverse of :func:`spectrum_to_rgb`."""
     return mi.Spectrum(rgb[0]) if dr.size_v(mi.Spectrum) == 1 else mi.Spectrum(rgb)
+
+
+def channel_mean(spectrum):
+    """Mean over the channels of every lane.  (``dr.mean`` bakes the number of lanes into the kernel, which is then
+    compiled anew for every size.)"""
+    return dr.sum(spectrum) * (1.0 / dr.size_v(type(spectrum)))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .arrays import upload
+from .arrays import channel_mean, upload
 from .light_tree import LightTree
 from .proxies import MaterialProxy
 
@@ -109,7 +109,7 @@ def contribution_bound(kind: str, position, normal, proxy: MaterialProxy, node: 
         # The lobe exists only where the receiver's hemisphere can see the cluster
         lobe = dr.select(receiver > 0, dr.power(mirror, proxy.exponent), 0)
         material += proxy.peak * lobe
-    reflected = dr.mean(material * node.intensity)
+    reflected = channel_mean(material * node.intensity)
     # A point inside a flat box has an infinite factor and no cosine: that is nothing, not NaN
     return dr.select(reflected > 0, factor * reflected, 0)
 

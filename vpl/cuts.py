@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import download, upload
+from .arrays import channel_mean, download, upload
 from .bounds import contribution_bound
 from .evaluation import evaluate_pairs
 from .gather import SceneTraits
@@ -183,7 +183,7 @@ class CutChunk:
         cluster's colour, keeps the estimate unbiased where colours differ.
         """
         light = self.group.lights.gather(self.group.tree.representative(self.nodes))
-        return light, self.group.tree.summed_intensity(self.nodes) / dr.mean(light.intensity)
+        return light, self.group.tree.summed_intensity(self.nodes) / channel_mean(light.intensity)
 
 
 def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):

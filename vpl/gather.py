@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import download, upload
+from .arrays import channel_mean, download, upload
 from .lights import Emitters, finite_or_zero
 from .tracing import derived_seed
 
@@ -129,9 +129,9 @@ def _follow_delta(si, bsdf, flags, sample1, sample2, choice):
     weight = finite_or_zero(mi.unpolarized_spectrum(weight))
     # Materials that do not heed the mask sample any lobe: those samples are not delta and count for nothing here
     weight &= mi.has_flag(flags, mi.BSDFFlags.Delta) & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    delta_level = dr.mean(weight)
-    opaque = 1 - dr.mean(mi.unpolarized_spectrum(bsdf.eval_null_transmission(si)))
-    smooth_level = dr.mean(finite_or_zero(mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si)))) * opaque
+    delta_level = channel_mean(weight)
+    opaque = 1 - channel_mean(mi.unpolarized_spectrum(bsdf.eval_null_transmission(si)))
+    smooth_level = channel_mean(finite_or_zero(mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si)))) * opaque
     smooth = mi.has_flag(flags, mi.BSDFFlags.Smooth) & (opaque > 0)
     probability = dr.clip(delta_level / (delta_level + smooth_level), _LEAST_PROBABILITY, 1 - _LEAST_PROBABILITY)
     probability = dr.select(delta_level > 0, dr.select(smooth, probability, 1), 0)

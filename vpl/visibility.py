@@ -10,6 +10,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .arrays import channel_mean
+
 
 def shadow_ray(kind: str, interaction, light):
     """Ray from a surface to a light that ends just before it; for directional lights it has no end."""
@@ -47,7 +49,7 @@ def _through_null_surfaces(scene, traits, ray, active):
         crossed = active & hit.is_valid() & traits.is_null(hit.shape)
         passed = dr.select(active & hit.is_valid() & ~crossed, 0, passed)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, crossed)
-        share = dr.mean(mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, crossed)))
+        share = channel_mean(mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, crossed)))
         passed = dr.select(crossed, passed * share, passed)
         active = crossed & (passed > 0)
         onward = si.spawn_ray(ray.d)
