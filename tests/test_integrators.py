@@ -278,3 +278,23 @@ def test_odd_scenes_render_without_nan(integrator, name):
         assert image.max() == 0
     else:
         assert image.max() > 0
+
+
+def test_no_kernel_reads_or_writes_outside_of_an_array(capfd):
+    """Dr.Jit's debug mode checks every index; a mirror and a pane give camera paths of several waves."""
+    objects = {
+        "mirror": wall([-0.4, 0, -0.5], [0, 1, 0], 20, 0.35, bsdf={"type": "conductor"}),
+        "pane": wall([0.4, 0, 0.2], [0, 1, 0], 0, 0.3, bsdf={"type": "thindielectric"}),
+    }
+    scene = mi.load_dict(closed_box(LIGHTS["point"]() | LIGHTS["spot"]() | {"lamp": area_light()}, **objects))
+    plugin = mi.load_dict({"type": "lightcuts", "vpl_count": 300, "max_depth": 5, "max_cut": 50})
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 1024)
+    ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, sampler.next_2d(), mi.Point2f(0.5))
+    with dr.scoped_set_flag(dr.JitFlag.Debug, True):
+        radiance, _, _ = plugin.sample(scene, sampler, mi.Ray3f(ray))
+        # The check itself works
+        dr.eval(radiance, dr.gather(mi.Float, mi.Float(1, 2, 3), dr.opaque(mi.UInt32, 99, 2)))
+        dr.sync_thread()
+    reports = [line for line in capfd.readouterr().err.splitlines() if "out-of-bounds" in line]
+    assert len(reports) == 1 and "99" in reports[0], reports

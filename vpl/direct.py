@@ -139,6 +139,5 @@ def direct_light(scene, extended: ExtendedEmitters, traits, points: GatherPoints
         radiance += dr.select(smooth, finite_or_zero(mi.unpolarized_spectrum(value) * found), 0)
         k += 1
     radiance /= mi.Float(total)
-    ray_count = dr.sum(rays)
-    dr.eval(radiance, ray_count)
-    return radiance, int(ray_count[0])
+    dr.eval(radiance, rays)
+    return radiance, int(dr.sum(rays)[0])

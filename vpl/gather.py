@@ -183,6 +183,8 @@ def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughpu
         goes_on &= hit & (depth < max_depth) & dr.any(following > 0) & (~roulette | (random[3] < survival))
         following = dr.select(roulette, following / survival, following)
     next_ray = si.spawn_ray(direction)
+    # Fields that are the same everywhere have one entry: widened, because points are gathered and scattered by index
+    si = dr.select(gathered, si, dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d)))
     dr.eval(emission, hit, gathered, si, weight, goes_on, next_ray.o, next_ray.d, following)
     return emission, hit, (gathered, si, weight), (goes_on, next_ray, following)
 
@@ -208,12 +210,16 @@ def follow_camera_rays(scene, emitters, traits, sampler, seed, ray, active, max_
     area emitters, applied to camera rays only.
     """
     count = dr.width(ray.d)
+    ray.time += dr.zeros(mi.Float, count)
+    ray.maxt += dr.zeros(mi.Float, count)
     lane = dr.arange(mi.UInt32, count)
     active = mi.Bool(active) & (lane < count)
     limits = (dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF))), dr.opaque(mi.UInt32, rr_depth))
     throughput, depth = dr.full(mi.UnpolarizedSpectrum, 1, count), 1
     found = None
     while True:
+        # Opaque, so that the second wave, where there is one, is the same kernel as the first
+        dr.make_opaque(ray, throughput, active)
         random = (sampler.next_1d(), sampler.next_2d(), sampler.next_1d(), sampler.next_1d()) if traits.delta else None
         emitted, hit, gathered, going = _wave(
             scene, emitters, traits, random, ray, throughput, dr.opaque(mi.UInt32, depth), limits, skip, active
@@ -233,7 +239,10 @@ def follow_camera_rays(scene, emitters, traits, sampler, seed, ray, active, max_
         onward = dr.compress(going[0])
         if len(onward) == 0:
             break
-        lane, ray, throughput = (dr.gather(type(x), x, onward) for x in (lane, going[1], going[2]))
+        lane, throughput = (dr.gather(type(x), x, onward) for x in (lane, going[2]))
+        time = dr.gather(mi.Float, ray.time, onward)
+        ray = mi.Ray3f(*(dr.gather(type(x), x, onward) for x in (going[1].o, going[1].d)), time)
+        ray.maxt = dr.full(mi.Float, dr.largest(mi.Float), len(onward))
         depth, active = depth + 1, dr.full(mi.Bool, True, len(onward))
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(derived_seed(seed, 3, depth), len(onward))

@@ -88,9 +88,9 @@ def _bounce(scene, sampler, ray, throughput, power, depth, limits: PathLimits):
     following = dr.select(depth < limits.rr_depth, following, following / survival)
 
     next_ray = si.spawn_ray(direction)
-    bad_count = dr.count(bad)
-    dr.eval(stored, si.p, normal, intensity, alive, next_ray.o, next_ray.d, following, bad_count)
-    return (stored, si.p, normal, intensity), (alive, next_ray.o, next_ray.d, following), int(bad_count[0])
+    # One kernel for everything; a count before would be a kernel of its own that does all the work twice
+    dr.eval(stored, si.p, normal, intensity, alive, next_ray.o, next_ray.d, following, bad)
+    return (stored, si.p, normal, intensity), (alive, next_ray.o, next_ray.d, following), int(dr.count(bad)[0])
 
 
 def _paths_of_group(scene, group, first: int, count: int, total: int, seed: int, limits: PathLimits):
@@ -103,7 +103,7 @@ def _paths_of_group(scene, group, first: int, count: int, total: int, seed: int,
     ray, power = group.sample(stratified, sampler.next_2d(), sampler.next_2d())
     power = mi.unpolarized_spectrum(power) / paths
     origin, direction, throughput = ray.o, ray.d, dr.full(mi.UnpolarizedSpectrum, 1, count)
-    dr.eval(origin, direction, power, throughput)
+    dr.make_opaque(origin, direction, power, throughput)  # so that the first bounce is the same kernel as all others
 
     parts, dropped, depth = [], 0, 1
     while count > 0 and depth <= limits.deepest:
