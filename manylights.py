@@ -33,13 +33,13 @@ def parse(arguments):
     add = parser.add_argument
     add("scene", metavar="SCENE", type=Path, help="scene file (XML)")
     add("-o", "--output", type=Path, metavar="FILE", help=".exr or .png (default: the scene's name, with .exr)")
-    add("-s", "--sensor", type=int, default=0, metavar="INDEX", help="sensor to render with (default: 0)")
+    add("--sensor", type=int, default=0, metavar="INDEX", help="sensor to render with (default: 0)")
     add("-i", "--integrator", metavar="NAME",
         help="replace the scene's integrator, keeping its max_depth, rr_depth and hide_emitters")  # fmt: skip
     add("-p", "--param", action="append", type=parameter, default=[], metavar="KEY=VALUE",
         help="parameter of the integrator, such as error=0.02; repeat for more")  # fmt: skip
     add("--spp", type=positive(int), metavar="N", help="samples per pixel (default: the scene's)")
-    add("--seed", type=command_line.seed, default=0, metavar="N", help="seed (default: 0)")
+    add("-s", "--seed", type=command_line.seed, default=0, metavar="N", help="seed (default: 0)")
     add("--pass-spp", type=positive(int), metavar="N",
         help="samples per pixel of one pass (default: as many as make two million in all)")  # fmt: skip
     add("--exposure", type=float, metavar="STOPS",
@@ -71,7 +71,7 @@ def load(options):
     parameters = file.integrator[1]
     scene = file.load(options.threads)
     if not 0 <= options.sensor < len(scene.sensors()):
-        raise UsageError(f"no sensor {options.sensor}: the scene has {len(scene.sensors())} (the seed is --seed)")
+        raise UsageError(f"no sensor {options.sensor}: the scene has {len(scene.sensors())}")
     return scene, name, parameters
 
 

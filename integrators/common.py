@@ -104,9 +104,9 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
         self.rr_depth = properties.integer(props, "rr_depth", 5, 1)
         self.vpl_count = properties.integer(props, "vpl_count", 200_000, 1)
         self.direct_count = properties.integer(props, "direct_count", 4096, 1)
-        self.clamping = properties.number(props, "clamping", 0.05, 0)
+        self.clamping = properties.number(props, "clamping", 0.01, 0)
         self.direct = properties.choice(props, "direct", "nee", ("nee", "vpl", "none"))
-        self.emitter_samples = properties.integer(props, "emitter_samples", 1, 1)
+        self.emitter_samples = properties.integer(props, "emitter_samples", 4, 1)
         self.lobe_limit = properties.number(props, "lobe_limit", 1.0, 0)
         self.aovs = properties.words(props, "aovs", AOVS)
         self.statistics: dict = {}

@@ -45,7 +45,7 @@ class VPLIntegrator(ManyLightIntegrator):
 
      * - emitter_samples
        - |int|
-       - Pairs of an emitter and a BSDF sample per gather point with ``direct="nee"``. (Default: 1)
+       - Pairs of an emitter and a BSDF sample per gather point with ``direct="nee"``. (Default: 4)
 
      * - direct_count
        - |int|
@@ -54,7 +54,8 @@ class VPLIntegrator(ManyLightIntegrator):
      * - clamping
        - |float|
        - Smallest distance to a virtual light that stands for a surface, as a fraction of the radius of the scene's
-         bounding sphere; light from nearer is dimmed instead of becoming a bright spot. 0 turns it off. (Default: 0.05)
+         bounding sphere; light from nearer is dimmed instead of becoming a bright spot. 0 turns it off.
+         (Default: 0.01; papers that use fewer lights clamp at 0.05)
 
      * - lobe_limit
        - |float|

@@ -114,7 +114,7 @@ def test_single_thread_does_not_hang(tmp_path):
         ([CORNELL, "-i", "path", "-p", "bogus=1"], 1, '"bogus"'),
         ([CORNELL, "-o", "nosuch/a.exr"], 2, "for the output"),
         ([CORNELL, "-o", "a.jpg"], 2, "must be an .exr or a .png"),
-        ([CORNELL, "-s", "1"], 2, "no sensor 1: the scene has 1"),
+        ([CORNELL, "--sensor", "1"], 2, "no sensor 1: the scene has 1"),
         ([CORNELL, "--spp", "0"], 2, "'0' is not a positive whole number"),
         ([CORNELL, "--seed", "-1"], 2, "'-1' is not a whole number"),
         (["SENSORLESS"], 1, "no sensor"),

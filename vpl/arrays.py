@@ -57,3 +57,10 @@ def channel_mean(spectrum):
     """Mean over the channels of every lane.  (``dr.mean`` bakes the number of lanes into the kernel, which is then
     compiled anew for every size.)"""
     return dr.sum(spectrum) * (1.0 / dr.size_v(type(spectrum)))
+
+
+def ones(count: int):
+    """A spectrum of ones, as evaluated arrays that are distinct for every channel: arrays shared by the channels would
+    make the kernels that first use them other kernels than those that follow."""
+    channels = [dr.opaque(mi.Float, 1.0, count) for _ in range(dr.size_v(mi.UnpolarizedSpectrum))]
+    return mi.UnpolarizedSpectrum(*channels)

@@ -24,7 +24,7 @@ from .surfaces import Batch
 # Pairs that are shaded and traced at a time: bounds the memory whatever the size of image and cuts
 _PAIRS_PER_CHUNK = 1 << 22
 # How the threshold that keeps a cut below its largest size is searched for
-_BRACKET, _BISECTIONS = 3.0, 3
+_BRACKET, _BISECTIONS = 4.0, 2
 
 
 @dataclass
@@ -120,28 +120,30 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
         return threshold, sizes, visits
     index = upload(mi.UInt32, rows)
     part = batch.select(index)
-    spent = dr.zeros(mi.UInt32, len(rows))
+    spent, fitting = dr.zeros(mi.UInt32, len(rows)), [dr.zeros(mi.UInt32, len(rows)) for _ in sizes.count]
 
-    def try_out(values):
-        nonlocal spent
+    def too_large(values):
+        """Which cuts are too large at these thresholds; keeps the sizes of those that are not."""
+        nonlocal spent, fitting
         found = cut_sizes(lights, part, upload(mi.Float, values), max_cut)
+        over = found.total() > max_cut
+        kept = upload(mi.UInt32, ~over) == 1
+        fitting = [dr.select(kept, new, old) for new, old in zip(found.count, fitting, strict=True)]
         spent += sum(found.visits)
-        return found, found.total() > max_cut
+        dr.eval(spent, fitting)
+        return over
 
     low = np.maximum(download(dr.gather(mi.Float, threshold, index)).astype(np.float64), np.finfo(np.float32).tiny)
     high = low * _BRACKET
-    _, over = try_out(high)
-    while over.any():
+    while (over := too_large(high)).any():
         low, high = np.where(over, high, low), np.where(over, high * _BRACKET, high)
-        _, over = try_out(high)
     for _ in range(_BISECTIONS):
         middle = np.sqrt(low * high)
-        _, over = try_out(middle)
+        over = too_large(middle)
         low, high = np.where(over, middle, low), np.where(over, high, middle)
-    final, _ = try_out(high)
     threshold = mi.Float(threshold)
     dr.scatter(threshold, upload(mi.Float, high), index)
-    for target, count in zip(sizes.count, final.count, strict=True):
+    for target, count in zip(sizes.count, fitting, strict=True):
         dr.scatter(target, count, index)
     dr.scatter_add(visits, spent, index)
     dr.eval(threshold, sizes.count, visits)

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import channel_mean, download, upload
+from .arrays import channel_mean, download, ones, upload
 from .lights import Emitters, finite_or_zero
 from .tracing import derived_seed
 
@@ -215,11 +215,11 @@ def follow_camera_rays(scene, emitters, traits, sampler, seed, ray, active, max_
     lane = dr.arange(mi.UInt32, count)
     active = mi.Bool(active) & (lane < count)
     limits = (dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF))), dr.opaque(mi.UInt32, rr_depth))
-    throughput, depth = dr.full(mi.UnpolarizedSpectrum, 1, count), 1
+    throughput, depth = ones(count), 1
     found = None
     while True:
         # Opaque, so that the second wave, where there is one, is the same kernel as the first
-        dr.make_opaque(ray, throughput, active)
+        dr.make_opaque(ray, active)
         random = (sampler.next_1d(), sampler.next_2d(), sampler.next_1d(), sampler.next_1d()) if traits.delta else None
         emitted, hit, gathered, going = _wave(
             scene, emitters, traits, random, ray, throughput, dr.opaque(mi.UInt32, depth), limits, skip, active

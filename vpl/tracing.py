@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import download, spectrum_to_rgb
+from .arrays import download, ones, spectrum_to_rgb
 from .emission import emission_groups
 from .lights import Emitters, VirtualLights
 
@@ -102,8 +102,8 @@ def _paths_of_group(scene, group, first: int, count: int, total: int, seed: int,
     stratified = dr.minimum((mi.Float(lane) + sampler.next_1d()) / paths, dr.one_minus_epsilon(mi.Float))
     ray, power = group.sample(stratified, sampler.next_2d(), sampler.next_2d())
     power = mi.unpolarized_spectrum(power) / paths
-    origin, direction, throughput = ray.o, ray.d, dr.full(mi.UnpolarizedSpectrum, 1, count)
-    dr.make_opaque(origin, direction, power, throughput)  # so that the first bounce is the same kernel as all others
+    origin, direction, throughput = ray.o, ray.d, ones(count)
+    dr.make_opaque(origin, direction, power)
 
     parts, dropped, depth = [], 0, 1
     while count > 0 and depth <= limits.deepest:
