@@ -79,9 +79,14 @@ class Clock:
 
 @dataclass
 class Prepared:
-    """A render before its method has worked: ``direct``, radiance per gather point; ``counts``, for statistics."""
+    """A render before its method has worked.
+
+    ``valid``: camera rays that are opaque in the film's alpha, where an environment counts, as in ``path``; ``direct``:
+    radiance per gather point; ``counts``: for statistics.
+    """
 
     paths: CameraPaths
+    valid: object
     direct: object
     jobs: list[Shading]
     counts: dict
@@ -119,11 +124,6 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
         """Channels that ``sample`` returns besides the radiance."""
         return list(self.aovs)
 
-    def traverse(self, callback):
-        """Expose the numeric parameters to ``mi.traverse``."""
-        for name in ("vpl_count", "direct_count", "clamping", "emitter_samples", "lobe_limit"):
-            callback.put(name, getattr(self, name), mi.ParamFlags.NonDifferentiable)
-
     def light_options(self) -> LightOptions:
         """The part of the properties that decides which lights are made."""
         return LightOptions(
@@ -142,7 +142,7 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
             prepared = self.prepare(scene, sampler, mi.Ray3f(ray), active)
             radiance, counters = self._assemble(prepared, [self.shade(job) for job in prepared.jobs])
         finite = dr.all(dr.isfinite(radiance)) & (self.max_depth > 0)
-        return dr.select(finite, mi.Spectrum(radiance), 0), prepared.paths.valid, counters
+        return dr.select(finite, mi.Spectrum(radiance), 0), prepared.valid, counters
 
     def prepare(self, scene, sampler, ray, active=True) -> Prepared:
         """Everything before the method's own work: camera paths, lights, direct light, batches of gather points."""
@@ -157,7 +157,10 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
             scene, emitters, traits, sampler, seed, ray, active, self.max_depth, self.rr_depth, skip
         )
         clock.lap("gather")
-        prepared = Prepared(paths, dr.zeros(mi.UnpolarizedSpectrum, paths.points.count), [], {}, clock)
+        sky = emitters.environment is not None and not self.hide_emitters
+        prepared = Prepared(
+            paths, paths.valid | (active & sky), dr.zeros(mi.UnpolarizedSpectrum, paths.points.count), [], {}, clock
+        )
         if paths.points.count == 0 or emitters.count == 0 or self.max_depth < 2:
             return prepared
 
@@ -171,7 +174,11 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
             prepared.direct += direct
             prepared.counts["emitter_rays"] = rays
             clock.lap("direct")
-        prepared.counts |= {"lights": lights.counts, "light_paths": lights.paths, "dropped": lights.dropped}
+        prepared.counts |= {
+            "lights": lights.counts,
+            "light_paths": lights.paths,
+            "dropped": lights.dropped + emitters.dropped,
+        }
         if lights.groups:
             prepared.jobs = self._jobs(scene, traits, lights, prepared, seed)
         return prepared
@@ -232,7 +239,7 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
     def describe(self) -> dict:
         """Properties and their values, for ``to_string`` and file metadata."""
         names = ["max_depth", "rr_depth", "vpl_count", "direct_count", "clamping", "direct", "emitter_samples"]
-        values = {name: getattr(self, name) for name in [*names, "lobe_limit"]}
+        values = {name: getattr(self, name) for name in [*names, "lobe_limit", "hide_emitters"]}
         values["max_depth"] = -1 if math.isinf(self.max_depth) else self.max_depth
         return values
 

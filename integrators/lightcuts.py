@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.arrays import download, upload
-from vpl.cuts import cut_sizes, evaluate_cuts, limited_cuts
+from vpl.cuts import evaluate_cuts, limited_cuts
 
 from . import properties
 from .common import Clock, ManyLightIntegrator, Shaded, Shading
@@ -34,11 +34,11 @@ class LightcutsIntegrator(ManyLightIntegrator):
      * - dark_floor
        - |float|
        - Points darker than this fraction of the image's mean are refined as if they had it; 0 holds the bound
-         everywhere, at several times the cost in dark corners. (Default: 0.25)
+         everywhere, at several times the cost in dark corners. (Default: 0.5)
 
      * - max_cut
        - |int|
-       - Most clusters in the cut of a point; 0 is no limit. (Default: 1000)
+       - Most clusters in the cut of a point, at least one per kind of light; 0 is no limit. (Default: 1000)
 
      * - max_depth
        - |int|
@@ -89,10 +89,10 @@ class LightcutsIntegrator(ManyLightIntegrator):
          ``upper_bounds``, ``cut_size``. (Default: none)
 
     Walter et al. 2005, "Lightcuts: a scalable approach to illumination" [LC]. All virtual lights are clustered into
-    one tree per kind (point, spot, oriented, directional); every gather point is lit by a *cut*: clusters that together
-    hold each light once, each stood for by one representative light with the cluster's intensity. The cut is the
-    coarsest whose clusters all have an upper bound of their contribution of at most ``error`` times the radiance of the
-    point.
+    one tree per kind (point, spot, oriented, directional, environment); every gather point is lit by a *cut*: clusters
+    that together hold each light once, each stood for by one representative light with the cluster's intensity. The cut
+    is the coarsest whose clusters all have an upper bound of their contribution of at most ``error`` times the radiance
+    of the point.
 
     What is estimated: emission + direct + indirect light, over the paths that ``path`` counts for the same
     ``max_depth``. Camera rays go on through mirrors, glass and masks. Left out are caustics and light that sharp lobes
@@ -128,7 +128,7 @@ class LightcutsIntegrator(ManyLightIntegrator):
     def __init__(self, props):
         super().__init__(props)
         self.error = properties.number(props, "error", 0.01, 0)
-        self.dark_floor = properties.number(props, "dark_floor", 0.25, 0)
+        self.dark_floor = properties.number(props, "dark_floor", 0.5, 0)
         self.max_cut = properties.integer(props, "max_cut", 1000, 0)
 
     def shade(self, job: Shading) -> Shaded:
@@ -151,13 +151,16 @@ class LightcutsIntegrator(ManyLightIntegrator):
         index = upload(mi.UInt32, rows)
         part = job.batch.select(index)
         threshold = dr.full(mi.Float, _ESTIMATE_ERROR * job.mean, len(rows))
-        sizes = cut_sizes(job.lights, part, threshold)
-        radiance, rays, collected = evaluate_cuts(job.scene, job.traits, job.lights, part, threshold, sizes)
+        threshold, sizes, searched = limited_cuts(job.lights, part, threshold, self.max_cut)
+        # Second representatives: the thresholds must not depend on the lights that the final cuts are made of
+        radiance, rays, collected = evaluate_cuts(
+            job.scene, job.traits, job.lights, part, threshold, sizes, second=True
+        )
         reflected = np.repeat(download(radiance).mean(1, dtype=np.float64), _ESTIMATE_STRIDE)[:count]
         estimate = block_mean(reflected + download(job.direct).mean(1, dtype=np.float64), _ESTIMATE_BLOCK)
         spent = Shaded(None, *(dr.zeros(mi.UInt32, count) for _ in range(3)))
         dr.scatter(spent.shadow_rays, rays, index)
-        dr.scatter(spent.upper_bounds, collected + sum(sizes.visits), index)
+        dr.scatter(spent.upper_bounds, collected + searched, index)
         return estimate, spent
 
     def describe(self):

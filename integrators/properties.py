@@ -17,15 +17,12 @@ def integer(props, name: str, default: int, minimum: int) -> int:
     return value
 
 
-def number(props, name: str, default: float, minimum: float, maximum: float = math.inf, exclusive=False) -> float:
-    """A finite number from ``minimum`` (excluded with ``exclusive``) to ``maximum``."""
+def number(props, name: str, default: float, minimum: float) -> float:
+    """A finite number of at least ``minimum``."""
     value = props.get(name, default)
-    allowed = f"a number {'above' if exclusive else 'of at least'} {minimum:g}"
-    allowed += "" if math.isinf(maximum) else f" and at most {maximum:g}"
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        _fail(props, name, allowed, value)
-    if value < minimum or value > maximum or (exclusive and value == minimum):
-        _fail(props, name, allowed, value)
+    numeric = isinstance(value, int | float) and not isinstance(value, bool)
+    if not numeric or not math.isfinite(value) or value < minimum:
+        _fail(props, name, f"a number of at least {minimum:g}", value)
     return float(value)
 
 

@@ -30,7 +30,7 @@ def proxy_of(albedo, peak, exponent, axis):
 
 def exact(kind, position, normal, albedo, peak, exponent, axis, lights, clamp):
     """Mean contribution of every light at every point, (points, lights) float64, for a BSDF equal to its proxy."""
-    if kind == "directional":
+    if kind in ("directional", "environment"):
         to_light = np.broadcast_to(-lights.direction.astype(np.float64), (len(position), lights.count, 3))
         factor = np.ones(to_light.shape[:2])
     else:
@@ -55,11 +55,11 @@ def scene_of(kind, rng, spread, count=64):
     direction = unit(rng, count) * 0.3 + [0, 0, 1]
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     cone = np.stack([rng.uniform(0.2, 0.9, count), np.full(count, 0.1)], axis=1)
-    where = None if kind == "directional" else position
+    where = None if kind in ("directional", "environment") else position
     return VirtualLights.of(kind, where, direction, rng.uniform(0, 1, (count, 3)) ** 4 + 1e-6, 0, cone)
 
 
-@pytest.mark.parametrize("kind", ["point", "spot", "oriented", "directional"])
+@pytest.mark.parametrize("kind", ["point", "spot", "oriented", "directional", "environment"])
 @pytest.mark.parametrize("spread", [(1, 1, 1), (1, 1, 0), (1, 0, 0), (0, 0, 0), (1e-3, 1, 1e-3)])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_no_light_exceeds_the_bound_of_its_ancestors(kind, spread, seed):
@@ -105,7 +105,7 @@ def test_a_bound_that_is_too_small_would_be_found():
     lights = scene_of("oriented", rng, np.ones(3))
     tree = build_light_tree(lights.position, lights.direction, lights.intensity, np.random.default_rng(5))
     tree.records[:, CONE_COS] = 1.0
-    narrow = DeviceTree("oriented", tree).gather(dr.zeros(mi.UInt32, POINTS))
+    narrow = DeviceTree("oriented", tree, tree.representative).gather(dr.zeros(mi.UInt32, POINTS))
     position, normal = rng.uniform(-3, 3, (POINTS, 3)), unit(rng, POINTS)
     zeros = np.zeros((POINTS, 3))
     albedo = np.full((POINTS, 3), 0.3)

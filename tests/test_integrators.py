@@ -18,7 +18,7 @@ def passes(scene, integrator, count, spp, first_seed=0, **more):
     return np.stack([render(scene, integrator, spp, first_seed + k, **more) for k in range(count)])
 
 
-def assert_same_expectation(ours, reference, alpha=0.01):
+def assert_same_expectation(ours, reference, alpha=0.002):
     """Welch's t test over seeds of tile means and of the image mean, Šidák-corrected over all of them."""
 
     def statistics(renders):

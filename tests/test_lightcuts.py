@@ -171,3 +171,64 @@ def test_light_passes_masks_as_path_says():
     # Crossing the screen costs ``path`` an edge: it needs a larger depth for the same light
     reference = render(scene, "path", 512, 9, max_depth=8).mean()
     assert abs(ours / reference - 1) < 0.06
+
+
+@pytest.mark.parametrize("bsdf", [{"type": "roughdielectric", "alpha": 0.3}, GLOSSY])
+def test_nothing_that_a_material_reflects_has_a_bound_of_zero(bsdf):
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": sensor(), "ball": {"type": "sphere", "bsdf": bsdf}, "sky": {"type": "constant"}}
+    )
+    _, jobs = prepared(scene)
+    batch, sampler = jobs[-1].batch, mi.load_dict({"type": "independent"})
+    sampler.seed(1, batch.count)
+    si, proxy = batch.surfaces.interaction, batch.proxy
+    for _ in range(16):
+        sample, weight = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
+        value = download(mi.Color3f(weight * sample.pdf))
+        to_light = si.to_world(sample.wo)
+        cosine = dr.select(proxy.no_cosine, 1, dr.maximum(dr.dot(batch.normal, to_light), 0))
+        lobe = dr.power(dr.maximum(dr.dot(proxy.axis, to_light), 0), proxy.exponent)
+        bound = download(proxy.base * cosine + dr.select(cosine > 0, proxy.peak * lobe, 0))
+        assert np.all(bound[value > 0] > 0)
+        assert np.mean(value.max(1) > 3 * bound.max(1)) < 0.1
+
+
+def test_a_largest_cut_below_the_number_of_kinds_ends():
+    image = render(mi.load_dict(many_kinds()), "lightcuts", 1, vpl_count=300, max_cut=1)
+    assert np.isfinite(image).all() and image.max() > 0
+
+
+def test_thresholds_do_not_bias_the_image():
+    """Estimates and cuts use different representatives: the mean over trees is the sum over the lights."""
+    scene = mi.load_dict(closed_box({"lamp": area_light()}))
+    ratios = []
+    for seed in range(24):
+        plugin, jobs = prepared(scene, seed, 16, vpl_count=300, error=0.3, dark_floor=0.0)
+        job = jobs[0]
+        exact = download(sum_all_lights(job.scene, job.traits, job.lights, job.batch)[0]).sum()
+        ratios.append(download(plugin.shade(job).radiance).sum() / exact)
+    assert abs(np.mean(ratios) - 1) < 3.5 * np.std(ratios, ddof=1) / np.sqrt(len(ratios)) + 1e-3
+
+
+@pytest.mark.parametrize("direct", ["nee", "vpl"])
+def test_a_sky_behind_masks_and_coloured_panes_is_seen_as_path_sees_it(direct):
+    tint = {"type": "rgb", "value": [1.0, 0.3, 0.1]}
+    scene = {
+        "type": "scene", "sensor": sensor(16), "sky": {"type": "constant"},
+        "floor": wall([0, 0, -1], [0, 1, 0], 0, 4.0),
+        "pane": wall([0, 0, -0.8], [0, 1, 0], 0, 9.0, bsdf={
+            "type": "thindielectric", "specular_transmittance": tint, "specular_reflectance": 0.0,
+        }),
+    }  # fmt: skip
+    scene = mi.load_dict(scene)
+    ours = render(scene, "lightcuts", 64, max_depth=4, direct=direct, direct_count=256).mean((0, 1))
+    assert np.allclose(ours, render(scene, "path", 256, 5, max_depth=4).mean((0, 1)), rtol=0.06)
+
+
+def test_alpha_is_that_of_path_with_and_without_a_sky():
+    for sky in ({}, {"sky": {"type": "constant"}}):
+        camera = sensor(16)
+        camera["film"]["pixel_format"] = "rgba"
+        scene = mi.load_dict({"type": "scene", "sensor": camera, "ball": {"type": "sphere"}, **sky})
+        alphas = [render(scene, name, 16)[..., 3] for name in ("lightcuts", "path")]
+        assert np.allclose(*alphas, atol=0.3) and np.allclose(alphas[0].mean(), alphas[1].mean(), atol=0.02)

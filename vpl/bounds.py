@@ -17,6 +17,7 @@ import mitsuba as mi
 
 from .arrays import channel_mean, upload
 from .light_tree import LightTree
+from .lights import AT_INFINITY
 from .proxies import MaterialProxy
 
 
@@ -34,10 +35,14 @@ class Node:
 
 
 class DeviceTree:
-    """A light tree's packed records on the device."""
+    """A light tree's packed records on the device.
 
-    def __init__(self, kind: str, tree: LightTree):
+    ``second_representative``: (2n - 1,) another light per node, drawn independently of the tree's own.
+    """
+
+    def __init__(self, kind: str, tree: LightTree, second_representative):
         self.kind = kind
+        self._second = upload(mi.UInt32, second_representative)
         self.count = len(tree.records)
         self._records = upload(mi.Float, tree.records)
 
@@ -58,8 +63,10 @@ class DeviceTree:
         """Scalar intensity of a node: the mean over channels of the sum over its lights."""
         return dr.gather(mi.Float, self._records, index * 16 + 10, active)
 
-    def representative(self, index, active=True):
-        """Index of a node's representative light."""
+    def representative(self, index, active=True, second=False):
+        """Index of a node's representative light, or of its second one."""
+        if second:
+            return dr.gather(mi.UInt32, self._second, index, active)
         return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._records, index * 16 + 15, active))
 
 
@@ -89,7 +96,7 @@ def contribution_bound(kind: str, position, normal, proxy: MaterialProxy, node: 
 
     ``normal``: shading normal on the side of the outgoing direction.
     """
-    if kind == "directional":
+    if kind in AT_INFINITY:
         # Directions towards the lights fill a cone around -axis: no distance, and cosines against a cone
         receiver = dr.maximum(cosine_less_angle(-dr.dot(normal, node.axis), node.cosine), 0)
         factor = mi.Float(1)

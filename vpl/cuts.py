@@ -63,10 +63,11 @@ def _count_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: 
 
 
 @dr.syntax
-def _collect_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: float, offset, total: int):
-    """The same walk, writing (row of the batch, node) of every node taken, point by point from ``offset`` on.
+def _collect_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: float, offset, length, total: int):
+    """The same walk, writing (row of the batch, node) of every node taken: ``length`` of them from ``offset`` on.
 
-    Returns (rows, nodes), and the nodes visited per point.
+    Returns (rows, nodes), how many were written per point, and how many were visited.  Should rounding make this walk
+    take other nodes than the one that counted, nothing is written outside of a point's part.
     """
     end = dr.opaque(mi.UInt32, group.tree.count)
     clamp = dr.opaque(mi.Float, smallest_distance)
@@ -76,13 +77,15 @@ def _collect_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance
     i, at, visits = mi.UInt32(0), mi.UInt32(offset), mi.UInt32(0)
     while dr.hint(i < end, exclude=[group, batch, rows, nodes]):
         taken, following = _step(group, batch, threshold, clamp, i)
+        taken &= at < offset + length
         dr.scatter(rows, row, at, taken)
         dr.scatter(nodes, i, at, taken)
         at += dr.select(taken, 1, 0)
         visits += 1
         i = following
-    dr.eval(rows, nodes, visits)
-    return rows, nodes, visits
+    written = at - offset
+    dr.eval(rows, nodes, written, visits)
+    return rows, nodes, written, visits
 
 
 @dr.syntax
@@ -106,13 +109,20 @@ def cut_sizes(lights: LightSet, batch: Batch, threshold, most: int = 0) -> CutSi
     return CutSizes([count for count, _ in found], [visits for _, visits in found])
 
 
+def _upload_thresholds(values: np.ndarray):
+    """Thresholds in double precision to the device; beyond float32 they are infinite, as unclamped bounds may be."""
+    with np.errstate(over="ignore"):
+        return upload(mi.Float, values.astype(np.float32))
+
+
 def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
     """Sizes of the cuts, with thresholds raised where a cut would have more than ``max_cut`` nodes (0: nowhere).
 
     Refining the worst cluster until ``max_cut`` nodes are reached ([LC] section 4.2) gives a threshold cut too, with a
-    larger threshold: it is bracketed by growing steps, which end because the root alone is a cut at an infinite
+    larger threshold: it is bracketed by growing steps, which end because the roots alone are a cut at an infinite
     threshold, and narrowed by bisection of its logarithm.  Returns (threshold, sizes, nodes visited in all).
     """
+    max_cut = max(max_cut, len(lights.groups)) if max_cut else 0  # the roots of all kinds are the coarsest cut
     sizes = cut_sizes(lights, batch, threshold, max_cut)
     visits = sum(sizes.visits)
     rows = np.flatnonzero(sizes.total() > max_cut)
@@ -125,7 +135,7 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
     def too_large(values):
         """Which cuts are too large at these thresholds; keeps the sizes of those that are not."""
         nonlocal spent, fitting
-        found = cut_sizes(lights, part, upload(mi.Float, values), max_cut)
+        found = cut_sizes(lights, part, _upload_thresholds(values), max_cut)
         over = found.total() > max_cut
         kept = upload(mi.UInt32, ~over) == 1
         fitting = [dr.select(kept, new, old) for new, old in zip(found.count, fitting, strict=True)]
@@ -134,15 +144,17 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
         return over
 
     low = np.maximum(download(dr.gather(mi.Float, threshold, index)).astype(np.float64), np.finfo(np.float32).tiny)
-    high = low * _BRACKET
+    step = _BRACKET
+    high = low * step
     while (over := too_large(high)).any():
-        low, high = np.where(over, high, low), np.where(over, high * _BRACKET, high)
+        step = min(step * step, 1e30)
+        low, high = np.where(over, high, low), np.where(over, high * step, high)
     for _ in range(_BISECTIONS):
         middle = np.sqrt(low * high)
         over = too_large(middle)
         low, high = np.where(over, middle, low), np.where(over, high, middle)
     threshold = mi.Float(threshold)
-    dr.scatter(threshold, upload(mi.Float, high), index)
+    dr.scatter(threshold, _upload_thresholds(high), index)
     for target, count in zip(sizes.count, fitting, strict=True):
         dr.scatter(target, count, index)
     dr.scatter_add(visits, spent, index)
@@ -178,13 +190,13 @@ class CutChunk:
     nodes: object
     visits: object
 
-    def representatives(self):
-        """The light that stands for each node, and the factor from its intensity to the cluster's.
+    def representatives(self, second=False):
+        """The light that stands for each node (or its second one), and the factor from its intensity to the cluster's.
 
         A representative is drawn with probability intensity / cluster intensity; dividing by it, rather than taking the
         cluster's colour, keeps the estimate unbiased where colours differ.
         """
-        light = self.group.lights.gather(self.group.tree.representative(self.nodes))
+        light = self.group.lights.gather(self.group.tree.representative(self.nodes, second=second))
         return light, self.group.tree.summed_intensity(self.nodes) / channel_mean(light.intensity)
 
 
@@ -200,19 +212,23 @@ def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
             part = batch if last - first == batch.count else batch.select(points)
             offset = upload(mi.UInt32, np.cumsum(count[first:last]) - count[first:last])
             chosen = dr.gather(mi.Float, threshold, points)
-            found = _collect_nodes(group, part, chosen, lights.smallest_distance, offset, total)
-            yield CutChunk(group, part, points, offset, dr.gather(mi.UInt32, group_count, points), *found)
+            length = dr.gather(mi.UInt32, group_count, points)
+            rows, nodes, written, visits = _collect_nodes(
+                group, part, chosen, lights.smallest_distance, offset, length, total
+            )
+            yield CutChunk(group, part, points, offset, written, rows, nodes, visits)
 
 
-def evaluate_cuts(scene, traits: SceneTraits, lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
+def evaluate_cuts(scene, traits: SceneTraits, lights: LightSet, batch: Batch, threshold, sizes: CutSizes, second=False):
     """Radiance of every point from its cut: representatives, scaled to the intensity of their clusters.
 
+    ``second``: use the second representative of every cluster, for an estimate that another cut may depend on.
     Returns (radiance, shadow rays, nodes visited) per point of the batch.
     """
     radiance = dr.zeros(mi.UnpolarizedSpectrum, batch.count)
     rays, visits = dr.zeros(mi.UInt32, batch.count), dr.zeros(mi.UInt32, batch.count)
     for chunk in collect_cuts(lights, batch, threshold, sizes):
-        light, scale = chunk.representatives()
+        light, scale = chunk.representatives(second)
         surface = chunk.batch.surfaces_at(chunk.rows)
         value, traced = evaluate_pairs(scene, traits, lights, chunk.group, surface, light, scale)
         traced = dr.select(traced, mi.UInt32(1), mi.UInt32(0))

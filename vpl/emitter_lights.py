@@ -32,14 +32,14 @@ def area_lights(emitters: Emitters, count: int, seed: int) -> VirtualLights:
 
 
 def environment_lights(scene, emitters: Emitters, count: int, seed: int) -> VirtualLights:
-    """``count`` directions towards the environment as directional lights, by its own importance sampling."""
+    """``count`` directions towards the environment as lights at infinity, by its own importance sampling."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, count)
     reference = dr.zeros(mi.Interaction3f, count)
     reference.p = mi.Point3f(bounding_sphere(scene).center)
     ds, weight = emitters.environment.sample_direction(reference, sampler.next_2d())
     irradiance = dr.zeros(mi.Color3f, count) + spectrum_to_rgb(finite_or_zero(mi.unpolarized_spectrum(weight))) / count
-    return VirtualLights.of("directional", None, download(-ds.d), download(irradiance))
+    return VirtualLights.of("environment", None, download(-ds.d), download(irradiance))
 
 
 def lights_of_emitters(scene, emitters: Emitters, count: int, seed: int) -> list[VirtualLights]:

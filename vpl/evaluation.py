@@ -27,7 +27,7 @@ def evaluate_pairs(scene, traits: SceneTraits, lights: LightSet, group: LightGro
     value = contribution(group.kind, surface, light, lights.smallest_distance, allowed) * scale
     traced = dr.any(value > 0)
     ray = shadow_ray(group.kind, surface.interaction, light)
-    passed = transmittance(scene, traits, group.kind, light.depth == 0, ray, traced)
+    passed = transmittance(scene, traits, group.kind, ray, traced)
     return dr.select(traced, value * passed, 0), traced
 
 

@@ -78,25 +78,44 @@ class LightSet:
         return point_depth + light_depth + 1 <= mi.UInt32(self.max_depth)
 
 
-def _largest_below(tree: LightTree, values: np.ndarray) -> np.ndarray:
-    """For every node, the largest of a value over its lights: (2n - 1,) from (n,) in the lights' own order."""
+def _leaf_ranges(tree: LightTree) -> np.ndarray:
+    """For every node, the first and one past the last of its lights in ``tree.leaf_order``: (2n - 1, 2)."""
     node = np.arange(len(tree.records))
     leaves_before = np.concatenate([[0], np.cumsum(tree.escape == node + 1)])
-    ranges = np.stack([leaves_before[node], leaves_before[tree.escape]], axis=1).reshape(-1)
+    return np.stack([leaves_before[node], leaves_before[tree.escape]], axis=1)
+
+
+def _largest_below(tree: LightTree, values: np.ndarray) -> np.ndarray:
+    """For every node, the largest of a value over its lights: (2n - 1,) from (n,) in the lights' own order."""
     in_order = np.append(values[tree.leaf_order], -np.inf)
-    return np.maximum.reduceat(in_order, ranges)[::2]
+    return np.maximum.reduceat(in_order, _leaf_ranges(tree).reshape(-1))[::2]
+
+
+def _second_representatives(tree: LightTree, intensity: np.ndarray, generator) -> np.ndarray:
+    """For every node, one of its lights, drawn by intensity and independently of all others: (2n - 1,).
+
+    A threshold that was found with the same representatives that the final cut uses keeps bright ones and refines dark
+    ones, which biases the image upwards; estimates use these instead.
+    """
+    first, last = _leaf_ranges(tree).T
+    cumulative = np.concatenate([[0.0], np.cumsum(intensity[tree.leaf_order].astype(np.float64))])
+    wanted = cumulative[first] + generator.random(len(first)) * (cumulative[last] - cumulative[first])
+    chosen = np.searchsorted(cumulative, wanted, side="right") - 1
+    return tree.leaf_order[np.clip(chosen, first, last - 1)]
 
 
 def light_tree(lights: VirtualLights, seed: int) -> DeviceTree:
     """The light tree of one kind; a spot tree's cones are widened by the cut-off angles below each node."""
     direction = None if lights.kind == "point" else lights.direction
-    tree = build_light_tree(lights.position, direction, lights.intensity, np.random.default_rng(seed))
+    generator = np.random.default_rng(seed)
+    tree = build_light_tree(lights.position, direction, lights.intensity, generator)
     if lights.kind == "spot":
         half_angle = np.arccos(np.clip(tree.records[:, CONE_COS].astype(np.float64), -1, 1))
         half_angle += _largest_below(tree, lights.cone[:, 0])
         # Rounded down, as the tree's own cones are, so that no light is lost to float32
         tree.records[:, CONE_COS] = np.cos(np.minimum(half_angle, np.pi)) - 2.0**-21
-    return DeviceTree(lights.kind, tree)
+    second = _second_representatives(tree, lights.intensity.mean(1), generator)
+    return DeviceTree(lights.kind, tree, second)
 
 
 def prepare_lights(scene, emitters: Emitters, options: LightOptions, seed: int) -> LightSet:
@@ -110,7 +129,7 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, seed: int) 
         found += [emitters.points, emitters.spots, emitters.directional]
         if options.direct == "vpl":
             found += lights_of_emitters(scene, emitters, options.direct_count, derived_seed(seed, 20))
-    if options.max_depth > 2 and options.vpl_count > 0:
+    if options.max_depth > 2:
         limits = PathLimits(options.max_depth - 2, options.rr_depth, options.lobe_limit)
         traced = trace_lights(scene, emitters, options.vpl_count, derived_seed(seed, 21), limits)
         found.append(traced.lights)

@@ -16,18 +16,20 @@ import numpy as np
 from .arrays import download, rgb_to_spectrum, upload
 
 # Kinds of virtual light. "point" and "spot" radiate from a point that the scene really has and are never clamped;
-# "oriented" lights stand for a piece of surface; "directional" ones lie at infinity.
-KINDS = ("point", "spot", "oriented", "directional")
+# "oriented" lights stand for a piece of surface. "directional" and "environment" lights lie at infinity; the latter
+# stand for a piece of sky that a camera path could reach, the former for an emitter that it could not.
+KINDS = ("point", "spot", "oriented", "directional", "environment")
+AT_INFINITY = ("directional", "environment")
 
 
 @dataclass
 class VirtualLights:
     """Lights of one kind, as NumPy arrays of n rows.
 
-    ``position`` (n, 3) float32, world units (None for directional lights);
+    ``position`` (n, 3) float32, world units (None for lights at infinity);
     ``direction`` (n, 3) float32: surface normal, spot axis, or the direction in which the light travels;
     ``intensity`` (n, 3) float32: radiant intensity of points and spots, exitant flux / pi of oriented lights (their
-    radiance times area), irradiance of directional lights;
+    radiance times area), irradiance of lights at infinity;
     ``depth`` (n,) uint32: edges of the light path that ends in the light, 0 for lights that stand for an emitter;
     ``cone`` (n, 2) float32: cut-off angle and beam angle of spots in radians, (pi, pi) elsewhere.
     """
@@ -252,4 +254,6 @@ def read_emitters(scene) -> Emitters:
         kept.append(lights)
     if dropped:
         mi.Log(mi.LogLevel.Warn, f"{dropped} emitter(s) with values that are not finite were dropped.")
-    return Emitters(*kept, area, scene.environment(), others + others_on_shapes, dropped)
+    others += others_on_shapes
+    others.sort(key=lambda row: (row[0], row[1].id(), str(row[1])))
+    return Emitters(*kept, area, scene.environment(), others, dropped)

@@ -1,11 +1,16 @@
-"""A simple majorant of every gather point's BSDF, found by probing it; used by the bounds and by nothing else.
+"""A simple stand-in for every gather point's BSDF, found by probing it; used by the bounds and by nothing else.
 
 For an outgoing direction at angle θ from the normal and δ from the mirror direction, the proxy is
 
     BSDF × cos θ  <=  base × cos θ + peak × max(cos δ, 0)^exponent
 
 with the base found far from the mirror direction and the lobe fitted from the mirror direction outwards, as wide as the
-widest probe asks for.  Materials that transmit, or that perturb the normal, are bounded without any cosine.
+widest probe asks for.  Materials that transmit, or that perturb the normal, are bounded without the receiver's cosine,
+by a base that also holds the BSDF at directions which the material itself samples.
+
+The inequality is exact for Lambertian points and holds at the probed directions of others; between them, narrow lobes
+at grazing angles can exceed it.  Then a cluster may be taken that the error bound would have refined: it costs accuracy
+there, and it cannot lose light, because the proxy is positive wherever the material may reflect.
 """
 
 from __future__ import annotations
@@ -21,6 +26,9 @@ from .gather import GatherPoints, SceneTraits, shape_in
 from .lights import finite_or_zero
 
 _SHARPEST = 1e5
+# Fraction of the peak below which no base falls, so that nothing is skipped on the word of a probe
+_LEAST_BASE = 1e-4
+_MATERIAL_SAMPLES = 8
 # Relative rounding with which a BSDF still is the albedo times the cosine
 _SAME = 1e-5
 # Angles in degrees between a probe and the mirror direction: first those that find the base, then those of the lobe.
@@ -106,12 +114,30 @@ def probe_materials(points: GatherPoints, traits: SceneTraits) -> MaterialProxy:
         peak = dr.maximum(peak, excess * scale)
         k += 1
     no_cosine = _without_cosine(si, bsdf, traits)
-    base = dr.select(no_cosine, base + peak, base)
+    if dr.hint(needs_no_cosine(traits), mode="scalar"):
+        sampled = _largest_sampled_value(si, bsdf, no_cosine)
+        base = dr.select(no_cosine, dr.maximum(base + peak, sampled), base)
+    base = dr.maximum(base, _LEAST_BASE * (peak + dr.max(base)))
     lambertian = ~no_cosine & (deviation <= _SAME * dr.max(albedo)) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
     base = dr.select(lambertian, albedo, base)
     axis = si.to_world(mirror)
     dr.eval(base, peak, exponent, axis, no_cosine, lambertian)
     return MaterialProxy(base, peak, exponent, axis, no_cosine, lambertian, traits.glossy, needs_no_cosine(traits))
+
+
+@dr.syntax
+def _largest_sampled_value(si, bsdf, active):
+    """Largest BSDF × cosine in directions that the material samples: finds lobes that probes near the mirror miss."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, dr.width(si.p))
+    largest, k = mi.Color3f(0), mi.UInt32(0)
+    while k < _MATERIAL_SAMPLES:
+        sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
+        smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Smooth)
+        value = spectrum_to_rgb(finite_or_zero(mi.unpolarized_spectrum(weight) * sample.pdf))
+        largest = dr.select(smooth, dr.maximum(largest, value), largest)
+        k += 1
+    return largest
 
 
 def needs_no_cosine(traits: SceneTraits) -> bool:

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from .arrays import rgb_to_spectrum, upload
-from .lights import VirtualLights, finite_or_zero
+from .lights import AT_INFINITY, VirtualLights, finite_or_zero
 
 _RECORD = 16
 
@@ -69,9 +69,9 @@ def geometry(kind: str, position, light: Light, smallest_distance):
 
     Returns (unit vector from ``position`` to the light, factor).  The factor is 1/d² for points, times the falloff for
     spots, cos/d² with d not smaller than ``smallest_distance`` for oriented lights ([IC] section 5: clamping), and 1
-    for directional lights.  A light exactly at ``position`` has no direction: its factor is 0.
+    for lights at infinity.  A light exactly at ``position`` has no direction: its factor is 0.
     """
-    if kind == "directional":
+    if kind in AT_INFINITY:
         return -light.direction, mi.Float(1)
     offset = light.position - position
     distance2 = dr.squared_norm(offset)

@@ -22,7 +22,7 @@ from .lights import Emitters, VirtualLights
 _PILOT_PATHS = 4096
 _LARGEST_WAVEFRONT = 1 << 20
 # A scene that stores a light on one path in a thousand gets an honest but bounded number of paths.
-_MOST_PATHS_PER_LIGHT = 64
+_MOST_PATHS_PER_LIGHT = 16
 _DEFENSIVE_SHARE = 0.05
 
 

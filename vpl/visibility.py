@@ -10,27 +10,25 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .arrays import channel_mean
+from .lights import AT_INFINITY
 
 
 def shadow_ray(kind: str, interaction, light):
-    """Ray from a surface to a light that ends just before it; for directional lights it has no end."""
-    if kind == "directional":
+    """Ray from a surface to a light that ends just before it; for lights at infinity it has no end."""
+    if kind in AT_INFINITY:
         return interaction.spawn_ray(-light.direction)
     return interaction.spawn_ray_to(light.position)
 
 
-def transmittance(scene, traits, kind: str, light_is_emitter, ray, active):
-    """Fraction of light that reaches the ray's origin: 0 or 1, or between where surfaces are partly transparent.
+def transmittance(scene, traits, kind: str, ray, active):
+    """Fraction of light that reaches the ray's origin: 0 or 1, or a spectrum where surfaces are partly transparent.
 
-    ``light_is_emitter``: mask of the lights that stand for an emitter.  Lanes that are not ``active`` give 0.
+    Lanes that are not ``active`` give 0.
     """
     passed = mi.Float(1) & active & ~scene.ray_test(ray, active)
-    if not traits.null or kind in ("point", "spot"):
+    if not traits.null or kind in ("point", "spot", "directional"):
         return passed
     through = active & (passed == 0)
-    if kind == "directional":
-        through &= ~light_is_emitter
     if traits.open_scene is not None:
         # Few blocked rays meet an open surface at all, and a scene of only those is tested quickly
         through &= traits.open_scene.ray_test(ray, through)
@@ -42,16 +40,16 @@ def _through_null_surfaces(scene, traits, ray, active):
     """Walk from surface to surface while they let light pass unscattered."""
     ray = mi.Ray3f(ray)
     active = mi.Bool(active)
-    passed = mi.Float(1) & active
+    passed = dr.select(active, mi.UnpolarizedSpectrum(1), 0)
     while dr.hint(active, exclude=[traits]):
         hit = scene.ray_intersect_preliminary(ray, active=active)
         # Most surfaces are opaque: only those that are not are worth a full intersection record
         crossed = active & hit.is_valid() & traits.is_null(hit.shape)
         passed = dr.select(active & hit.is_valid() & ~crossed, 0, passed)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, crossed)
-        share = channel_mean(mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, crossed)))
+        share = mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, crossed))
         passed = dr.select(crossed, passed * share, passed)
-        active = crossed & (passed > 0)
+        active = crossed & dr.any(passed > 0)
         onward = si.spawn_ray(ray.d)
         onward.maxt = ray.maxt - si.t
         ray = dr.select(active, onward, ray)
