@@ -194,7 +194,7 @@ def _within(scene, plugin, budget: float, reference, noise) -> dict:
     """Errors of the average of as many passes as fit into ``budget`` seconds, at least one."""
     mi.render(scene, integrator=plugin, spp=1, seed=99)
     seconds, total, count = 0.0, 0.0, 0
-    spp = 1 if plugin.class_name() != "PathIntegrator" else 8
+    spp = 2 if plugin.class_name() != "PathIntegrator" else 8
     while count == 0 or seconds * (count + 1) / count <= budget:
         image, spent = scenes.timed(lambda: mi.render(scene, integrator=plugin, spp=spp, seed=count))  # noqa: B023
         total, seconds, count = total + np.array(image, np.float64), seconds + spent, count + 1

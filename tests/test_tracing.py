@@ -114,6 +114,29 @@ def test_emitted_power_and_directions_equal_mitsubas(name):
     assert np.allclose(ours[:, columns], expected[:, columns], atol=0.02 * np.abs(expected[:, 0]).max())
 
 
+@pytest.mark.parametrize("kind", ["envmap", "constant", "directional"])
+def test_rays_from_infinity_fill_the_disk_that_the_scene_shows_to_them(kind):
+    sky = mi.Bitmap(np.random.default_rng(0).uniform(0, 1, (8, 16, 3)).astype(np.float32) ** 4)
+    turned = mi.ScalarTransform4f().rotate([0, 1, 0], 70).rotate([1, 0, 0], 50)
+    emitter = {
+        "envmap": {"type": "envmap", "bitmap": sky, "to_world": turned},
+        "constant": {"type": "constant"},
+        "directional": {"type": "directional", "direction": [0.3, 0.1, -1]},
+    }[kind]
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "center": [3, 1, 2]}, "sky": emitter})
+    (group,) = emission_groups(scene, read_emitters(scene))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 50_000)
+    ray, _ = group.sample(sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
+    sphere = scene.bbox().bounding_sphere()
+    offset = download(ray.o) - np.array(sphere.center).reshape(3)
+    direction, radius = download(ray.d), float(sphere.radius)
+    along = np.sum(offset * direction, axis=1)
+    across2 = np.sum((offset - along[:, None] * direction) ** 2, axis=1)
+    assert np.allclose(along, -radius, rtol=1e-3)
+    assert across2.mean() == pytest.approx(radius**2 / 2, rel=0.02)
+
+
 def test_choice_follows_its_pmf_and_never_takes_a_zero():
     weight = np.array([0.0, 3.0, 0.0, 1.0, 1e-12, 6.0, 0.0])
     choice = Choice(weight)

@@ -24,7 +24,7 @@ from .surfaces import Batch
 # Pairs that are shaded and traced at a time: bounds the memory whatever the size of image and cuts
 _PAIRS_PER_CHUNK = 1 << 22
 # How the threshold that keeps a cut below its largest size is searched for
-_BRACKET, _BISECTIONS = 4.0, 2
+_BRACKET, _BISECTIONS = 4.0, 3
 
 
 @dataclass

@@ -113,6 +113,13 @@ class AreaEmission:
         return si.spawn_ray(direction), radiance * dr.pi / (ps.pdf * self._choice.probability(row))
 
 
+def _ray_through_sphere(sphere, direction, sample):
+    """A ray in a direction through a uniform point of the disk that the bounding sphere shows to it."""
+    disk = mi.warp.square_to_uniform_disk_concentric(sample)
+    offset = mi.Frame3f(direction).to_world(mi.Vector3f(disk.x, disk.y, -1))
+    return mi.Ray3f(mi.Point3f(sphere.center) + offset * mi.Float(sphere.radius), direction)
+
+
 class DirectionalEmission:
     """Parallel rays through the scene's bounding sphere."""
 
@@ -127,12 +134,29 @@ class DirectionalEmission:
         """Ray and weight (power per path)."""
         row = self._choice.row(stratified)
         direction = dr.gather(mi.Vector3f, self._direction, row)
-        disk = mi.warp.square_to_uniform_disk_concentric(position_sample)
-        radius = mi.Float(self._sphere.radius)
-        offset = mi.Frame3f(direction).to_world(mi.Vector3f(disk.x, disk.y, -1))
         irradiance = rgb_to_spectrum(dr.gather(mi.Color3f, self._irradiance, row))
-        weight = irradiance * (dr.pi * dr.square(radius)) / self._choice.probability(row)
-        return mi.Ray3f(mi.Point3f(self._sphere.center) + offset * radius, direction), weight
+        weight = irradiance * (np.pi * float(self._sphere.radius) ** 2) / self._choice.probability(row)
+        return _ray_through_sphere(self._sphere, direction, position_sample), weight
+
+
+class EnvironmentEmission:
+    """Rays from the environment: a direction by its own importance sampling, then parallel rays.
+
+    Not by its ``sample_ray``: for a rotated environment map (Mitsuba 3.9.1) the rays of that do not fill the disk that
+    the scene shows to them, and several times too much light enters by windows.
+    """
+
+    def __init__(self, environment, sphere):
+        self._environment, self._sphere = environment, sphere
+        self.power = np.array([other_power(environment, sphere)])
+
+    def sample(self, stratified, position_sample, direction_sample):
+        """Ray and weight (power per path)."""
+        center = dr.zeros(mi.Interaction3f, dr.width(stratified))
+        center.p = mi.Point3f(self._sphere.center)
+        ds, weight = self._environment.sample_direction(center, direction_sample)
+        weight = finite_or_zero(mi.unpolarized_spectrum(weight)) * (np.pi * float(self._sphere.radius) ** 2)
+        return _ray_through_sphere(self._sphere, -ds.d, position_sample), weight
 
 
 class OtherEmission:
@@ -158,8 +182,7 @@ def emission_groups(scene, emitters: Emitters) -> list:
         groups.append(AreaEmission(emitters.area))
     if emitters.directional.count:
         groups.append(DirectionalEmission(emitters.directional, sphere))
-    single = [emitter for _, emitter in emitters.others]
+    groups += [OtherEmission(emitter, sphere) for _, emitter in emitters.others]
     if emitters.environment is not None:
-        single.append(emitters.environment)
-    groups += [OtherEmission(emitter, sphere) for emitter in single]
+        groups.append(EnvironmentEmission(emitters.environment, sphere))
     return [group for group in groups if group.power.sum() > 0]
