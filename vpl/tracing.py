@@ -3,8 +3,10 @@
 A path that scatters by a diffuse lobe at a surface leaves a virtual point light there: the lobe was chosen by the
 BSDF's own sampling, so that its weight is the flux that leaves by that lobe, for any material, and glossy or specular
 bounces only carry the path on.  (Departure from the instant-radiosity papers, which store a light at every vertex and
-scale it by the diffuse albedo: equal in expectation, and it needs nothing but ``bsdf.sample``.)  Glossy lobes that are
-broad enough are stored as diffuse ones: an approximation, with ``lobe_limit`` as its knob.
+scale it by the diffuse albedo: it needs nothing but ``bsdf.sample``, and is equal in expectation for materials that
+weight a sample by its own lobe; those that weight it by all lobes, as ``principled`` does, share out the energy where
+lobes overlap.)  Glossy lobes that are broad enough are stored as diffuse ones: an approximation, with ``lobe_limit`` as
+its knob.
 """
 
 from __future__ import annotations
