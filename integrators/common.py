@@ -17,8 +17,8 @@ from vpl.gather import CameraPaths, SceneTraits, follow_camera_rays, refuse_medi
 from vpl.light_set import LightOptions, LightSet, prepare_lights
 from vpl.lights import read_emitters
 from vpl.proxies import probe_materials
+from vpl.sampling import derived_seed
 from vpl.surfaces import Batch, make_batches
-from vpl.tracing import derived_seed
 
 from . import properties
 

@@ -10,7 +10,8 @@ import pytest
 from vpl.arrays import download, upload
 from vpl.emission import Choice, emission_groups
 from vpl.lights import read_emitters
-from vpl.tracing import PathLimits, derived_seed, trace_lights
+from vpl.sampling import derived_seed
+from vpl.tracing import PathLimits, trace_lights
 
 from .conftest import area_light, closed_box
 

@@ -31,7 +31,6 @@ class Node:
     cosine: object
     intensity: object
     escape: object
-    representative: object
 
 
 class DeviceTree:
@@ -56,7 +55,6 @@ class DeviceTree:
             c.y,
             mi.Color3f(c.w, d.x, d.y),
             dr.reinterpret_array(mi.UInt32, d.z),
-            dr.reinterpret_array(mi.UInt32, d.w),
         )
 
     def summed_intensity(self, index, active=True):

@@ -14,6 +14,7 @@ import numpy as np
 from .emission import Choice, bounding_sphere, other_power
 from .gather import GatherPoints, emitted_towards
 from .lights import Emitters, finite_or_zero
+from .sampling import independent_sampler
 
 _UNIFORM_SHARE = 0.5
 
@@ -50,9 +51,7 @@ class ExtendedEmitters:
             here = active & (row < areas)
             ds = self.emitters.area.shape(row, here).sample_direction(si, direction_sample, here)
             facing = here & (dr.dot(ds.d, ds.n) < 0) & (ds.pdf > 0)
-            on_light = dr.zeros(mi.SurfaceInteraction3f, dr.width(si.p))
-            on_light.p, on_light.n, on_light.uv, on_light.wi = ds.p, ds.n, ds.uv, mi.Vector3f(0, 0, 1)
-            weight = dr.select(facing, self.emitters.area.emitted(row, on_light, facing) / ds.pdf, 0)
+            weight = dr.select(facing, self.emitters.area.emitted_in_front(row, ds, facing) / ds.pdf, 0)
         for number, emitter in enumerate(self.single):
             here = active & (row == areas + number)
             one, one_weight = emitter.sample_direction(si, direction_sample, here)
@@ -112,8 +111,7 @@ def direct_light(scene, extended: ExtendedEmitters, traits, points: GatherPoints
     si, bsdf = points.si, points.si.bsdf()
     if dr.hint(extended.choice is None, mode="scalar"):
         return dr.zeros(mi.UnpolarizedSpectrum, points.count), 0
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, points.count)
+    sampler = independent_sampler(seed, points.count)
     context = mi.BSDFContext()
     limit = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF)))
     total = dr.opaque(mi.UInt32, samples)

@@ -12,6 +12,7 @@ import numpy as np
 
 from .arrays import download, rgb_to_spectrum, upload
 from .lights import Emitters, VirtualLights, finite_or_zero
+from .sampling import independent_sampler
 from .shading import spot_falloff
 
 
@@ -44,8 +45,7 @@ class Choice:
 
 def solid_angle_radiance(emitter, center, count: int = 4096) -> float:
     """Integral of an emitter's radiance over all directions as seen from ``center``; mean over channels."""
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, count)
+    sampler = independent_sampler(0, count)
     reference = dr.zeros(mi.Interaction3f, count)
     reference.p = mi.Point3f(center)
     _, weight = emitter.sample_direction(reference, sampler.next_2d())
@@ -56,8 +56,7 @@ def other_power(emitter, bounding_sphere) -> float:
     """Power of an emitter that only its own routines know, estimated from rays that it emits."""
     if emitter.is_environment():
         return solid_angle_radiance(emitter, bounding_sphere.center) * np.pi * bounding_sphere.radius**2
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, 4096)
+    sampler = independent_sampler(0, 4096)
     _, weight = emitter.sample_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
     return float(download(finite_or_zero(weight)).mean(dtype=np.float64))
 
@@ -108,8 +107,8 @@ class AreaEmission:
         ps = self._area.shape(row).sample_position(0, position_sample)
         direction = mi.Frame3f(ps.n).to_world(mi.warp.square_to_cosine_hemisphere(direction_sample))
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(row))
-        si.p, si.n, si.uv, si.wi = ps.p, ps.n, ps.uv, mi.Vector3f(0, 0, 1)
-        radiance = self._area.emitted(row, si)
+        si.p, si.n = ps.p, ps.n
+        radiance = self._area.emitted_in_front(row, ps)
         return si.spawn_ray(direction), radiance * dr.pi / (ps.pdf * self._choice.probability(row))
 
 

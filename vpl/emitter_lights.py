@@ -9,32 +9,23 @@ import numpy as np
 from .arrays import download, spectrum_to_rgb
 from .emission import Choice, bounding_sphere
 from .lights import Emitters, VirtualLights, finite_or_zero
-
-
-def _stratified(sampler, count: int):
-    """One uniform number in each of ``count`` equal parts of [0, 1)."""
-    sample = (mi.Float(dr.arange(mi.UInt32, count)) + sampler.next_1d()) / dr.opaque(mi.Float, count)
-    return dr.minimum(sample, dr.one_minus_epsilon(mi.Float))
+from .sampling import independent_sampler, stratified
 
 
 def area_lights(emitters: Emitters, count: int, seed: int) -> VirtualLights:
     """``count`` points on area emitters as oriented lights, chosen by power and then by area."""
     area = emitters.area
     choice = Choice(area.power)
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, count)
-    row = choice.row(_stratified(sampler, count))
+    sampler = independent_sampler(seed, count)
+    row = choice.row(stratified(sampler, count, 0, count))
     ps = area.shape(row).sample_position(0, sampler.next_2d())
-    si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.p, si.n, si.uv, si.wi = ps.p, ps.n, ps.uv, mi.Vector3f(0, 0, 1)
-    intensity = spectrum_to_rgb(area.emitted(row, si)) / (ps.pdf * choice.probability(row) * count)
+    intensity = spectrum_to_rgb(area.emitted_in_front(row, ps)) / (ps.pdf * choice.probability(row) * count)
     return VirtualLights.of("oriented", download(ps.p), download(ps.n), download(intensity))
 
 
 def environment_lights(scene, emitters: Emitters, count: int, seed: int) -> VirtualLights:
     """``count`` directions towards the environment as lights at infinity, by its own importance sampling."""
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, count)
+    sampler = independent_sampler(seed, count)
     reference = dr.zeros(mi.Interaction3f, count)
     reference.p = mi.Point3f(bounding_sphere(scene).center)
     ds, weight = emitters.environment.sample_direction(reference, sampler.next_2d())

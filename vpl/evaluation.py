@@ -9,6 +9,7 @@ from .arrays import download
 from .emission import Choice
 from .gather import SceneTraits
 from .light_set import LightGroup, LightSet
+from .sampling import independent_sampler
 from .shading import contribution
 from .surfaces import Batch, Surface
 from .visibility import shadow_ray, transmittance
@@ -74,8 +75,7 @@ def mean_radiance(scene, traits: SceneTraits, lights: LightSet, batch: Batch, se
     total = 0.0
     for group in lights.groups:
         choice = Choice(group.lights.scalar_intensity)
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed, count)
+        sampler = independent_sampler(seed, count)
         row = dr.minimum(mi.UInt32(sampler.next_1d() * batch.count), batch.count - 1)
         index = choice.row(sampler.next_1d())
         light, scale = group.lights.gather(index), dr.rcp(choice.probability(index))

@@ -14,7 +14,7 @@ import numpy as np
 
 from .arrays import channel_mean, download, ones, upload
 from .lights import Emitters, finite_or_zero
-from .tracing import derived_seed
+from .sampling import derived_seed, independent_sampler
 
 # Neither side of a choice between a delta and a smooth lobe gets less than this unless it carries nothing.
 _LEAST_PROBABILITY = 0.05
@@ -244,8 +244,7 @@ def follow_camera_rays(scene, emitters, traits, sampler, seed, ray, active, max_
         ray = mi.Ray3f(*(dr.gather(type(x), x, onward) for x in (going[1].o, going[1].d)), time)
         ray.maxt = dr.full(mi.Float, dr.largest(mi.Float), len(onward))
         depth, active = depth + 1, dr.full(mi.Bool, True, len(onward))
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(derived_seed(seed, 3, depth), len(onward))
+        sampler = independent_sampler(derived_seed(seed, 3, depth), len(onward))
     return CameraPaths(emission, valid, _collect(*found))
 
 

@@ -14,8 +14,9 @@ from .emission import bounding_sphere
 from .emitter_lights import lights_of_emitters
 from .light_tree import CONE_COS, LightTree, build_light_tree
 from .lights import KINDS, Emitters, VirtualLights
+from .sampling import derived_seed
 from .shading import DeviceLights
-from .tracing import PathLimits, derived_seed, trace_lights
+from .tracing import PathLimits, trace_lights
 
 
 @dataclass(frozen=True)

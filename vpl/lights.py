@@ -119,6 +119,12 @@ class AreaEmitters:
         """The shape of a row (counted from 0) as a pointer array."""
         return dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self._shapes, row, active))
 
+    def emitted_in_front(self, row, sample, active=True):
+        """Radiance that a position sample (or direction sample) on the emitter of ``row`` sends to its front."""
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(row))
+        si.p, si.n, si.uv, si.wi = sample.p, sample.n, sample.uv, mi.Vector3f(0, 0, 1)
+        return self.emitted(row, si, active)
+
     def emitted(self, row, si, active=True):
         """Radiance emitted at ``si`` towards ``si.wi`` by the emitter of ``row`` (counted from 0)."""
         active = active & (mi.Frame3f.cos_theta(si.wi) > 0)

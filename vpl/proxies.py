@@ -24,6 +24,7 @@ import numpy as np
 from .arrays import spectrum_to_rgb, upload
 from .gather import GatherPoints, SceneTraits, shape_in
 from .lights import finite_or_zero
+from .sampling import independent_sampler
 
 _SHARPEST = 1e5
 # Fraction of the peak below which no base falls, so that nothing is skipped on the word of a probe
@@ -128,8 +129,7 @@ def probe_materials(points: GatherPoints, traits: SceneTraits) -> MaterialProxy:
 @dr.syntax
 def _largest_sampled_value(si, bsdf, active):
     """Largest BSDF × cosine in directions that the material samples: finds lobes that probes near the mirror miss."""
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, dr.width(si.p))
+    sampler = independent_sampler(0, dr.width(si.p))
     largest, k = mi.Color3f(0), mi.UInt32(0)
     while k < _MATERIAL_SAMPLES:
         sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)

@@ -20,6 +20,7 @@ import numpy as np
 from .arrays import download, ones, spectrum_to_rgb
 from .emission import emission_groups
 from .lights import Emitters, VirtualLights
+from .sampling import derived_seed, independent_sampler, stratified
 
 _PILOT_PATHS = 4096
 _LARGEST_WAVEFRONT = 1 << 20
@@ -47,14 +48,6 @@ class TracedLights:
     lights: VirtualLights
     paths: int
     dropped: int
-
-
-def derived_seed(seed: int, *stream: int) -> int:
-    """A 32-bit seed for each (seed, stream...), by Mitsuba's own hash."""
-    for number in stream:
-        first, _ = mi.sample_tea_32(mi.UInt32(seed & 0xFFFFFFFF), mi.UInt32(number & 0xFFFFFFFF))
-        seed = int(first[0])
-    return seed
 
 
 def _bounce(scene, sampler, ray, throughput, power, depth, limits: PathLimits):
@@ -97,13 +90,10 @@ def _bounce(scene, sampler, ray, throughput, power, depth, limits: PathLimits):
 
 def _paths_of_group(scene, group, first: int, count: int, total: int, seed: int, limits: PathLimits):
     """Trace the paths first .. first + count - 1 of the ``total`` that a group of emitters gets."""
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(derived_seed(seed, 0), count)
-    lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
-    paths = dr.opaque(mi.Float, float(total))
-    stratified = dr.minimum((mi.Float(lane) + sampler.next_1d()) / paths, dr.one_minus_epsilon(mi.Float))
-    ray, power = group.sample(stratified, sampler.next_2d(), sampler.next_2d())
-    power = mi.unpolarized_spectrum(power) / paths
+    sampler = independent_sampler(derived_seed(seed, 0), count)
+    chosen = stratified(sampler, count, first, total)
+    ray, power = group.sample(chosen, sampler.next_2d(), sampler.next_2d())
+    power = mi.unpolarized_spectrum(power) / dr.opaque(mi.Float, float(total))
     origin, direction, throughput = ray.o, ray.d, ones(count)
     dr.make_opaque(origin, direction, power)
 
