@@ -22,7 +22,7 @@ import sys
 from pathlib import Path
 
 from comparison import command_line, references, report
-from comparison.command_line import UsageError, explain, parameter, positive
+from comparison.command_line import UsageError, parameter, positive
 from comparison.scene_comparison import SceneComparison
 
 ROOT = Path(__file__).resolve().parent
@@ -125,16 +125,10 @@ def main(arguments=None):
     """Run the command; return its exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = parse(arguments)
-    try:
-        return 0 if run(options, shlex.join(["compare.py", *arguments])) else 1
-    except KeyboardInterrupt:
-        print(f"\ncompare: interrupted; what was finished is in {options.out}", file=sys.stderr)
-        return 130
-    except Exception as error:
-        if options.verbose:
-            raise
-        print(f"compare: {explain(error)}", file=sys.stderr)
-        return 2 if isinstance(error, UsageError) else 1
+    command = shlex.join(["compare.py", *arguments])
+    return command_line.exit_status(
+        "compare", lambda: 0 if run(options, command) else 1, f"what was finished is in {options.out}", options.verbose
+    )
 
 
 if __name__ == "__main__":

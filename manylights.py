@@ -20,7 +20,7 @@ import mitsuba as mi
 from tqdm import tqdm
 
 from comparison import command_line, images
-from comparison.command_line import UsageError, explain, parameter, positive
+from comparison.command_line import UsageError, parameter, positive
 from comparison.rendering import Progressive, pass_sizes
 from comparison.scene_files import SceneFile
 
@@ -157,16 +157,7 @@ def run(options):
 def main(arguments=None):
     """Run the command; return its exit status."""
     options = parse(arguments)
-    try:
-        return run(options)
-    except KeyboardInterrupt:
-        print("\nmanylights: interrupted; nothing was written", file=sys.stderr)
-        return 130
-    except Exception as error:
-        if options.verbose:
-            raise
-        print(f"manylights: {explain(error)}", file=sys.stderr)
-        return 2 if isinstance(error, UsageError) else 1
+    return command_line.exit_status("manylights", lambda: run(options), "nothing was written", options.verbose)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import argparse
 import re
+import sys
 from importlib import metadata
 from pathlib import Path
 
@@ -114,6 +115,23 @@ def explain(error):
         error = error.__cause__
     message = re.sub(r"\[\w+\.cpp:\d+\] ", "", str(error))
     return " ".join(message.split()) or type(error).__name__
+
+
+def exit_status(program, run, interrupted, verbose):
+    """Run a command and return its exit status; what it raises becomes one line on the standard error.
+
+    `run` returns the status; `interrupted` says what Ctrl-C leaves behind; with `verbose` errors are raised on.
+    """
+    try:
+        return run()
+    except KeyboardInterrupt:
+        print(f"\n{program}: interrupted; {interrupted}", file=sys.stderr)
+        return 130
+    except Exception as error:
+        if verbose:
+            raise
+        print(f"{program}: {explain(error)}", file=sys.stderr)
+        return 2 if isinstance(error, UsageError) else 1
 
 
 def versions():
