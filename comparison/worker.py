@@ -177,7 +177,7 @@ def _render_vpl(job, passes, described):
     """Render the passes of another integrator (same seeds and parameters, so same lights and camera rays) by `vpl`, and
     write the image, which is all that the other one approximates."""
     file = _parse(job)
-    file.set_integrator("vpl", keep=None)
+    file.set_integrator("vpl", {"aovs": ""}, keep=None)  # nobody asks for its channels, and it may not know them all
     parameters, progressive = file.integrator[1], Progressive(file.load(job.threads), job.seed)
     for one in tqdm(passes, desc=f"{job.label}: reference by vpl", unit="pass", disable=None):
         progressive.render(one.spp, one.seed)
