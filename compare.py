@@ -6,8 +6,9 @@
     python compare.py --demo
 
 Prints a table and writes to the output folder, for each scene and integrator, the image (`SCENE.LABEL.exr`, with how it
-was made, and `.png`) and its error (`SCENE.LABEL.error.png`), and `results.json` and `report.html` for all of them;
-comparison/report.py documents the keys of the former.
+was made, and `.png`), its error (`SCENE.LABEL.error.png`) and with `--aovs` its other channels in false colours
+(`SCENE.LABEL.CHANNEL.png`), and `results.json` and `report.html` for all of them; comparison/report.py documents the
+keys of the former.
 
 Times are wall-clock seconds of rendering alone. The first pass of each process, with an empty kernel cache, is the cold
 one and is reported apart; the time budget is for warm passes. comparison/metrics.py defines the errors.
@@ -48,6 +49,9 @@ def parse(arguments):
         help="samples per pixel of one pass, which has virtual lights of its own (default: chosen)")  # fmt: skip
     add("-p", "--param", action="append", type=parameter, default=[], metavar="LABEL.KEY=VALUE",
         help="parameter of an integrator, such as lightcuts.error=0.02; repeat for more")  # fmt: skip
+    add("--aovs", type=_names, default=[], metavar="NAME,...",
+        help="channels to show in false colours, asked of the integrators that know them: shadow_rays, upper_bounds, "
+             "cut_size (see their docstrings)")  # fmt: skip
     add("-r", "--reference", type=_reference, default="path:1024",
         help="an EXR file, or a folder that holds SCENE.exr, which also gives the width; path:SPP (path traced, kept, "
              "continued); vpl (each image by all of its own virtual lights) (default: path:1024)")  # fmt: skip
@@ -67,6 +71,11 @@ def parse(arguments):
     if not options.spp and not options.time:
         options.time = 20.0
     return options
+
+
+def _names(text):
+    """Split a comma-separated list; an argparse type."""
+    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def _reference(text):
@@ -96,7 +105,23 @@ def chosen_integrators(options):
         if not name or label not in chosen:
             raise UsageError(f"--param {key}: not of the form LABEL.KEY=VALUE, where LABEL is {' or '.join(chosen)}")
         chosen[label][1][name] = value
+    for aov in options.aovs:
+        _ask_for(aov, chosen)
     return chosen
+
+
+def _ask_for(aov, chosen):
+    """Add an AOV to the parameters of those chosen integrators that know it; raises UsageError if none does."""
+    own = [choice for choice in chosen.values() if choice[0] in command_line.own_integrators()]
+    if not own:
+        raise UsageError(f"--aovs: only {', '.join(command_line.own_integrators())} have AOVs")
+    refusals = [command_line.aov_refusal(name, aov) for name, _ in own]
+    if all(refusals):
+        raise UsageError(f"--aovs {aov}: {'; '.join(dict.fromkeys(refusals))}")
+    for (_, parameters), refusal in zip(own, refusals, strict=True):
+        if not refusal:
+            given = _names(str(parameters.get("aovs", "")))
+            parameters["aovs"] = ",".join(dict.fromkeys([*given, aov]))
 
 
 def run(options, command):

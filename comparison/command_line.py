@@ -102,6 +102,17 @@ def check_integrator(name):
         ) from None
 
 
+def aov_refusal(integrator, aov):
+    """Return why one of this project's integrators refuses an AOV (it says which it allows), None if it knows it."""
+    properties = mi.Properties(integrator)
+    properties["aovs"] = aov
+    try:
+        mi.PluginManager.instance().create_object(properties)
+    except (RuntimeError, ValueError) as error:
+        return explain(error)
+    return None
+
+
 def check_scene(path):
     """Raise UsageError if there is no such file."""
     if not Path(path).is_file():

@@ -12,9 +12,11 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 
-# Perceptually increasing, from no error to a large one: black, indigo, magenta, orange, pale yellow.
-ERROR_COLOURS = np.array([(0, 0, 4), (60, 15, 112), (158, 44, 120), (236, 105, 60), (252, 190, 60), (252, 253, 200)])
+# Lightness (CIE L*) rises by about 20 from each to the next: black, indigo, magenta, orange, yellow, pale yellow.
+FALSE_COLOURS = np.array([(0, 0, 4), (60, 15, 112), (158, 44, 120), (236, 105, 60), (252, 190, 60), (252, 253, 200)])
 ERROR_RANGE = (0.01, 1.0)  # relative errors at the two ends of the false colours, which are logarithmic
+# Of the positive values of an AOV: pixels that the film's filter just grazes must not add decades to its scale.
+AOV_PERCENTILES = (1, 99.9)
 
 
 @contextmanager
@@ -83,13 +85,27 @@ def tone_map(rgb, exposure):
     return (encoded * 255 + 0.5).astype(np.uint8)
 
 
-def false_colours(relative_error):
-    """Return the colours, (height, width, 3) uint8, of relative errors, (height, width), on a logarithmic scale."""
-    low, high = np.log(ERROR_RANGE)
-    position = (np.log(np.maximum(np.nan_to_num(relative_error, nan=np.inf), 1e-9)) - low) / (high - low)
-    position = np.clip(position, 0, 1) * (len(ERROR_COLOURS) - 1)
-    stops = np.arange(len(ERROR_COLOURS))
-    return np.stack([np.interp(position, stops, ERROR_COLOURS[:, i]) for i in range(3)], axis=-1).astype(np.uint8)
+def false_colours(values, ends=ERROR_RANGE):
+    """Return the colours, (height, width, 3) uint8, of values, (height, width), on a logarithmic scale with the given
+    ends, by default that of relative errors. What is below it, such as zero, has the lowest colour, what is above it or
+    not a number the highest."""
+    low, high = np.log(ends)
+    position = (np.log(np.maximum(np.nan_to_num(values, nan=np.inf), ends[0])) - low) / (high - low)
+    position = np.clip(position, 0, 1) * (len(FALSE_COLOURS) - 1)
+    stops = np.arange(len(FALSE_COLOURS))
+    return np.stack([np.interp(position, stops, FALSE_COLOURS[:, i]) for i in range(3)], axis=-1).astype(np.uint8)
+
+
+def logarithmic_ends(planes):
+    """Return the ends (low, high) of one logarithmic scale for several images, (height, width) each: the least and the
+    greatest of their `AOV_PERCENTILES`, in two digits so that they can be told in full. They are a factor of two apart
+    at least, and 1 and 2 where nothing is positive."""
+    positive = [plane[(plane > 0) & np.isfinite(plane)] for plane in planes]
+    found = [np.percentile(values, AOV_PERCENTILES) for values in positive if values.size]
+    if not found:
+        return 1.0, 2.0
+    low, high = (float(f"{end:.2g}") for end in (min(low for low, _ in found), max(high for _, high in found)))
+    return min(low, high / 2), high
 
 
 def write_png(path, pixels):

@@ -11,6 +11,8 @@ scenes                            a list, one entry a scene:
                                   absent where every render has a reference of its own ("vpl_output")
     renders                       a list, one entry an integrator: see worker.run for the measurements, and "errors",
                                   see metrics.compare (absent without a reference)
+    aovs                          with --aovs: from channel to its "scale", the values at the ends of the logarithmic
+                                  false colours, and "files", from label to PNG file
     error, traceback              instead, where the scene, or in a render where that integrator, failed
 """
 
@@ -97,9 +99,10 @@ def write(folder, results, pictures):
         explanation=EXPLANATION,
         rows=rows,
         reference_text=reference_text,
+        embedded=_embedded,
         pictures={name: {title: _embedded(file) for title, file in of.items()} for name, of in pictures.items()},
         error_range=[f"{value:.0%}" for value in images.ERROR_RANGE],
-        error_colours=", ".join(f"rgb{tuple(map(int, stop))}" for stop in images.ERROR_COLOURS),
+        false_colours=", ".join(f"rgb{tuple(map(int, stop))}" for stop in images.FALSE_COLOURS),
     )
     with images.replacing(folder / "report.html") as file:
         file.write_text(page)

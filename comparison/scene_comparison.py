@@ -3,6 +3,8 @@
 import traceback
 from pathlib import Path
 
+import numpy as np
+
 from . import images, metrics, references, worker
 from .command_line import explain, own_integrators
 from .scene_files import SceneFile
@@ -17,6 +19,7 @@ class SceneComparison:
 
     def __init__(self, path, options):
         self.path, self.options, self.pictures = path, options, {}
+        self._aovs = {}  # channel -> label -> values, (height, width)
         self.result = {"scene": str(path), "name": Path(path).stem, "renders": []}
 
     def run(self, integrators):
@@ -95,7 +98,8 @@ class SceneComparison:
 
     def _assess(self, result, reference, exposure):
         """Add the errors of a render to its result, and make its pictures; return the exposure that they have."""
-        image, label = references.read(result["output"]).image, result["label"]
+        planes, channels, _ = images.read_exr(result["output"])
+        image, label = images.colour(planes, channels).astype(np.float64), result["label"]
         if result["vpl_output"]:
             reference = references.read(result["vpl_output"])
         exposure = exposure or images.automatic_exposure(image)
@@ -103,7 +107,21 @@ class SceneComparison:
         if reference:
             result["errors"] = metrics.compare(image, reference.image, reference.standard_error)
             self._picture(f"{label}.error", images.false_colours(metrics.relative_error(image, reference.image)))
+        self._show_aovs(label, planes, channels)
         return exposure
+
+    def _show_aovs(self, label, planes, channels):
+        """Draw the AOV channels of a render, and those of earlier ones anew, as this one may widen their scale."""
+        for aov in self.options.aovs:
+            for index, channel in enumerate(channels):
+                if channel.partition(".")[0] == aov:  # "aov", or "aov.R" of one that is a colour
+                    self._aovs.setdefault(channel, {})[label] = planes[..., index].copy()
+        for channel, of in self._aovs.items():
+            ends, files = images.logarithmic_ends(of.values()), {}
+            for label, values in of.items():
+                files[label] = str(self._output(f"{label}.{channel}", ".png"))
+                images.write_png(files[label], images.false_colours(values, ends))
+            self.result.setdefault("aovs", {})[channel] = {"scale": ends, "files": files}
 
     def _picture(self, title, pixels):
         self.pictures[title] = self._output(title, ".png")

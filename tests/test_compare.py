@@ -166,6 +166,20 @@ def test_false_colours_get_brighter_with_the_error():
     assert brightness[0] == brightness[1] < brightness[2] < brightness[3] < brightness[4] < brightness[5]
 
 
+def test_false_colours_of_other_channels_span_their_scale():
+    colours = images.false_colours(np.array([[0.0, -1.0, 30.0, 300.0, 3000.0, np.inf, np.nan]]), (30, 3000))[0]
+    assert np.all(colours[:3] == images.FALSE_COLOURS[0]) and np.all(colours[4:] == images.FALSE_COLOURS[-1])
+    np.testing.assert_allclose(colours[3], images.FALSE_COLOURS[2:4].mean(axis=0), atol=1)  # the middle of the scale
+
+
+def test_scale_of_several_images_holds_all_and_ignores_grazed_pixels():
+    few, many = np.linspace(101.0, 201, 1000).reshape(20, 50), np.full((20, 50), 4000.0)
+    few[0, :5], few[1, :10], many[0, 0] = 1e-3, 0, np.inf
+    assert images.logarithmic_ends([few, many]) == (100, 4000)
+    assert images.logarithmic_ends([many, np.zeros((2, 2))]) == (2000, 4000)
+    assert images.logarithmic_ends([np.zeros((2, 2))]) == (1, 2)
+
+
 def test_colour_of_luminance_and_of_nothing():
     assert images.colour(np.ones((2, 2, 1)), ["Y"]).shape == (2, 2, 3)
     with pytest.raises(ValueError, match="no colour channels among depth"):
@@ -279,6 +293,37 @@ def test_reference_by_vpl_shares_the_lights(tmp_path, capsys):
     assert every["rays_per_sample"] > 0
 
 
+def test_aovs_are_asked_for_and_shown_on_one_scale(tmp_path, capsys):
+    status = compare.main([
+        str(CORNELL), "-i", "path,few=vpl,many=vpl", "-p", "few.vpl_count=100", "-p", "many.vpl_count=900", "--spp",
+        "1", "--width", "16", "--reference", "vpl", "-o", str(tmp_path), "-p", "many.aovs=cut_size,shadow_rays",
+        "--aovs", "shadow_rays, upper_bounds",
+    ])  # fmt: skip
+    assert status == 0, capsys.readouterr().out
+    scene = json.loads((tmp_path / "results.json").read_text())["scenes"][0]
+    asked = [render["parameters"].get("aovs") for render in scene["renders"]]
+    assert asked == [None, "shadow_rays,upper_bounds", "cut_size,shadow_rays,upper_bounds"]
+    assert images.read_exr(scene["renders"][2]["vpl_output"])[1] == ["B", "G", "R"]
+    assert list(scene["aovs"]) == ["shadow_rays", "upper_bounds"]
+    rays, bounds = scene["aovs"].values()
+    assert rays["files"] == {label: str(tmp_path / f"cornell.{label}.shadow_rays.png") for label in ("few", "many")}
+    low, high = rays["scale"]
+    assert 4 * low < high and bounds["scale"] == [1, 2]  # vpl computes no bounds
+    pixels = {label: np.array(mi.Bitmap(file)).astype(int) for label, file in rays["files"].items()}
+    assert pixels["many"].mean() > 2 * pixels["few"].mean() > 0
+    assert np.all(np.array(mi.Bitmap(bounds["files"]["few"])) == images.FALSE_COLOURS[0])
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 3 + 2 + 4  # images, errors, channels
+    assert f"<span>{low:g}</span><span>{high:g}</span>" in page
+
+
+def test_aovs_that_not_all_know_are_asked_of_those_that_do(monkeypatch):
+    monkeypatch.setattr(compare.command_line, "aov_refusal", lambda *asked: asked == ("vpl", "own"))
+    options = compare.parse([str(CORNELL), "-i", "path,lightcuts,vpl", "--aovs", "cut_size,own"])
+    asked = {label: parameters for label, (_, parameters) in compare.chosen_integrators(options).items()}
+    assert asked == {"path": {}, "lightcuts": {"aovs": "cut_size,own"}, "vpl": {"aovs": "cut_size"}}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -287,6 +332,8 @@ def test_reference_by_vpl_shares_the_lights(tmp_path, capsys):
         ([str(CORNELL), "-i", "nosuch"], "unknown integrator 'nosuch'; there are"),
         ([str(CORNELL), "-i", "path,path"], "'path' is no name of its own"),
         ([str(CORNELL), "-p", "vpl.error=1"], "LABEL is path or lightcuts"),
+        ([str(CORNELL), "--aovs", "shadow_rays,bogus"], 'a comma-separated list out of "shadow_rays", "upper_bounds"'),
+        ([str(CORNELL), "-i", "path", "--aovs", "cut_size"], "only vpl, lightcuts have AOVs"),
         ([str(CORNELL), "-r", "path:many"], "not of the form path:SPP"),
         ([str(CORNELL), "-r", "nosuch.exr"], "neither a file"),
         ([str(CORNELL), "--spp", "1", "--time", "1"], "not allowed with"),
