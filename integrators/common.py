@@ -30,7 +30,8 @@ class Shading:
     """What a method is asked to shade: one batch of gather points.
 
     ``direct``: radiance per point that is known already (direct light of extended emitters); ``mean``: an estimate of
-    the mean radiance over all gather points of the render and over channels; ``stopped``: whether to give up early.
+    the mean radiance over all gather points of the render and over channels; ``pixel``: UInt32, which points belong to
+    the same pixel, and ``samples``: camera rays of a pixel; ``stopped``: whether to give up early.
     """
 
     scene: object
@@ -40,6 +41,8 @@ class Shading:
     direct: object
     mean: float
     seed: int
+    pixel: object
+    samples: int
     stopped: Callable[[], bool]
 
 
@@ -47,7 +50,8 @@ class Shading:
 class Shaded:
     """What a method answers: radiance due to the lights, and counters, per point of the batch.
 
-    ``shadow_rays``, ``upper_bounds``, ``cut_size``: UInt32; ``seconds``: time by stage.
+    ``shadow_rays``, ``upper_bounds``, ``cut_size``: UInt32, or Float where several points share one; ``seconds``: time
+    by stage; ``phase_one``: radiance that a first phase assumed, where the method has one.
     """
 
     radiance: object
@@ -55,6 +59,7 @@ class Shaded:
     upper_bounds: object
     cut_size: object
     seconds: dict = field(default_factory=dict)
+    phase_one: object = None
 
 
 class Clock:
@@ -93,6 +98,11 @@ class Prepared:
     clock: Clock
 
 
+def _whole_sum(values) -> int:
+    """Sum of a counter over all points (None: nothing was counted); shares of a count add up to whole numbers."""
+    return 0 if values is None else round(float(download(values).sum(dtype="float64")))
+
+
 class ManyLightIntegrator(mi.SamplingIntegrator):
     """Base class: reads the common properties, makes lights and gather points, and asks ``shade`` for the rest.
 
@@ -102,6 +112,7 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
     """
 
     needs_trees = True
+    offered_aovs = AOVS
 
     def __init__(self, props):
         super().__init__(props)
@@ -113,7 +124,9 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
         self.direct = properties.choice(props, "direct", "nee", ("nee", "vpl", "none"))
         self.emitter_samples = properties.integer(props, "emitter_samples", 4, 1)
         self.lobe_limit = properties.number(props, "lobe_limit", 1.0, 0)
-        self.aovs = properties.words(props, "aovs", AOVS)
+        self.aovs = properties.words(props, "aovs", self.offered_aovs)
+        # Read by the base class too, which does not show it
+        self.samples_per_pass = properties.integer(props, "samples_per_pass", 2**32 - 1, 1)
         self.statistics: dict = {}
 
     def shade(self, job: Shading) -> Shaded:
@@ -180,10 +193,10 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
             "dropped": lights.dropped + emitters.dropped,
         }
         if lights.groups:
-            prepared.jobs = self._jobs(scene, traits, lights, prepared, seed)
+            prepared.jobs = self._jobs(scene, traits, lights, prepared, seed, self._samples_of_a_pixel(sampler))
         return prepared
 
-    def _jobs(self, scene, traits, lights: LightSet, prepared: Prepared, seed: int) -> list[Shading]:
+    def _jobs(self, scene, traits, lights: LightSet, prepared: Prepared, seed: int, samples: int) -> list[Shading]:
         """One job per batch of gather points, each knowing the mean radiance over all of them."""
         points, jobs, mean = prepared.paths.points, [], 0.0
         batches = make_batches(points, probe_materials(points, traits))
@@ -191,7 +204,9 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
         for number, batch in enumerate(batches):
             direct = dr.gather(type(prepared.direct), prepared.direct, batch.index)
             stream = derived_seed(seed, 31, number)
-            jobs.append(Shading(scene, traits, lights, batch, direct, 0.0, stream, self.should_stop))
+            pixel = dr.gather(mi.UInt32, points.ray, batch.index) // samples
+            dr.eval(pixel)
+            jobs.append(Shading(scene, traits, lights, batch, direct, 0.0, stream, pixel, samples, self.should_stop))
             if self.needs_trees:
                 level = mean_radiance(scene, traits, lights, batch, derived_seed(seed, 32, number))
                 mean += (level + float(download(direct).mean(dtype="float64"))) * batch.count / points.count
@@ -200,15 +215,22 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
         prepared.clock.lap("pilot")
         return jobs
 
+    def _samples_of_a_pixel(self, sampler) -> int:
+        """Camera rays of a pixel in this pass: Mitsuba puts them next to each other."""
+        samples = min(sampler.sample_count(), self.samples_per_pass)
+        return samples if sampler.wavefront_size() % samples == 0 else 1
+
     def _assemble(self, prepared: Prepared, shaded: list[Shaded]):
         """Put the batches together: (radiance, requested counters) per camera ray; fills ``statistics``."""
         points, clock = prepared.paths.points, prepared.clock
         radiance = prepared.direct
-        totals = {name: dr.zeros(mi.UInt32, points.count) for name in AOVS}
+        totals = {}
         for job, part in zip(prepared.jobs, shaded, strict=True):
             dr.scatter_add(radiance, part.radiance, job.batch.index)
-            for name in AOVS:
-                dr.scatter(totals[name], getattr(part, name), job.batch.index)
+            for name in self.offered_aovs:
+                values = getattr(part, name)
+                total = totals.setdefault(name, dr.zeros(type(values), points.count))
+                dr.scatter(total, values, job.batch.index)
             clock.split(part.seconds)
         image, bad_samples = mi.UnpolarizedSpectrum(prepared.paths.emission), 0
         counters = [dr.zeros(mi.Float, dr.width(prepared.paths.valid)) for _ in self.aovs]
@@ -217,7 +239,8 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
             bad = ~dr.all(dr.isfinite(lit))
             dr.scatter_add(image, dr.select(bad, 0, lit), points.ray)
             for name, counter in zip(self.aovs, counters, strict=True):
-                dr.scatter(counter, mi.Float(totals[name]), points.ray)
+                if name in totals:
+                    dr.scatter(counter, mi.Float(totals[name]), points.ray)
             bad_samples = int(dr.count(bad)[0])
         dr.eval(image, counters)
         self._count(prepared, totals, bad_samples)
@@ -230,7 +253,7 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
         names = {"shadow_rays": "shadow_rays", "upper_bounds": "bound_computations", "cut_size": "cut_size"}
         self.statistics = {
             "gather_points": prepared.paths.points.count,
-            **{label: int(download(totals[name]).sum(dtype="int64")) for name, label in names.items()},
+            **{label: _whole_sum(totals.get(name)) for name, label in names.items()},
             **({"lights": {}, "light_paths": 0, "emitter_rays": 0, "dropped": 0} | prepared.counts),
             "seconds": prepared.clock.seconds,
         }

@@ -11,12 +11,14 @@ from vpl.cuts import evaluate_cuts, limited_cuts
 
 from . import properties
 from .common import Clock, ManyLightIntegrator, Shaded, Shading
+from .manual import manual_page
 
 # A point's radiance is estimated from coarse cuts at every eighth point, averaged over sixteen neighbours on the
 # Morton curve; bounds of these cuts are accepted up to this fraction of the image's mean.
 _ESTIMATE_STRIDE, _ESTIMATE_BLOCK, _ESTIMATE_ERROR = 8, 16, 0.05
 
 
+@manual_page
 class LightcutsIntegrator(ManyLightIntegrator):
     r"""
     .. _integrator-lightcuts:
@@ -40,53 +42,7 @@ class LightcutsIntegrator(ManyLightIntegrator):
        - |int|
        - Most clusters in the cut of a point, at least one per kind of light; 0 is no limit. (Default: 1000)
 
-     * - max_depth
-       - |int|
-       - Longest path from camera to emitter, in edges, counted as Mitsuba's ``path`` counts them: 1 shows emitters
-         only, 2 adds direct light, and -1 is no limit. (Default: -1)
-
-     * - rr_depth
-       - |int|
-       - Edges after which paths may end by Russian roulette. (Default: 5)
-
-     * - hide_emitters
-       - |bool|
-       - Do not show area emitters and environments to the camera. (Default: no)
-
-     * - vpl_count
-       - |int|
-       - How many virtual point lights to aim for. (Default: 200000)
-
-     * - direct
-       - |string|
-       - Light that comes straight from emitters. ``nee``: area emitters and environments by emitter and BSDF sampling
-         with multiple importance sampling. ``vpl``: they become virtual lights, as in the papers. ``none``: left out.
-         Point lights, spots and directional emitters are virtual lights already, exact and never clamped, in both
-         ``nee`` and ``vpl``. (Default: ``nee``)
-
-     * - emitter_samples
-       - |int|
-       - Pairs of an emitter and a BSDF sample per gather point with ``direct="nee"``. (Default: 4)
-
-     * - direct_count
-       - |int|
-       - Virtual lights on area emitters, and as many for the environment, with ``direct="vpl"``. (Default: 4096)
-
-     * - clamping
-       - |float|
-       - Smallest distance to a virtual light that stands for a surface, as a fraction of the radius of the scene's
-         bounding sphere; light from nearer is dimmed instead of becoming a bright spot. 0 turns it off.
-         (Default: 0.01; papers that use fewer lights clamp at 0.05)
-
-     * - lobe_limit
-       - |float|
-       - A glossy lobe stores virtual lights where its density is at most this, per steradian, as though it were
-         diffuse (which has at most 1/pi); 0 stores the light of diffuse lobes only. (Default: 1.0)
-
-     * - aovs
-       - |string|
-       - Comma-separated counters to return as channels, per camera ray and from the same pass: ``shadow_rays``,
-         ``upper_bounds``, ``cut_size``. (Default: none)
+     {common parameters}
 
     Walter et al. 2005, "Lightcuts: a scalable approach to illumination" [LC]. All virtual lights are clustered into
     one tree per kind (point, spot, oriented, directional, environment); every gather point is lit by a *cut*: clusters
@@ -94,15 +50,7 @@ class LightcutsIntegrator(ManyLightIntegrator):
     is the coarsest whose clusters all have an upper bound of their contribution of at most ``error`` times the radiance
     of the point.
 
-    What is estimated: emission + direct + indirect light, over the paths that ``path`` counts for the same
-    ``max_depth``. Camera rays go on through mirrors, glass and masks. Left out are caustics and light that sharp lobes
-    send on from the second surface (they would need another kind of light), and what ``clamping`` cuts off.
-
-    - Surfaces only: a scene with a participating medium is refused.
-    - ``*_rgb`` and ``*_mono`` variants only. Not differentiable.
-    - Emitters: point, spot, directional, area on any shape, envmap, constant, sunsky; projectors and textured spots
-      with ``direct="nee"``.
-    - Shadow rays pass surfaces that do not scatter (masks, thin glass) with their transmission.
+    {what is estimated}
 
     **Departures from the paper.** The radiance that bounds are compared with is not the running total of the cut but an
     estimate made before, from coarse cuts of every eighth point and the direct light, averaged over sixteen

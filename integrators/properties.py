@@ -26,6 +26,14 @@ def number(props, name: str, default: float, minimum: float) -> float:
     return float(value)
 
 
+def boolean(props, name: str, default: bool) -> bool:
+    """True or false."""
+    value = props.get(name, default)
+    if not isinstance(value, bool):
+        _fail(props, name, "true or false", value)
+    return value
+
+
 def choice(props, name: str, default: str, allowed: tuple[str, ...]) -> str:
     """One of a few words."""
     value = props.get(name, default)

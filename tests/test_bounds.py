@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vpl.arrays import download, upload
-from vpl.bounds import DeviceTree, contribution_bound
+from vpl.bounds import DeviceTree, Receiver, contribution_bound
 from vpl.light_set import light_tree
 from vpl.light_tree import CONE_COS, build_light_tree
 from vpl.lights import VirtualLights
@@ -82,13 +82,13 @@ def test_no_light_exceeds_the_bound_of_its_ancestors(kind, spread, seed):
     def vectors(values):
         return mi.Vector3f(*(upload(mi.Float, values[:, k]) for k in range(3)))
 
-    proxy = proxy_of(albedo, peak, exponent, axis)
+    receiver = Receiver(mi.Point3f(vectors(position)), vectors(normal), proxy_of(albedo, peak, exponent, axis))
     leaves = np.concatenate([[0], np.cumsum(reference.escape == np.arange(len(reference.records)) + 1)])
     worst = 0.0
     for node in range(len(reference.records)):
         below = reference.leaf_order[leaves[node] : leaves[reference.escape[node]]]
         fetched = device.gather(dr.full(mi.UInt32, node, POINTS))
-        bound = contribution_bound(kind, mi.Point3f(vectors(position)), vectors(normal), proxy, fetched, clamp)
+        bound = contribution_bound(kind, receiver, fetched, clamp)
         bound = download(bound).astype(np.float64)
         assert not np.isnan(bound).any() and (bound >= 0).all()
         # The cluster's whole intensity at the place of its best light, and the sum of its lights
@@ -115,5 +115,6 @@ def test_a_bound_that_is_too_small_would_be_found():
     def vectors(values):
         return mi.Vector3f(*(upload(mi.Float, values[:, k]) for k in range(3)))
 
-    bound = contribution_bound("oriented", mi.Point3f(vectors(position)), vectors(normal), proxy, narrow, 0.05)
+    receiver = Receiver(mi.Point3f(vectors(position)), vectors(normal), proxy)
+    bound = contribution_bound("oriented", receiver, narrow, 0.05)
     assert np.any(truth > download(bound) * 1.001)

@@ -333,7 +333,7 @@ def test_aovs_that_not_all_know_are_asked_of_those_that_do(monkeypatch):
         ([str(CORNELL), "-i", "path,path"], "'path' is no name of its own"),
         ([str(CORNELL), "-p", "vpl.error=1"], "LABEL is path or lightcuts"),
         ([str(CORNELL), "--aovs", "shadow_rays,bogus"], 'a comma-separated list out of "shadow_rays", "upper_bounds"'),
-        ([str(CORNELL), "-i", "path", "--aovs", "cut_size"], "only vpl, lightcuts have AOVs"),
+        ([str(CORNELL), "-i", "path", "--aovs", "cut_size"], "have AOVs"),
         ([str(CORNELL), "-r", "path:many"], "not of the form path:SPP"),
         ([str(CORNELL), "-r", "nosuch.exr"], "neither a file"),
         ([str(CORNELL), "--spp", "1", "--time", "1"], "not allowed with"),

@@ -33,6 +33,23 @@ class Node:
     escape: object
 
 
+@dataclass
+class Receiver:
+    """Gather points, or boxes of them, in a kernel: one per lane.
+
+    ``position``: of a point, or the centre of a box of half extents ``extent`` (None for points); ``normal``: shading
+    normal on the side of the outgoing direction, or the axis of a cone around the normals of half-angle
+    acos(``normal_cosine``); ``mirror_cosine``: the same for the proxy's axis.
+    """
+
+    position: object
+    normal: object
+    proxy: MaterialProxy
+    extent: object = None
+    normal_cosine: object = None
+    mirror_cosine: object = None
+
+
 class DeviceTree:
     """A light tree's packed records on the device.
 
@@ -56,6 +73,10 @@ class DeviceTree:
             mi.Color3f(c.w, d.x, d.y),
             dr.reinterpret_array(mi.UInt32, d.z),
         )
+
+    def escape(self, index, active=True):
+        """The node that follows a node's subtree."""
+        return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._records, index * 16 + 14, active))
 
     def summed_intensity(self, index, active=True):
         """Scalar intensity of a node: the mean over channels of the sum over its lights."""
@@ -89,34 +110,54 @@ def cosine_less_angle(cosine, cone_cosine):
     return dr.select(cosine >= cone_cosine, 1, cosine * cone_cosine + sines)
 
 
-def contribution_bound(kind: str, position, normal, proxy: MaterialProxy, node: Node, smallest_distance):
-    """Upper bound of the mean over channels of a cluster's contribution to a gather point; 0 is exact.
+def _nearest_cosine(cosine, cone_cosine):
+    """The larger cosine where an axis is only known to lie in a cone (None: it is exact)."""
+    return cosine if cone_cosine is None else cosine_less_angle(cosine, cone_cosine)
 
-    ``normal``: shading normal on the side of the outgoing direction.
+
+def contribution_bound(kind: str, receiver: Receiver, node: Node, smallest_distance):
+    """Upper bound of the mean over channels of a cluster's contribution to gather points; 0 is exact.
+
+    For a box of points the vectors to a box of lights fill a box again, with the sum of both extents [IC section 3].
     """
+    proxy, mirror = receiver.proxy, None
     if kind in AT_INFINITY:
         # Directions towards the lights fill a cone around -axis: no distance, and cosines against a cone
-        receiver = dr.maximum(cosine_less_angle(-dr.dot(normal, node.axis), node.cosine), 0)
-        factor = mi.Float(1)
-        mirror = dr.maximum(cosine_less_angle(-dr.dot(proxy.axis, node.axis), node.cosine), 0) if proxy.glossy else None
+
+        def largest_cosine(axis):
+            return cosine_less_angle(-dr.dot(axis, node.axis), node.cosine)
+
     else:
-        center = 0.5 * (node.box_min + node.box_max) - position
+        center = 0.5 * (node.box_min + node.box_max) - receiver.position
         extent = 0.5 * (node.box_max - node.box_min)
+        if receiver.extent is not None:
+            extent += receiver.extent
         radius = dr.norm(extent)
         distance2 = dr.squared_norm(dr.maximum(dr.abs(center) - extent, 0))
-        receiver = dr.maximum(cosine_to_box(normal, center, extent, distance2, radius), 0)
-        mirror = dr.maximum(cosine_to_box(proxy.axis, center, extent, distance2, radius), 0) if proxy.glossy else None
-        factor = _geometry_bound(kind, node, center, extent, distance2, radius, smallest_distance)
-    if proxy.without_cosines:
-        receiver = dr.select(proxy.no_cosine, 1, receiver)
-    material = proxy.base * receiver
+
+        def largest_cosine(axis):
+            return cosine_to_box(axis, center, extent, distance2, radius)
+
+    cosine = dr.maximum(_nearest_cosine(largest_cosine(receiver.normal), receiver.normal_cosine), 0)
     if proxy.glossy:
-        # The lobe exists only where the receiver's hemisphere can see the cluster
-        lobe = dr.select(receiver > 0, dr.power(mirror, proxy.exponent), 0)
-        material += proxy.peak * lobe
-    reflected = channel_mean(material * node.intensity)
+        mirror = dr.maximum(_nearest_cosine(largest_cosine(proxy.axis), receiver.mirror_cosine), 0)
+    factor = mi.Float(1)
+    if kind not in AT_INFINITY:
+        factor = _geometry_bound(kind, node, center, extent, distance2, radius, smallest_distance)
+    reflected = channel_mean(_material_bound(proxy, cosine, mirror) * node.intensity)
     # A point inside a flat box has an infinite factor and no cosine: that is nothing, not NaN
     return dr.select(reflected > 0, factor * reflected, 0)
+
+
+def _material_bound(proxy: MaterialProxy, cosine, mirror):
+    """Largest BSDF times cosine, given the largest cosines to the normal and to the mirror direction."""
+    if proxy.without_cosines:
+        cosine = dr.select(proxy.no_cosine, 1, cosine)
+    material = proxy.base * cosine
+    if proxy.glossy:
+        # The lobe exists only where the receiver's hemisphere can see the cluster
+        material += proxy.peak * dr.select(cosine > 0, dr.power(mirror, proxy.exponent), 0)
+    return material
 
 
 def _geometry_bound(kind: str, node: Node, center, extent, distance2, radius, smallest_distance):

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import channel_mean, download, upload
+from .arrays import download, upload
 from .bounds import contribution_bound
 from .evaluation import evaluate_pairs
 from .gather import SceneTraits
@@ -42,7 +42,7 @@ class CutSizes:
 def _step(group: LightGroup, batch: Batch, threshold, smallest_distance, i):
     """Look at node ``i``: (taken into the cut, next node).  A bound of zero skips the node: nothing can arrive."""
     node = group.tree.gather(i)
-    bound = contribution_bound(group.kind, batch.position, batch.normal, batch.proxy, node, smallest_distance)
+    bound = contribution_bound(group.kind, batch.receiver, node, smallest_distance)
     reached = bound > 0
     taken = reached & ((node.escape == i + 1) | (bound <= threshold))
     return taken, dr.select(taken | ~reached, node.escape, i + 1)
@@ -191,13 +191,8 @@ class CutChunk:
     visits: object
 
     def representatives(self, second=False):
-        """The light that stands for each node (or its second one), and the factor from its intensity to the cluster's.
-
-        A representative is drawn with probability intensity / cluster intensity; dividing by it, rather than taking the
-        cluster's colour, keeps the estimate unbiased where colours differ.
-        """
-        light = self.group.lights.gather(self.group.tree.representative(self.nodes, second=second))
-        return light, self.group.tree.summed_intensity(self.nodes) / channel_mean(light.intensity)
+        """The light that stands for each node, or its second one, and its factor: see :class:`LightGroup`."""
+        return self.group.representatives(self.nodes, second)
 
 
 def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):

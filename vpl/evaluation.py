@@ -18,18 +18,40 @@ from .visibility import shadow_ray, transmittance
 _LIGHTS_PER_KERNEL = 4096
 
 
-def evaluate_pairs(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface: Surface, light, scale):
+def evaluate_pairs(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface, light, scale, seen=None):
     """Shade one (surface, light) pair per lane and trace its shadow ray, unless nothing would arrive.
 
-    ``light``: lights gathered from ``group``; ``scale``: factor on their intensity.
-    Returns (radiance with visibility, mask of the lanes whose ray was traced).
+    ``light``: lights gathered from ``group``; ``scale``: factor on their intensity; ``seen``: lanes whose light is
+    taken to arrive without a ray (None: none).  Returns (radiance with visibility, mask of the lanes whose ray was
+    traced).
     """
+    value = _unoccluded(lights, group, surface, light) * scale
+    arrives = dr.any(value > 0)
+    traced = arrives if seen is None else arrives & ~seen
+    passed = _visibility(scene, traits, group, surface, light, traced)
+    if seen is not None:
+        passed = dr.select(seen, 1, passed)
+    return dr.select(arrives, value * passed, 0), traced
+
+
+def probe_visibility(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface: Surface, light):
+    """The fraction of light that arrives, (surface, light) pair by pair, where any would if nothing was between.
+
+    Returns (fraction, mask of the lanes for which it was asked).
+    """
+    traced = dr.any(_unoccluded(lights, group, surface, light) > 0)
+    # Always of several channels: all() and any() over those of one would run over the lanes
+    return mi.UnpolarizedSpectrum(_visibility(scene, traits, group, surface, light, traced)), traced
+
+
+def _unoccluded(lights: LightSet, group: LightGroup, surface: Surface, light):
     allowed = lights.allowed(surface.depth, light.depth)
-    value = contribution(group.kind, surface, light, lights.smallest_distance, allowed) * scale
-    traced = dr.any(value > 0)
+    return contribution(group.kind, surface, light, lights.smallest_distance, allowed)
+
+
+def _visibility(scene, traits: SceneTraits, group: LightGroup, surface: Surface, light, active):
     ray = shadow_ray(group.kind, surface.interaction, light)
-    passed = transmittance(scene, traits, group.kind, ray, traced)
-    return dr.select(traced, value * passed, 0), traced
+    return transmittance(scene, traits, group.kind, ray, active)
 
 
 @dr.syntax

@@ -9,6 +9,7 @@ from time import perf_counter
 import mitsuba as mi
 import numpy as np
 
+from .arrays import channel_mean
 from .bounds import DeviceTree
 from .emission import bounding_sphere
 from .emitter_lights import lights_of_emitters
@@ -47,6 +48,15 @@ class LightGroup:
     @property
     def count(self) -> int:
         return self.lights.count
+
+    def representatives(self, nodes, second=False):
+        """The light that stands for each node (or its second one), and the factor from its intensity to the cluster's.
+
+        A representative is drawn with probability intensity / cluster intensity; dividing by it, rather than taking the
+        cluster's colour, keeps the estimate unbiased where colours differ.
+        """
+        light = self.lights.gather(self.tree.representative(nodes, second=second))
+        return light, self.tree.summed_intensity(nodes) / channel_mean(light.intensity)
 
 
 @dataclass

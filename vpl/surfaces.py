@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .arrays import rgb_to_spectrum
+from .bounds import Receiver
 from .gather import GatherPoints
 from .proxies import MaterialProxy
 
@@ -31,6 +32,10 @@ class LambertianSurface(Surface):
     normal: object
     albedo: object
 
+    def material(self):
+        """None: an albedo is all that tells one material from another."""
+        return None
+
     def reflected(self, to_light, active):
         """BSDF times cosine for light from a world space direction."""
         return rgb_to_spectrum(self.albedo * dr.maximum(dr.dot(self.normal, to_light), 0)) & active
@@ -39,6 +44,10 @@ class LambertianSurface(Surface):
 @dataclass
 class ScatteringSurface(Surface):
     """Any material: ``interaction`` is a full surface interaction."""
+
+    def material(self):
+        """A number for the BSDF of each surface."""
+        return dr.reinterpret_array(mi.UInt32, self.interaction.bsdf())
 
     def reflected(self, to_light, active):
         """BSDF times cosine for light from a world space direction."""
@@ -65,6 +74,11 @@ class Batch:
     @property
     def position(self):
         return self.surfaces.interaction.p
+
+    @property
+    def receiver(self) -> Receiver:
+        """The points as bounds see them."""
+        return Receiver(self.position, self.normal, self.proxy)
 
     def surfaces_at(self, row, active=True):
         """The surfaces of some rows of this batch, as lazy gathers."""

@@ -1,0 +1,246 @@
+"""IlluminationCut: clusters of gather points and clusters of lights, chosen together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from vpl.approximate_image import approximate_radiance
+from vpl.arrays import download, upload
+from vpl.cuts import limited_cuts
+from vpl.pair_lists import evaluate_lists, list_pairs
+from vpl.pair_visibility import decide_visibility
+from vpl.pairs import BoundCounter, Pairs, find_pairs
+from vpl.point_clusters import PointClusters
+from vpl.shared_samples import share_samples
+from vpl.surfaces import Batch
+
+from . import properties
+from .common import AOVS, Clock, ManyLightIntegrator, Shaded, Shading
+from .manual import manual_page
+
+# Pairs held before they are evaluated: bounds the memory whatever the image and the error
+_PAIRS_HELD = 1 << 25
+# One point in so many tells how large the cuts around it are
+_TRIED_STRIDE = 32
+_DEFAULT_ERROR = {"all": 0.015, "adaptive": 0.01}
+
+
+@dataclass
+class Shown:
+    """The points that are shaded: ``rows`` along the tree, as a batch; ``of``: for every point, which of them it
+    shows."""
+
+    batch: Batch
+    rows: object
+    of: object
+
+
+@manual_page
+class IlluminationCutIntegrator(ManyLightIntegrator):
+    r"""
+    .. _integrator-illuminationcut:
+
+    IlluminationCut (:monosp:`illuminationcut`)
+    -------------------------------------------
+
+    .. pluginparameters::
+
+     * - error
+       - |float|
+       - Largest bound of what a pair of clusters contributes to one of its points, as a fraction of the least radiance
+         among them: 0.01 is 1%. 0 refines to single lights. (Default: 0.015, with ``visibility="adaptive"`` 0.01)
+
+     * - visibility
+       - |string|
+       - ``all``: one shadow ray for every point of a pair. ``adaptive``: a few of them are traced, and where they agree
+         the others are taken to see the same; fewer rays, and a bias (see below). (Default: ``all``)
+
+     * - dark_floor
+       - |float|
+       - Points darker than this fraction of the image's mean are refined as if they had it; 0 holds the bound
+         everywhere, at several times the cost in dark corners. (Default: 0.5)
+
+     * - max_cut
+       - |int|
+       - About how many clusters a point may be lit by; where the bound asks for more, it is raised. 0 is no limit.
+         (Default: 1000)
+
+     * - phase_one_error
+       - |float|
+       - Bound, as a fraction of the image's mean, up to which pairs of the first, approximate image are not refined. 0
+         leaves it to the paper's criterion alone. (Default: 0.2)
+
+     * - share_samples
+       - |bool|
+       - Shade only one of the samples of a pixel that lie close to each other, and let the others take over its light.
+         Pays with many samples a pixel; noisier on fine textures. (Default: no)
+
+     {common parameters}
+
+    Bus, Mustafa and Biri 2015, "IlluminationCut" [IC]. Like :ref:`lightcuts <integrator-lightcuts>`, but points are
+    clustered too: a tree over all gather points and the trees over the lights are descended together, until every pair
+    of a cluster of points and a cluster of lights has a bound of at most ``error`` times the radiance of its points
+    (eq. 4, Algorithm 1). Bounds are computed once for many points, and the shadow rays of a pair leave from one place
+    towards one light. A first, approximate image (Phase I) says how bright the points are.
+
+    With ``visibility="adaptive"`` (Algorithm 2, "IlluminationCut-Sampling") a pair of 32 points or more is probed
+    with 8 or 16 rays. If all arrive, or none does, no more are traced; otherwise the pair is divided and its parts
+    are probed. An occluder that lies between the probes is missed: the result is biased at small shadows and where a
+    shadow's edge passes between probes, by amounts that the error bound does not cover.
+
+    {what is estimated}
+
+    **Departures from the paper.** Order of refinement: see :mod:`vpl.pairs`. Tree of points: see :mod:`vpl.point_tree`.
+    Phase I: see :mod:`vpl.approximate_image`. Adaptive visibility: see :mod:`vpl.pair_visibility`. ``dark_floor`` and
+    ``max_cut`` are ours: without the latter, sharp lobes take thousands of clusters; it is held by raising the bound
+    around points for which a light cut at their bound is larger, tried at every 32nd point. A cluster's representative
+    counts with its own colour, so that pairs are unbiased where colours differ. Lambertian points and all others are in
+    trees of their own.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="illuminationcut">
+                <integer name="max_depth" value="8"/>
+                <string name="visibility" value="adaptive"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            import integrators
+            "integrator": {"type": "illuminationcut", "max_depth": 8, "visibility": "adaptive"}
+    """
+
+    offered_aovs = (*AOVS, "phase_one")
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.visibility = properties.choice(props, "visibility", "all", tuple(_DEFAULT_ERROR))
+        self.error = properties.number(props, "error", _DEFAULT_ERROR[self.visibility], 0)
+        self.dark_floor = properties.number(props, "dark_floor", 0.5, 0)
+        self.max_cut = properties.integer(props, "max_cut", 1000, 0)
+        self.share_samples = properties.boolean(props, "share_samples", False)
+        self.phase_one_error = properties.number(props, "phase_one_error", 0.2, 0)
+
+    def shade(self, job: Shading) -> Shaded:
+        """Phase I, Phase II and the evaluation of the pairs, for one batch ([IC] section 3)."""
+        clock = Clock()
+        clusters = PointClusters(job.batch)
+        clock.lap("point_tree")
+        counter = BoundCounter(clusters, "upper_bounds" in self.aovs)
+        bright, rays = self._approximate(job, clusters, counter)
+        threshold = self._threshold(job, clusters, bright, counter)
+        clock.lap("phase_one")
+
+        shaded = Shaded(
+            dr.zeros(mi.UnpolarizedSpectrum, clusters.count), rays, None, dr.zeros(mi.UInt32, clusters.count)
+        )
+        shown = self._choose_shown(job, clusters)
+        for group, pairs in self._pairs(job, clusters, threshold, counter):
+            clock.lap("phase_two")
+            self._evaluate(job, group, clusters, shown, pairs, shaded, clock)
+        clock.lap("phase_two")
+        shaded.upper_bounds = counter.per_point()
+        shaded.phase_one = upload(mi.Float, bright[clusters.tree.leaf])
+        shaded.seconds = clock.seconds
+        return _in_batch_order(clusters, shaded)
+
+    def _approximate(self, job: Shading, clusters: PointClusters, counter: BoundCounter):
+        """Phase I: approximate radiance at every leaf, (m,) float64, and the shadow rays it took, per point."""
+        negligible = self.phase_one_error * job.mean
+        generator = np.random.default_rng(job.seed)
+        reflected, rays = approximate_radiance(
+            job.scene, job.traits, job.lights, clusters, negligible, generator, counter
+        )
+        tree = clusters.tree
+        direct = tree.reduce(download(job.direct).mean(1, dtype=np.float64), np.add) / tree.count
+        return reflected + direct, rays
+
+    def _threshold(self, job: Shading, clusters: PointClusters, bright: np.ndarray, counter: BoundCounter):
+        """Largest bound that a pair may have, per point node: error × least radiance of its points ([IC] eq. 4)."""
+        tree, leaves = clusters.tree, clusters.tree.leaves()
+        allowed = self.error * np.maximum(bright[leaves], self.dark_floor * job.mean)
+        if self.max_cut:
+            # A leaf takes after the point that is tried next to its first one
+            raised = self._raise_thresholds(job, clusters, np.repeat(allowed, tree.count[leaves]), counter)
+            allowed *= raised[tree.first[leaves] // _TRIED_STRIDE]
+        return upload(mi.Float, tree.gather_up(allowed, leaves, np.minimum))
+
+    def _raise_thresholds(self, job: Shading, clusters: PointClusters, allowed: np.ndarray, counter: BoundCounter):
+        """Factors, at least 1, by which every _TRIED_STRIDE-th point must raise its threshold to have a cut that is not
+        larger than ``max_cut``."""
+        rows = np.arange(0, clusters.count, _TRIED_STRIDE)
+        index, threshold = upload(mi.UInt32, rows), upload(mi.Float, allowed[rows])
+        part = clusters.batch.select(index)
+        raised, _, visits = limited_cuts(job.lights, part, threshold, self.max_cut)
+        counter.add_at_points(index, visits)
+        return np.maximum(download(raised).astype(np.float64) / np.maximum(allowed[rows], 1e-300), 1)
+
+    def _pairs(self, job: Shading, clusters: PointClusters, threshold, counter: BoundCounter):
+        """Phase II: yield (group of lights, illumination-aware pairs), at most about _PAIRS_HELD of them at a time."""
+
+        def illumination_aware(points, lights, bound, index):
+            return bound <= dr.gather(mi.Float, threshold, index)  # [IC] Algorithm 1, line 26
+
+        for group in job.lights.groups:
+            held, count = [], 0
+            for pairs in find_pairs(clusters, job.lights, group, illumination_aware, counter):
+                held.append(pairs)
+                count += pairs.count
+                if count >= _PAIRS_HELD:
+                    yield group, Pairs.join(held)
+                    held, count = [], 0
+            if held:
+                yield group, Pairs.join(held)
+
+    def _choose_shown(self, job: Shading, clusters: PointClusters) -> Shown:
+        """All points, or with ``share_samples`` those that stand for others of their pixel."""
+        rows = of = dr.arange(mi.UInt32, clusters.count)
+        if not self.share_samples or job.samples == 1:
+            dr.eval(rows)
+            return Shown(clusters.batch, rows, of)
+        pixel = download(job.pixel)[clusters.tree.order]
+        chosen, stands_for = share_samples(clusters.tree, pixel, job.samples, np.random.default_rng(job.seed + 1))
+        rows = upload(mi.UInt32, chosen)
+        return Shown(clusters.batch.select(rows), rows, upload(mi.UInt32, stands_for))
+
+    def _evaluate(self, job: Shading, group, clusters, shown: Shown, pairs: Pairs, shaded: Shaded, clock: Clock):
+        """Add the light of some pairs to ``shaded``."""
+        seen, traced = [], [pairs]
+        if self.visibility == "adaptive":
+            seen, traced = decide_visibility(
+                job.scene, job.traits, job.lights, group, clusters, pairs, shaded.shadow_rays
+            )
+            clock.lap("visibility")
+        if not seen and not traced:
+            return
+        lists = list_pairs(group, clusters, traced, seen)
+        radiance, rays = evaluate_lists(job.scene, job.traits, job.lights, group, shown.batch, lists, shown.rows)
+        shaded.radiance += dr.gather(type(radiance), radiance, shown.of)
+        dr.scatter_add(shaded.shadow_rays, rays, shown.rows)
+        dr.scatter_add(shaded.cut_size, dr.gather(mi.UInt32, lists.length, shown.rows), shown.rows)
+        dr.eval(shaded.radiance, shaded.shadow_rays, shaded.cut_size)
+        clock.lap("evaluate")
+
+    def describe(self):
+        """All properties and their values."""
+        names = ("visibility", "error", "dark_floor", "max_cut", "phase_one_error", "share_samples")
+        return super().describe() | {name: getattr(self, name) for name in names}
+
+
+def _in_batch_order(clusters: PointClusters, shaded: Shaded) -> Shaded:
+    """Put what is known along the tree back into the order of the batch."""
+    for name in ("radiance", *IlluminationCutIntegrator.offered_aovs):
+        values = getattr(shaded, name)
+        target = dr.empty(type(values), clusters.count)
+        dr.scatter(target, values, clusters.order)
+        dr.eval(target)
+        setattr(shaded, name, target)
+    return shaded
+
+
+mi.register_integrator("illuminationcut", IlluminationCutIntegrator)
