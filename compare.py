@@ -51,7 +51,7 @@ def parse(arguments):
         help="parameter of an integrator, such as lightcuts.error=0.02; repeat for more")  # fmt: skip
     add("--aovs", type=_names, default=[], metavar="NAME,...",
         help="channels to show in false colours, asked of the integrators that know them: shadow_rays, upper_bounds, "
-             "cut_size (see their docstrings)")  # fmt: skip
+             "cut_size, phase_one (see their docstrings)")  # fmt: skip
     add("-r", "--reference", type=_reference, default="path:1024",
         help="an EXR file, or a folder that holds SCENE.exr, which also gives the width; path:SPP (path traced, kept, "
              "continued); vpl (each image by all of its own virtual lights) (default: path:1024)")  # fmt: skip

@@ -15,12 +15,12 @@ NAMES = (
     "veach_ajar", "everything8003",
 )  # fmt: skip
 # Heights at a width of 256, by the aspect of the references
-_HEIGHTS = {"cornell": 256, "everything8003": 256, "bistro_interior": 192}
+_HEIGHTS = {"cornell": 256, "glossy": 256, "everything8003": 256, "bistro_interior": 192}
 
 
 def scene_file(name: str) -> Path:
     """The XML file of a scene; FileNotFoundError with the reason where it is absent."""
-    if name in ("cornell", "hall"):
+    if name in ("cornell", "glossy", "hall"):
         return PROJECT / "scenes" / f"{name}.xml"
     path = SHARED / "scenes" / name / "scene.xml"
     if not path.exists():

@@ -72,7 +72,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
      * - phase_one_error
        - |float|
        - Bound, as a fraction of the image's mean, up to which pairs of the first, approximate image are not refined. 0
-         leaves it to the paper's criterion alone. (Default: 0.2)
+         leaves it to the paper's criterion alone. (Default: 0.5)
 
      * - share_samples
        - |bool|
@@ -124,7 +124,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         self.dark_floor = properties.number(props, "dark_floor", 0.5, 0)
         self.max_cut = properties.integer(props, "max_cut", 1000, 0)
         self.share_samples = properties.boolean(props, "share_samples", False)
-        self.phase_one_error = properties.number(props, "phase_one_error", 0.2, 0)
+        self.phase_one_error = properties.number(props, "phase_one_error", 0.5, 0)
 
     def shade(self, job: Shading) -> Shaded:
         """Phase I, Phase II and the evaluation of the pairs, for one batch ([IC] section 3)."""
@@ -162,7 +162,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
 
     def _threshold(self, job: Shading, clusters: PointClusters, bright: np.ndarray, counter: BoundCounter):
         """Largest bound that a pair may have, per point node: error × least radiance of its points ([IC] eq. 4)."""
-        tree, leaves = clusters.tree, clusters.tree.leaves()
+        tree, leaves = clusters.tree, clusters.tree.leaves
         allowed = self.error * np.maximum(bright[leaves], self.dark_floor * job.mean)
         if self.max_cut:
             # A leaf takes after the point that is tried next to its first one

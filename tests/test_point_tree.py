@@ -76,7 +76,7 @@ def check_structure(tree, position, normal, leaf_size):
     assert depth == sorted(depth)
     assert tree.levels.tolist() == [depth.index(level) for level in range(depth[-1] + 1)] + [m]
     assert depth[-1] <= 63 + np.ceil(np.log2(n))
-    leaves = tree.leaves().tolist()
+    leaves = tree.leaves.tolist()
     assert set(leaves) == {node for node in range(m) if child[node] == 0}
     assert [k for node in leaves for k in range(first[node], first[node] + count[node])] == list(range(n))
 
@@ -91,7 +91,7 @@ def check_sums(tree):
     assert (tree.reduce(whole, np.add) == np.einsum("mn,nij->mij", within.astype(int), whole)).all()
     np.testing.assert_allclose(tree.reduce(values.astype(np.float64), np.add), within @ values.astype(np.float64))
     assert (tree.reduce(flags, np.logical_or) == (within & flags).any(axis=1)).all()
-    leaves = tree.leaves()
+    leaves = tree.leaves
     assert (tree.gather_up(tree.count[leaves], leaves, np.add) == tree.count).all()
     above = np.eye(tree.size, dtype=np.int64)
     for node in range(1, tree.size):
@@ -206,7 +206,7 @@ def test_points_are_parted_by_their_normals_wherever_they_are(spread):
     normal = np.tile(normal / np.linalg.norm(normal, axis=1, keepdims=True), (8, 1)).astype(np.float32)
     position = np.random.default_rng(2).choice([-1, 1], normal.shape).astype(np.float32)
     tree = build_checked(spread * position, normal, 8)
-    for leaf in holds(tree)[tree.leaves()]:
+    for leaf in holds(tree)[tree.leaves]:
         assert (normal[leaf] == normal[leaf][0]).all()
 
 

@@ -77,7 +77,7 @@ def list_pairs(group: LightGroup, clusters: PointClusters, traced: list[Pairs], 
 def _paths(tree: PointTree, filled: np.ndarray):
     """Nodes with a list from the root down to every leaf, one leaf after the other, and where each point's are."""
     length = tree.push_down(filled.astype(np.uint32))
-    leaves = tree.leaves()
+    leaves = tree.leaves
     end = np.cumsum(length[leaves], dtype=np.int64)
     path = np.zeros(end[-1], np.uint32)
     node, place = leaves, end - 1

@@ -88,10 +88,10 @@ def _records(tree: PointTree, batch: Batch) -> np.ndarray:
     """(m, _RECORD) float32."""
     position = download(batch.position)
     records = np.zeros((tree.size, _RECORD), np.float32)
-    records[:, 0:3] = tree.reduce(position, np.minimum)
-    records[:, 3:6] = tree.reduce(position, np.maximum)
+    # One pass for all bounds: the largest of -x is the least of x
+    largest = tree.reduce(np.hstack([-position, position, download(batch.proxy.base)]), np.maximum)
+    records[:, 0:3], records[:, 3:6], records[:, 10:13] = -largest[:, 0:3], largest[:, 3:6], largest[:, 6:9]
     records[:, 6:9], records[:, 9] = tree.cones(download(batch.normal))
-    records[:, 10:13] = tree.reduce(download(batch.proxy.base), np.maximum)
     for column, values in ((13, tree.first), (14, tree.count), (15, tree.child)):
         records[:, column] = values.view(np.float32)
     return records

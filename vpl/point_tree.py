@@ -22,6 +22,7 @@ Departures from the paper, and why:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -60,6 +61,7 @@ class PointTree:
         """Number of nodes."""
         return len(self.first)
 
+    @cached_property
     def leaves(self) -> np.ndarray:
         """Leaves along the curve, so that their ranges follow each other: (l,) int64."""
         leaves = np.flatnonzero(self.child == 0)
@@ -70,7 +72,7 @@ class PointTree:
 
         ``function``: np.minimum, np.maximum, np.add, np.logical_or ...
         """
-        leaves = self.leaves()
+        leaves = self.leaves
         return self.gather_up(function.reduceat(values[self.order], self.first[leaves], axis=0), leaves, function)
 
     def gather_up(self, at_leaves: np.ndarray, leaves: np.ndarray, function: np.ufunc) -> np.ndarray:
@@ -96,13 +98,14 @@ class PointTree:
         """
         directions = directions.astype(np.float64)
         # Unit in double precision too: near 1 the angle of a cosine magnifies what single precision left over
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        directions /= np.sqrt(np.einsum("ij,ij->i", directions, directions))[:, None]
         axes = self.reduce(directions, np.add)
-        length = np.linalg.norm(axes, axis=1, keepdims=True)
-        balanced = length[:, 0] < 1e-6 * self.count
-        axes = np.where(balanced[:, None], [0.0, 0.0, 1.0], axes / np.where(length > 0, length, 1))
+        length = np.sqrt(np.einsum("ij,ij->i", axes, axes))
+        balanced = length < 1e-6 * self.count
+        axes /= np.where(balanced, 1, length)[:, None]
+        axes[balanced] = (0, 0, 1)
         cosine = np.einsum("ij,ij->i", directions[self.order], axes[self.leaf])
-        leaves = self.leaves()
+        leaves = self.leaves
         angles = np.zeros(self.size)
         angles[leaves] = np.arccos(np.clip(np.minimum.reduceat(cosine, self.first[leaves]), -1, 1))
         for nodes in self._inner_from_below():

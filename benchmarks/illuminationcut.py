@@ -1,0 +1,294 @@
+"""IlluminationCut against ``lightcuts``, and against shadow rays alone: the tables of [IC] section 4 for our scenes.
+
+    ./run -- python benchmarks/illuminationcut.py [--scenes NAME ...] [--parts table tight samples lights rays public]
+
+table    [IC] table 1: ``lightcuts`` at 1%, and both forms of ``illuminationcut`` with the ``error`` that gives the same
+         RMSE, found by trying; same VPLs, same clamping, warm, 512 wide, 1 sample a pixel.
+tight    [IC] table 3: the same at the RMSE of ``lightcuts`` at 0.1%, without a limit to cuts.
+samples  [IC] table 6: the same with 9 samples a pixel.
+lights   [IC] figure 5 and table 5: render time from 50 k to 1.2 M VPLs, and peak memory at 1600×1200.
+rays     shadow rays per second of all of ``shade``, against the same rays traced alone in one batch.
+public   the settings of the public C++ code in the Cornell box, in CPU seconds of all threads.
+
+Errors are against the sum of all lights at a random subset of points.  Times are medians of three interleaved runs;
+"render" is what a method does after lights, their trees and gather points are there, which all methods share.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+mi.set_variant("llvm_ad_rgb")
+
+import integrators  # noqa: E402, F401
+from benchmarks import scenes  # noqa: E402
+from vpl.arrays import download, upload  # noqa: E402
+from vpl.evaluation import sum_all_lights  # noqa: E402
+from vpl.pairs import BoundCounter, Pairs, find_pairs  # noqa: E402
+from vpl.point_clusters import PointClusters  # noqa: E402
+from vpl.shading import contribution  # noqa: E402
+from vpl.visibility import shadow_ray  # noqa: E402
+
+NAMES = (*scenes.NAMES, "glossy")
+DEPTH, VPLS, WIDTH, SUBSET, RUNS = 6, 200_000, 512, 4000, 3
+# Tried in turn until the RMSE passes that of lightcuts; between two of them the error is interpolated
+ERRORS = (0.0015, 0.003, 0.006, 0.012, 0.024, 0.048, 0.096, 0.19, 0.38)
+
+
+@dataclass
+class Found:
+    """One render: seconds of ``shade``, and per pixel: normalised RMSE, relative L1, rays, bounds."""
+
+    seconds: float
+    rmse: float
+    relative: float
+    rays: float
+    bounds: float
+    stages: dict
+
+
+class Problem:
+    """Lights, gather points and, at a random subset of points, the exact light of a scene."""
+
+    def __init__(self, name: str, samples: int = 1, **settings):
+        self.settings = {"max_depth": DEPTH, "vpl_count": VPLS} | settings
+        self.scene = scenes.load(name, WIDTH)
+        plugin, rays = self.plugin("lightcuts"), scenes.camera_rays(self.scene, 0, samples)
+        self.prepared, self.preprocessing = scenes.timed(lambda: plugin.prepare(self.scene, *rays))
+        self.points = self.prepared.paths.points.count
+        self.exact, self.mean = [], 0.0
+        for number, job in enumerate(self.prepared.jobs):
+            share = max(round(SUBSET * job.batch.count / self.points), min(job.batch.count, 64))
+            rows = np.random.default_rng(number).choice(job.batch.count, min(share, job.batch.count), replace=False)
+            part = job.batch.select(upload(mi.UInt32, np.sort(rows)))
+            exact = download(sum_all_lights(job.scene, job.traits, job.lights, part)[0])
+            self.exact.append((np.sort(rows), exact))
+            direct = download(job.direct)[np.sort(rows)]
+            self.mean += float((exact + direct).mean()) * job.batch.count / self.points
+
+    def plugin(self, kind: str, **more):
+        """A plugin with the settings that all methods share."""
+        return mi.load_dict({"type": kind, **self.settings, **more})
+
+    def shade(self, plugin) -> Found:
+        """Shade all points with a plugin and compare the subset."""
+        shaded, seconds = scenes.timed(lambda: [plugin.shade(job) for job in self.prepared.jobs])
+        square = absolute = rays = bounds = 0.0
+        stages: dict = {}
+        for job, part, (rows, exact) in zip(self.prepared.jobs, shaded, self.exact, strict=True):
+            difference = download(part.radiance)[rows] - exact
+            share = job.batch.count / self.points
+            square += share * float((difference**2).mean())
+            absolute += share * float(np.abs(difference).mean())
+            rays += float(download(part.shadow_rays).sum(dtype=np.float64))
+            bounds += float(download(part.upper_bounds).sum(dtype=np.float64))
+            for stage, spent in part.seconds.items():
+                stages[stage] = stages.get(stage, 0.0) + spent
+        rmse = np.sqrt(square) / self.mean
+        return Found(seconds, rmse, absolute / self.mean, rays / self.points, bounds / self.points, stages)
+
+    def error_for(self, rmse: float, **more) -> float:
+        """The ``error`` at which ``illuminationcut`` has a given RMSE."""
+        before = None
+        for error in ERRORS:
+            reached = self.shade(self.plugin("illuminationcut", error=error, **more)).rmse
+            if reached >= rmse:
+                break
+            before = error, reached
+        if before is None or reached < rmse:
+            return error
+        slope = np.log(error / before[0]) / np.log(reached / before[1])
+        return float(before[0] * (rmse / before[1]) ** slope)
+
+
+def equal_quality(title: str, names, samples: int, lightcuts_error: float, **settings) -> None:
+    """Print the table of ``lightcuts`` and both forms of ``illuminationcut`` at its RMSE."""
+    print(f"\n## {title} (width {WIDTH}, {samples} sample(s) a pixel, {VPLS} VPLs, max_depth {DEPTH}, warm)")
+    print("scene | method | error | preprocessing s | render s | rays/px | RMSE | relative L1 | bounds/px | speedup")
+    speedups: dict = {"all": [], "adaptive": []}
+    for name in names:
+        problem = Problem(name, samples, **settings)
+        methods = {"lightcuts": problem.plugin("lightcuts", error=lightcuts_error)}
+        target = problem.shade(methods["lightcuts"]).rmse
+        errors = {"lightcuts": lightcuts_error}
+        for visibility in speedups:
+            errors[visibility] = problem.error_for(target, visibility=visibility)
+            methods[visibility] = problem.plugin("illuminationcut", visibility=visibility, error=errors[visibility])
+        runs: dict = {label: [] for label in methods}
+        for _ in range(RUNS):
+            for label, plugin in methods.items():
+                runs[label].append(problem.shade(plugin))
+        middle = {label: sorted(found, key=lambda one: one.seconds)[RUNS // 2] for label, found in runs.items()}
+        for label, found in middle.items():
+            speedup = middle["lightcuts"].seconds / found.seconds
+            if label in speedups:
+                speedups[label].append(speedup)
+            print(
+                f"{name} | {label} | {100 * errors[label]:.2g}% | {problem.preprocessing:.2f} | {found.seconds:.2f} | "
+                f"{found.rays:.0f} | {found.rmse:.4f} | {100 * found.relative:.2f}% | {found.bounds:.0f} | "
+                f"{speedup:.1f}",
+                flush=True,
+            )
+    for visibility, values in speedups.items():
+        print(f"geometric mean of the speedups, visibility={visibility}: {scenes.geometric_mean(values):.2f}")
+
+
+def ray_rates(names) -> None:
+    """Part "rays"."""
+    print("\n## shadow rays per second: all of shade, error 1.5%, against the rays of its pairs alone")
+    print("scene | rays, M | whole, M/s | alone, M/s | share")
+    for name in names:
+        problem = Problem(name)
+        plugin, rays, whole, alone = problem.plugin("illuminationcut"), 0.0, 0.0, 0.0
+        for job in problem.prepared.jobs:
+            plugin.shade(job)
+            shaded, spent = scenes.timed(lambda: plugin.shade(job))  # noqa: B023
+            count = float(download(shaded.shadow_rays).sum(dtype=np.float64))
+            rays, whole, alone = rays + count, whole + spent, alone + count * _seconds_alone(plugin, job)
+        rate, bare = rays / whole / 1e6, rays / alone / 1e6
+        print(f"{name} | {rays / 1e6:.1f} | {rate:.1f} | {bare:.1f} | {100 * rate / bare:.0f}%", flush=True)
+
+
+def _seconds_alone(plugin, job, most: int = 1 << 22) -> float:
+    """Seconds per shadow ray, for some million of a job's pairs expanded and traced alone, light by light."""
+    clusters = PointClusters(job.batch)
+    bound = dr.opaque(mi.Float, plugin.error * job.mean)
+    seconds = count = 0.0
+    for group in job.lights.groups:
+        accept = lambda points, lights, value, index: value <= bound  # noqa: E731
+        counter = BoundCounter(clusters, False)
+        found = list(find_pairs(clusters, job.lights, group, accept, counter))
+        if not found:
+            continue
+        pairs = Pairs.join(found)
+        points = download(pairs.points)
+        # A random part of the pairs, in the order in which their points lie along the tree
+        chosen = np.random.default_rng(0).permutation(len(points))
+        chosen = chosen[: np.searchsorted(np.cumsum(clusters.tree.count[points[chosen]], dtype=np.int64), most)]
+        chosen = chosen[np.argsort(clusters.tree.first[points[chosen]], kind="stable")]
+        length = clusters.tree.count[points[chosen]].astype(np.int64)
+        within = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)
+        row = upload(mi.UInt32, np.repeat(clusters.tree.first[points[chosen]], length) + within)
+        light, _ = group.representatives(upload(mi.UInt32, np.repeat(download(pairs.lights)[chosen], length)))
+        surface = clusters.batch.surfaces_at(row)
+        active = dr.any(contribution(group.kind, surface, light, job.lights.smallest_distance) > 0)
+        ray = shadow_ray(group.kind, surface.interaction, light)
+        dr.eval(ray, active)
+        rays = dr.gather(mi.Ray3f, ray, dr.compress(active))
+        dr.eval(rays)
+        scenes.timed(lambda: job.scene.ray_test(rays))  # noqa: B023
+        seconds += scenes.timed(lambda: job.scene.ray_test(rays))[1]  # noqa: B023
+        count += dr.width(rays.d)
+    return seconds / max(count, 1)
+
+
+def many_lights(names) -> None:
+    """Part "lights"."""
+    print("\n## render time and number of VPLs (width 512, illuminationcut at its default error)")
+    print("scene | VPLs | trees s | render s, all | render s, adaptive")
+    for name in names:
+        for count in (50_000, 200_000, 600_000, 1_200_000):
+            scene = scenes.load(name, WIDTH)
+            seconds = []
+            for visibility in ("all", "adaptive"):
+                settings = {"max_depth": DEPTH, "vpl_count": count, "visibility": visibility}
+                plugin = mi.load_dict({"type": "illuminationcut", **settings})
+                prepared = plugin.prepare(scene, *scenes.camera_rays(scene, 0))
+                runs = [
+                    scenes.timed(lambda: [plugin.shade(job) for job in prepared.jobs])[1]  # noqa: B023
+                    for _ in range(RUNS + 1)
+                ]
+                seconds.append(float(np.median(runs[1:])))
+            tree = prepared.clock.seconds["tree"]
+            print(f"{name} | {count} | {tree:.2f} | {seconds[0]:.2f} | {seconds[1]:.2f}", flush=True)
+    print("\n## peak memory above the scene, 1600×1200, 1.2 M VPLs, 1 sample a pixel")
+    for name in names:
+        command = [sys.executable, __file__, "--memory-of", name]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        print(f"{name}: {done.stdout.strip()}", flush=True)
+
+
+def memory_of(name: str) -> None:
+    """Print the growth of this process's peak memory while it renders a large image with many lights."""
+    scene = mi.load_file(str(scenes.scene_file(name)), resx=1600, resy=1200)
+    mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=1)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for visibility in ("all", "adaptive"):
+        settings = {"max_depth": DEPTH, "vpl_count": 1_200_000, "visibility": visibility}
+        dr.eval(mi.render(scene, integrator=mi.load_dict({"type": "illuminationcut", **settings}), spp=1))
+        dr.sync_thread()
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        print(f"{visibility} {(peak - before) / 2**20:.2f} GiB", end="  ")
+    print()
+
+
+def public_settings() -> None:
+    """Part "public"."""
+    print(
+        "\n## the public C++ code's settings: Cornell box, 512×512, error 1%, max_depth 9, 2048 direct and 47 k indirect"
+    )
+    print("VPLs, distances clamped at 5% of the diagonal; CPU seconds of all threads")
+    print("method | light tree | render | rays/px | bounds/px | relative L1 | public code: tree + render, L1")
+    rows = {
+        "lightcuts": ("lightcuts", {}, "4 + 57 s, 0.64%"),
+        "illuminationcut": ("illuminationcut", {"visibility": "all"}, "7 + 20 s, 0.57%"),
+        "illuminationcut, adaptive": ("illuminationcut", {"visibility": "adaptive"}, "7 + 13.5 s, 0.57%"),
+    }
+    # The diagonal is twice the radius of the bounding sphere, which our clamping is a fraction of
+    settings = {"max_depth": 9, "direct": "vpl", "direct_count": 2048, "vpl_count": 47_000, "clamping": 0.1}
+    problem = Problem("cornell", 1, **settings)
+    for label, (kind, more, published) in rows.items():
+        for error in (0.01, 0.005, 0.0025):
+            plugin = problem.plugin(kind, error=error, **more)
+            problem.shade(plugin)
+            start = time.process_time()
+            found = problem.shade(plugin)
+            render = time.process_time() - start
+            tree = problem.prepared.clock.seconds["tree"]
+            print(
+                f"{label}, {100 * error:.2g}% | {tree:.2f} s | {render:.2f} s | {found.rays:.0f} | "
+                f"{found.bounds:.0f} | {100 * found.relative:.2f}% | {published}",
+                flush=True,
+            )
+
+
+def main() -> None:
+    """Parse the command line and run the parts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parts = ("table", "tight", "samples", "lights", "rays", "public")
+    parser.add_argument("--scenes", nargs="+", default=list(NAMES), choices=NAMES)
+    parser.add_argument("--parts", nargs="+", default=list(parts), choices=parts)
+    parser.add_argument("--memory-of", choices=NAMES, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.memory_of:
+        memory_of(options.memory_of)
+        return
+    names = scenes.available(options.scenes)
+    some = [name for name in ("cornell", "sponza_crytek", "dining_room") if name in names]
+    if "table" in options.parts:
+        equal_quality("the RMSE of lightcuts at 1%", names, 1, 0.01)
+    if "tight" in options.parts:
+        equal_quality("the RMSE of lightcuts at 0.1%, cuts unlimited", some, 1, 0.001, max_cut=0)
+    if "samples" in options.parts:
+        equal_quality("the RMSE of lightcuts at 1%", some, 9, 0.01)
+    if "lights" in options.parts:
+        many_lights(some)
+    if "rays" in options.parts:
+        ray_rates(names)
+    if "public" in options.parts:
+        public_settings()
+
+
+if __name__ == "__main__":
+    main()
