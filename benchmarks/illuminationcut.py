@@ -235,9 +235,7 @@ def memory_of(name: str) -> None:
 
 def public_settings() -> None:
     """Part "public"."""
-    print(
-        "\n## the public C++ code's settings: Cornell box, 512×512, error 1%, max_depth 9, 2048 direct and 47 k indirect"
-    )
+    print("\n## settings of the public C++ code: Cornell box, 512×512, max_depth 9, 2048 direct and 47 k indirect")
     print("VPLs, distances clamped at 5% of the diagonal; CPU seconds of all threads")
     print("method | light tree | render | rays/px | bounds/px | relative L1 | public code: tree + render, L1")
     rows = {

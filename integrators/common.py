@@ -9,6 +9,7 @@ from time import perf_counter
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from vpl.arrays import download
 from vpl.direct import ExtendedEmitters, direct_light
@@ -30,8 +31,8 @@ class Shading:
     """What a method is asked to shade: one batch of gather points.
 
     ``direct``: radiance per point that is known already (direct light of extended emitters); ``mean``: an estimate of
-    the mean radiance over all gather points of the render and over channels; ``pixel``: UInt32, which points belong to
-    the same pixel, and ``samples``: camera rays of a pixel; ``stopped``: whether to give up early.
+    the mean radiance over all gather points of the render and over channels; ``ray``: UInt32, the camera ray of each
+    point; ``samples``: camera rays of a pixel, which follow each other; ``stopped``: whether to give up early.
     """
 
     scene: object
@@ -41,7 +42,7 @@ class Shading:
     direct: object
     mean: float
     seed: int
-    pixel: object
+    ray: object
     samples: int
     stopped: Callable[[], bool]
 
@@ -193,7 +194,7 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
             "dropped": lights.dropped + emitters.dropped,
         }
         if lights.groups:
-            prepared.jobs = self._jobs(scene, traits, lights, prepared, seed, self._samples_of_a_pixel(sampler))
+            prepared.jobs = self._jobs(scene, traits, lights, prepared, seed, self._samples_of_a_pixel(scene, sampler))
         return prepared
 
     def _jobs(self, scene, traits, lights: LightSet, prepared: Prepared, seed: int, samples: int) -> list[Shading]:
@@ -204,9 +205,8 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
         for number, batch in enumerate(batches):
             direct = dr.gather(type(prepared.direct), prepared.direct, batch.index)
             stream = derived_seed(seed, 31, number)
-            pixel = dr.gather(mi.UInt32, points.ray, batch.index) // samples
-            dr.eval(pixel)
-            jobs.append(Shading(scene, traits, lights, batch, direct, 0.0, stream, pixel, samples, self.should_stop))
+            ray = dr.gather(mi.UInt32, points.ray, batch.index)
+            jobs.append(Shading(scene, traits, lights, batch, direct, 0.0, stream, ray, samples, self.should_stop))
             if self.needs_trees:
                 level = mean_radiance(scene, traits, lights, batch, derived_seed(seed, 32, number))
                 mean += (level + float(download(direct).mean(dtype="float64"))) * batch.count / points.count
@@ -215,10 +215,18 @@ class ManyLightIntegrator(mi.SamplingIntegrator):
         prepared.clock.lap("pilot")
         return jobs
 
-    def _samples_of_a_pixel(self, sampler) -> int:
-        """Camera rays of a pixel in this pass: Mitsuba puts them next to each other."""
+    def _samples_of_a_pixel(self, scene, sampler) -> int:
+        """Camera rays of a pixel in this pass, which Mitsuba puts next to each other; 1 where that cannot be known.
+
+        A wrapper may render in passes of its own: then no sensor has as many pixels as there would have to be.
+        """
         samples = min(sampler.sample_count(), self.samples_per_pass)
-        return samples if sampler.wavefront_size() % samples == 0 else 1
+        for sensor in scene.sensors():
+            film = sensor.film()
+            border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+            if sampler.wavefront_size() == samples * int(np.prod(np.array(film.crop_size(), np.int64) + border)):
+                return samples
+        return 1
 
     def _assemble(self, prepared: Prepared, shaded: list[Shaded]):
         """Put the batches together: (radiance, requested counters) per camera ray; fills ``statistics``."""

@@ -10,10 +10,10 @@ import numpy as np
 
 from vpl.approximate_image import approximate_radiance
 from vpl.arrays import download, upload
-from vpl.cuts import limited_cuts
+from vpl.cuts import limited_cuts, upload_thresholds
 from vpl.pair_lists import evaluate_lists, list_pairs
 from vpl.pair_visibility import decide_visibility
-from vpl.pairs import BoundCounter, Pairs, find_pairs
+from vpl.pairs import BoundCounter, Pairs, find_pairs, in_batches
 from vpl.point_clusters import PointClusters
 from vpl.shared_samples import share_samples
 from vpl.surfaces import Batch
@@ -23,7 +23,7 @@ from .common import AOVS, Clock, ManyLightIntegrator, Shaded, Shading
 from .manual import manual_page
 
 # Pairs held before they are evaluated: bounds the memory whatever the image and the error
-_PAIRS_HELD = 1 << 25
+_PAIRS_HELD = 1 << 23
 # One point in so many tells how large the cuts around it are
 _TRIED_STRIDE = 32
 _DEFAULT_ERROR = {"all": 0.015, "adaptive": 0.01}
@@ -142,6 +142,8 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         shown = self._choose_shown(job, clusters)
         for group, pairs in self._pairs(job, clusters, threshold, counter):
             clock.lap("phase_two")
+            if job.stopped():
+                break
             self._evaluate(job, group, clusters, shown, pairs, shaded, clock)
         clock.lap("phase_two")
         shaded.upper_bounds = counter.per_point()
@@ -157,7 +159,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
             job.scene, job.traits, job.lights, clusters, negligible, generator, counter
         )
         tree = clusters.tree
-        direct = tree.reduce(download(job.direct).mean(1, dtype=np.float64), np.add) / tree.count
+        direct = tree.reduce(download(job.direct).mean(1, dtype=np.float64), np.minimum)
         return reflected + direct, rays
 
     def _threshold(self, job: Shading, clusters: PointClusters, bright: np.ndarray, counter: BoundCounter):
@@ -165,37 +167,31 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         tree, leaves = clusters.tree, clusters.tree.leaves
         allowed = self.error * np.maximum(bright[leaves], self.dark_floor * job.mean)
         if self.max_cut:
-            # A leaf takes after the point that is tried next to its first one
+            # A leaf takes after the last point that is tried before it.  What is 0 could not be raised.
+            allowed = np.maximum(allowed, np.finfo(np.float32).tiny)
             raised = self._raise_thresholds(job, clusters, np.repeat(allowed, tree.count[leaves]), counter)
             allowed *= raised[tree.first[leaves] // _TRIED_STRIDE]
-        return upload(mi.Float, tree.gather_up(allowed, leaves, np.minimum))
+        return upload_thresholds(tree.gather_up(allowed, leaves, np.minimum))
 
     def _raise_thresholds(self, job: Shading, clusters: PointClusters, allowed: np.ndarray, counter: BoundCounter):
         """Factors, at least 1, by which every _TRIED_STRIDE-th point must raise its threshold to have a cut that is not
         larger than ``max_cut``."""
         rows = np.arange(0, clusters.count, _TRIED_STRIDE)
-        index, threshold = upload(mi.UInt32, rows), upload(mi.Float, allowed[rows])
+        index, threshold = upload(mi.UInt32, rows), upload_thresholds(allowed[rows])
         part = clusters.batch.select(index)
         raised, _, visits = limited_cuts(job.lights, part, threshold, self.max_cut)
         counter.add_at_points(index, visits)
         return np.maximum(download(raised).astype(np.float64) / np.maximum(allowed[rows], 1e-300), 1)
 
     def _pairs(self, job: Shading, clusters: PointClusters, threshold, counter: BoundCounter):
-        """Phase II: yield (group of lights, illumination-aware pairs), at most about _PAIRS_HELD of them at a time."""
+        """Phase II: yield (group of lights, illumination-aware pairs), about _PAIRS_HELD of them at a time."""
 
         def illumination_aware(points, lights, bound, index):
             return bound <= dr.gather(mi.Float, threshold, index)  # [IC] Algorithm 1, line 26
 
         for group in job.lights.groups:
-            held, count = [], 0
-            for pairs in find_pairs(clusters, job.lights, group, illumination_aware, counter):
-                held.append(pairs)
-                count += pairs.count
-                if count >= _PAIRS_HELD:
-                    yield group, Pairs.join(held)
-                    held, count = [], 0
-            if held:
-                yield group, Pairs.join(held)
+            for pairs in in_batches(find_pairs(clusters, job.lights, group, illumination_aware, counter), _PAIRS_HELD):
+                yield group, pairs
 
     def _choose_shown(self, job: Shading, clusters: PointClusters) -> Shown:
         """All points, or with ``share_samples`` those that stand for others of their pixel."""
@@ -203,7 +199,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         if not self.share_samples or job.samples == 1:
             dr.eval(rows)
             return Shown(clusters.batch, rows, of)
-        pixel = download(job.pixel)[clusters.tree.order]
+        pixel = download(job.ray)[clusters.tree.order] // job.samples
         chosen, stands_for = share_samples(clusters.tree, pixel, job.samples, np.random.default_rng(job.seed + 1))
         rows = upload(mi.UInt32, chosen)
         return Shown(clusters.batch.select(rows), rows, upload(mi.UInt32, stands_for))

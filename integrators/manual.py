@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-_PARAMETERS = """     * - max_depth
+_PARAMETERS = """\
+     * - max_depth
        - |int|
        - Longest path from camera to emitter, in edges, counted as Mitsuba's ``path`` counts them: 1 shows emitters
          only, 2 adds direct light, and -1 is no limit. (Default: -1)
@@ -47,11 +48,12 @@ _PARAMETERS = """     * - max_depth
 
      * - aovs
        - |string|
-       - Comma-separated counters to return as channels, per camera ray and from the same pass: {aovs}.
+       - Comma-separated channels to return, per camera ray and from the same pass: {aovs}.
          (Default: none)
 """
 
-_ESTIMATED = """    What is estimated: emission + direct + indirect light, over the paths that ``path`` counts for the
+_ESTIMATED = """\
+    What is estimated: emission + direct + indirect light, over the paths that ``path`` counts for the
 same ``max_depth``. Camera rays go on through mirrors, glass and masks. Left out are caustics and light that sharp
 lobes send on from the second surface (they would need another kind of light), and what ``clamping`` cuts off.
 

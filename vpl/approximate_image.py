@@ -1,10 +1,11 @@
 """Phase I: a coarse and fast image that tells Phase II how much error every cluster of points can bear [IC section 3].
 
-Departures from the paper: nothing but the size of the point cluster limits pairs with lights at infinity, whose
-distance is infinite, so it must be small next to the whole image's points; normals of a point cluster may spread as
-much as directions of a light cluster.  And a pair whose bound is a small part of the image's mean radiance is not
-refined further: with the paper's criterion alone, Phase I takes 36 million pairs, each with a shadow ray, in the
-Cornell box and in the kitchen (width 512, 200,000 lights), ten times what Phase II then needs.
+Departures from the paper: its aperture of 20 degrees is taken as the half-angle of a cone; nothing but the size of
+the point cluster limits pairs with lights at infinity, whose distance is infinite, so it must be small next to the
+whole image's points; normals of a point cluster may spread as much as directions of a light cluster.  And a pair
+whose bound is a small part of the image's mean radiance is not refined further: with the paper's criterion alone,
+Phase I takes 36 million pairs, each with a shadow ray, in the Cornell box and in the kitchen (width 512, 200,000
+lights), ten times what Phase II then needs.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import channel_mean, download, upload
+from .arrays import add_at, channel_mean, download, upload
 from .evaluation import evaluate_pairs
 from .gather import SceneTraits
 from .light_set import LightGroup, LightSet
 from .lights import AT_INFINITY
-from .pairs import Pairs, find_pairs, light_radius
+from .pairs import find_pairs, in_batches
 from .point_clusters import PointClusters
 
 # Pairs that are shaded and traced at a time
@@ -41,9 +42,8 @@ def _coarse_enough(clusters: PointClusters, group: LightGroup, negligible: float
         if at_infinity:
             separated = narrow & (lights.cosine > _APERTURE) & (radius < largest)
         else:
-            reach = light_radius(lights)
-            center = 0.5 * (lights.box_min + lights.box_max)
-            distance = dr.norm(center - receiver.position) - radius - reach
+            reach = lights.radius
+            distance = dr.norm(lights.center - receiver.position) - radius - reach
             if group.kind != "point":
                 # Lights of one place and direction have a wide cone only if each of them has: then it cannot shrink
                 narrow &= (lights.cosine > _APERTURE) | (reach == 0)
@@ -71,18 +71,13 @@ def approximate_radiance(
     dr.eval(radiance, rays)
     for group in lights.groups:
         criterion = _coarse_enough(clusters, group, negligible)
-        # One evaluation for all pairs: a kernel for each step of the search would cost more than its rays
-        found = list(find_pairs(clusters, lights, group, criterion, counter))
-        if not found:
-            continue
-        pairs = Pairs.join(found)
-        for first in range(0, pairs.count, _PAIRS_PER_KERNEL):
-            part = pairs.slice(first, _PAIRS_PER_KERNEL)
+        # Many steps of the search at a time: a kernel for each would cost more than its rays
+        for part in in_batches(find_pairs(clusters, lights, group, criterion, counter), _PAIRS_PER_KERNEL):
             point = dr.gather(mi.UInt32, stand_in, part.points)
             surface = clusters.batch.surfaces_at(point)
             light, scale = group.representatives(part.lights, second=True)
             value, traced = evaluate_pairs(scene, traits, lights, group, surface, light, scale)
-            dr.scatter_add(radiance, channel_mean(value), part.points)
-            dr.scatter_add(rays, dr.select(traced, mi.UInt32(1), 0), point)
+            add_at(radiance, channel_mean(value), part.points)
+            add_at(rays, dr.select(traced, mi.UInt32(1), 0), point)
             dr.eval(radiance, rays)
     return tree.push_down(download(radiance).astype(np.float64)), rays

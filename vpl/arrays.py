@@ -39,8 +39,19 @@ def download(values):
     """Copy a Dr.Jit array to NumPy: ``(n,)`` for flat types, ``(n, k)`` for vectors of k entries."""
     dr.eval(values)
     dr.sync_thread()
-    array = np.array(values.numpy(), copy=True)
-    return array.T.copy() if array.ndim == 2 else array
+    if dr.depth_v(type(values)) == 1:
+        return np.array(values.numpy(), copy=True)
+    # Channel by channel: making one array of a vector compiles a kernel for every width
+    return np.stack([download(channel) for channel in values], axis=1)
+
+
+def add_at(target, values, index):
+    """Add values to some entries of an array, several to the same one if need be; to be evaluated by the caller.
+
+    Left to itself, ``dr.scatter_add`` keeps copies of small targets whose width it bakes into the kernel, which is then
+    compiled anew for every size.
+    """
+    dr.scatter_add(target, values, index, mode=dr.ReduceMode.Local)
 
 
 def spectrum_to_rgb(spectrum) -> mi.Color3f:

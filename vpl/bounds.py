@@ -32,6 +32,21 @@ class Node:
     intensity: object
     escape: object
 
+    @property
+    def center(self):
+        """Centre of the box of positions."""
+        return 0.5 * (self.box_min + self.box_max)
+
+    @property
+    def extent(self):
+        """Half extents of the box of positions."""
+        return 0.5 * (self.box_max - self.box_min)
+
+    @property
+    def radius(self):
+        """Radius of the ball around the box; 0 for lights at infinity."""
+        return dr.norm(self.extent)
+
 
 @dataclass
 class Receiver:
@@ -128,8 +143,7 @@ def contribution_bound(kind: str, receiver: Receiver, node: Node, smallest_dista
             return cosine_less_angle(-dr.dot(axis, node.axis), node.cosine)
 
     else:
-        center = 0.5 * (node.box_min + node.box_max) - receiver.position
-        extent = 0.5 * (node.box_max - node.box_min)
+        center, extent = node.center - receiver.position, node.extent
         if receiver.extent is not None:
             extent += receiver.extent
         radius = dr.norm(extent)

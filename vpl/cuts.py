@@ -109,7 +109,7 @@ def cut_sizes(lights: LightSet, batch: Batch, threshold, most: int = 0) -> CutSi
     return CutSizes([count for count, _ in found], [visits for _, visits in found])
 
 
-def _upload_thresholds(values: np.ndarray):
+def upload_thresholds(values: np.ndarray):
     """Thresholds in double precision to the device; beyond float32 they are infinite, as unclamped bounds may be."""
     with np.errstate(over="ignore"):
         return upload(mi.Float, values.astype(np.float32))
@@ -135,7 +135,7 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
     def too_large(values):
         """Which cuts are too large at these thresholds; keeps the sizes of those that are not."""
         nonlocal spent, fitting
-        found = cut_sizes(lights, part, _upload_thresholds(values), max_cut)
+        found = cut_sizes(lights, part, upload_thresholds(values), max_cut)
         over = found.total() > max_cut
         kept = upload(mi.UInt32, ~over) == 1
         fitting = [dr.select(kept, new, old) for new, old in zip(found.count, fitting, strict=True)]
@@ -154,7 +154,7 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
         over = too_large(middle)
         low, high = np.where(over, middle, low), np.where(over, high, middle)
     threshold = mi.Float(threshold)
-    dr.scatter(threshold, _upload_thresholds(high), index)
+    dr.scatter(threshold, upload_thresholds(high), index)
     for target, count in zip(sizes.count, fitting, strict=True):
         dr.scatter(target, count, index)
     dr.scatter_add(visits, spent, index)

@@ -98,7 +98,8 @@ def mean_radiance(scene, traits: SceneTraits, lights: LightSet, batch: Batch, se
     for group in lights.groups:
         choice = Choice(group.lights.scalar_intensity)
         sampler = independent_sampler(seed, count)
-        row = dr.minimum(mi.UInt32(sampler.next_1d() * batch.count), batch.count - 1)
+        points = dr.opaque(mi.UInt32, batch.count)
+        row = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(points)), points - 1)
         index = choice.row(sampler.next_1d())
         light, scale = group.lights.gather(index), dr.rcp(choice.probability(index))
         value, _ = evaluate_pairs(scene, traits, lights, group, batch.surfaces_at(row), light, scale)

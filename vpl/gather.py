@@ -14,6 +14,7 @@ import numpy as np
 
 from .arrays import channel_mean, download, ones, upload
 from .lights import Emitters, finite_or_zero
+from .morton import interleave
 from .sampling import derived_seed, independent_sampler
 
 # Neither side of a choice between a delta and a smooth lobe gets less than this unless it carries nothing.
@@ -193,13 +194,7 @@ def _morton_order(position: np.ndarray) -> np.ndarray:
     """Order of points, (n, 3) float32, along a Morton curve through their bounding box."""
     low, high = position.min(0), position.max(0)
     cell = (position - low) * (1023.0 / max(float((high - low).max()), np.finfo(np.float32).tiny))
-    code = np.zeros(len(position), np.uint32)
-    for axis in range(3):
-        bits = np.minimum(cell[:, axis], 1023).astype(np.uint32)
-        for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
-            bits = (bits | (bits << np.uint32(shift))) & np.uint32(mask)
-        code |= bits << np.uint32(axis)
-    return np.argsort(code, kind="stable")
+    return np.argsort(interleave(np.minimum(cell, 1023)), kind="stable")
 
 
 def follow_camera_rays(scene, emitters, traits, sampler, seed, ray, active, max_depth, rr_depth, skip=None):

@@ -27,6 +27,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from .morton import interleave
+
 # Columns of LightTree.records
 BOX_MIN, BOX_MAX, CONE_AXIS, CONE_COS = slice(0, 3), slice(3, 6), slice(6, 9), 9
 INTENSITY, FLUX, ESCAPE, REPRESENTATIVE = 10, slice(11, 14), 14, 15
@@ -127,16 +129,7 @@ def _sort_lights(position, direction):
     low = points.min(axis=0).astype(np.float64)
     extent = (points.max(axis=0) - low).max()
     scale = (2**21 - 1) / extent if extent > 0 else 0.0
-    masks = (0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
-    code = np.zeros(len(points), np.uint64)
-    for axis in range(3):
-        bits = ((points[:, axis] - low[axis]) * scale).astype(np.uint64)
-        # Halve the groups of adjacent bits until bit k stands at 3k.
-        for shift, mask in zip((32, 16, 8, 4, 2), masks, strict=True):
-            bits |= bits << np.uint64(shift)
-            bits &= np.uint64(mask)
-        code |= bits << np.uint64(axis)
-    return np.argsort(code, kind="stable")
+    return np.argsort(interleave((points - low) * scale), kind="stable")
 
 
 def _start_clusters(position, direction, flux, order, angular_weight):

@@ -7,11 +7,12 @@ probed on its own, until parts are so small that all their rays are traced.
 The result is biased: what blocks the light between the probes only is not seen.  The points of a pair lie next to each
 other along a curve, so that takes an occluder smaller than their distance, or its very edge.
 
-Departures from the paper, where a mixed pair is divided into the 16 or 8 subarrays that its probes stand for: here it
-is divided into the two children of its point node, which are subarrays too, but of points that are near to each
-other. Probes at points to which the representative would contribute nothing, whatever its visibility, do not vote;
-where none votes, few points can need a ray, and those are traced.  Partly transparent occluders count as neither open
-nor closed.
+Departures from the paper.  A mixed pair is divided not into the 16 or 8 subarrays that its probes stand for but into
+as many descendants of its point node, which are subarrays too, of points that are near to each other.  The paper
+probes pairs of 8 points or more, with 16 rays from 33 points on; here it is 32 and 64: at 512 pixels a side that
+takes 4 to 14% more rays, and 12 to 15% less time, because packets of rays stay whole. Probes at points to which the
+representative would contribute nothing, whatever its visibility, do not vote; where none votes, few points can need a
+ray, and those are traced.  Partly transparent occluders count as neither open nor closed.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .arrays import add_at
 from .evaluation import probe_visibility
 from .gather import SceneTraits
 from .light_set import LightGroup, LightSet
 from .pairs import Pairs
 from .point_clusters import PointClusters
 
-# [IC] Algorithm 2: rays of pairs with fewer points are all traced; probes of larger ones, and of those above the limit
+# Rays of pairs with fewer points are all traced; probes of larger ones, and of those above the limit
 _FEWEST_POINTS, _FEW_PROBES, _MANY_PROBES, _MANY_POINTS = 32, 8, 16, 64
 # Probes traced at a time
 _PROBES_PER_KERNEL = 1 << 22
@@ -49,7 +51,7 @@ def _probe(
     passed, votes = probe_visibility(scene, traits, lights, group, surface, light)
     found = dr.select(dr.all(passed == 1), mi.UInt32(_OPEN), dr.select(dr.any(passed > 0), _OPEN | _CLOSED, _CLOSED))
     union = dr.block_reduce(dr.ReduceOp.Or, dr.select(votes, found, 0), probes)
-    dr.scatter_add(rays, dr.select(votes, mi.UInt32(1), 0), point)
+    add_at(rays, dr.select(votes, mi.UInt32(1), 0), point)
     dr.eval(union, rays)
     return union
 

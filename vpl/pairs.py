@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import download, upload
+from .arrays import add_at, download, upload
 from .bounds import contribution_bound
 from .light_set import LightGroup, LightSet
 from .lights import AT_INFINITY
@@ -60,14 +60,17 @@ class Pairs:
     @staticmethod
     def join(parts: list[Pairs]) -> Pairs:
         """All pairs of several parts, evaluated."""
-        joined = Pairs(dr.concat([part.points for part in parts]), dr.concat([part.lights for part in parts]))
-        dr.eval(joined.points, joined.lights)
+        count = sum(part.count for part in parts)
+        joined = Pairs(dr.empty(mi.UInt32, count), dr.empty(mi.UInt32, count))
+        first = 0
+        for part in parts:
+            # dr.concat would bake every offset into a kernel of its own
+            place = dr.arange(mi.UInt32, part.count) + dr.opaque(mi.UInt32, first)
+            dr.scatter(joined.points, part.points, place)
+            dr.scatter(joined.lights, part.lights, place)
+            dr.eval(joined.points, joined.lights)
+            first += part.count
         return joined
-
-
-def light_radius(node):
-    """Radius of the ball around a light node's box; 0 for lights at infinity."""
-    return 0.5 * dr.norm(node.box_max - node.box_min)
 
 
 def _chord(cosine):
@@ -82,9 +85,8 @@ def _lights_spread_more(kind: str, points, lights):
         spread += _chord(points.receiver.mirror_cosine)
     if kind in AT_INFINITY:
         return _chord(lights.cosine) > _DIRECTIONS * spread
-    center = 0.5 * (lights.box_min + lights.box_max)
-    distance = dr.norm(center - points.receiver.position)
-    return light_radius(lights) > points.radius + _DIRECTIONS * distance * spread
+    distance = dr.norm(lights.center - points.receiver.position)
+    return lights.radius > points.radius + _DIRECTIONS * distance * spread
 
 
 def _judge(clusters: PointClusters, group: LightGroup, pairs: Pairs, accept: Callable, smallest_distance):
@@ -136,7 +138,7 @@ class BoundCounter:
         """Count one bound for each of some point nodes."""
         self.total += dr.width(points)
         if self._at_nodes is not None:
-            dr.scatter_add(self._at_nodes, dr.gather(mi.Float, self._share, points), points)
+            add_at(self._at_nodes, dr.gather(mi.Float, self._share, points), points)
             dr.eval(self._at_nodes)
 
     def add_at_points(self, index, counts) -> None:
@@ -148,10 +150,23 @@ class BoundCounter:
     def per_point(self):
         """Bounds for every point along the tree, (n,) Float: exact where located, else the same everywhere."""
         if self._at_nodes is None:
-            return dr.full(mi.Float, self.total / self._clusters.count, self._clusters.count)
+            return dr.opaque(mi.Float, self.total / self._clusters.count, self._clusters.count)
         tree = self._clusters.tree
         shared = tree.push_down(download(self._at_nodes).astype(np.float64))[tree.leaf]
         return upload(mi.Float, shared + self._at_points)
+
+
+def in_batches(found, least: int):
+    """Join what :func:`find_pairs` yields to :class:`Pairs` of at least ``least`` pairs, but for the last."""
+    held, count = [], 0
+    for pairs in found:
+        held.append(pairs)
+        count += pairs.count
+        if count >= least:
+            yield Pairs.join(held)
+            held, count = [], 0
+    if held:
+        yield Pairs.join(held)
 
 
 def find_pairs(clusters: PointClusters, lights: LightSet, group: LightGroup, accept: Callable, counter: BoundCounter):

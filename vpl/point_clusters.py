@@ -38,7 +38,7 @@ class PointNode:
 class PointClusters:
     """A batch of gather points along its point tree, with the bounds of every node on the device [IC section 3].
 
-    ``order``: row of the original batch that each point of ``batch`` is; ``leaf``: the node that holds each point.
+    ``order``: row of the original batch that each point of ``batch`` is.
     """
 
     def __init__(self, batch: Batch):
@@ -52,7 +52,6 @@ class PointClusters:
         )
         self.order = upload(mi.UInt32, self.tree.order)
         self.batch = batch.select(self.order)
-        self.leaf = upload(mi.UInt32, self.tree.leaf)
         self._records = upload(mi.Float, _records(self.tree, batch))
         proxy = batch.proxy
         self._lobes = upload(mi.Float, _lobe_records(self.tree, proxy)) if proxy.glossy else None
@@ -84,6 +83,14 @@ class PointClusters:
         return PointNode(receiver, first, count, child)
 
 
+def _directions(vectors) -> np.ndarray:
+    """Unit vectors, (n, 3) float32; those of broken meshes that are not become +z, so that they have a place."""
+    values = download(vectors)
+    length = np.einsum("ij,ij->i", values, values)
+    values[~(np.abs(length - 1) < 1e-3)] = (0, 0, 1)
+    return values
+
+
 def _records(tree: PointTree, batch: Batch) -> np.ndarray:
     """(m, _RECORD) float32."""
     position = download(batch.position)
@@ -91,7 +98,7 @@ def _records(tree: PointTree, batch: Batch) -> np.ndarray:
     # One pass for all bounds: the largest of -x is the least of x
     largest = tree.reduce(np.hstack([-position, position, download(batch.proxy.base)]), np.maximum)
     records[:, 0:3], records[:, 3:6], records[:, 10:13] = -largest[:, 0:3], largest[:, 3:6], largest[:, 6:9]
-    records[:, 6:9], records[:, 9] = tree.cones(download(batch.normal))
+    records[:, 6:9], records[:, 9] = tree.cones(_directions(batch.normal))
     for column, values in ((13, tree.first), (14, tree.count), (15, tree.child)):
         records[:, column] = values.view(np.float32)
     return records
@@ -100,7 +107,7 @@ def _records(tree: PointTree, batch: Batch) -> np.ndarray:
 def _lobe_records(tree: PointTree, proxy: MaterialProxy) -> np.ndarray:
     """(m, _LOBE_RECORD) float32."""
     records = np.zeros((tree.size, _LOBE_RECORD), np.float32)
-    records[:, 0:3], records[:, 3] = tree.cones(download(proxy.axis))
+    records[:, 0:3], records[:, 3] = tree.cones(_directions(proxy.axis))
     records[:, 4:7] = tree.reduce(download(proxy.peak), np.maximum)
     records[:, 7] = tree.reduce(download(proxy.exponent), np.minimum)
     return records

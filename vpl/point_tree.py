@@ -26,11 +26,11 @@ from functools import cached_property
 
 import numpy as np
 
+from .morton import interleave
+
 _NORMAL_CELLS, _NORMAL_BITS, _POSITION_BITS, _MATERIAL_BITS = 7, 3, 16, 6
 # Points from which the extent of their middle is found
 _SAMPLE = 1 << 16
-_SHIFTS = (32, 16, 8, 4, 2)
-_MASKS = (0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
 # A cosine is lowered by this much before it is stored in single precision, so that no cone loses a vector to rounding
 _COSINE_ROUNDING = 2.0**-21
 
@@ -124,18 +124,6 @@ class PointTree:
                 yield nodes
 
 
-def _spread(cells: np.ndarray) -> np.ndarray:
-    """Interleave the bits of cells, (n, 3) integers of up to 21 bits: Morton codes, (n,) uint64."""
-    code = np.zeros(len(cells), np.uint64)
-    for axis in range(3):
-        bits = cells[:, axis].astype(np.uint64)
-        for shift, mask in zip(_SHIFTS, _MASKS, strict=True):
-            bits |= bits << np.uint64(shift)
-            bits &= np.uint64(mask)
-        code |= bits << np.uint64(axis)
-    return code
-
-
 def _cells(position: np.ndarray) -> np.ndarray:
     """Cells of positions in a cube of 2^_POSITION_BITS a side, (n, 3) float64: even in the middle, growing outwards."""
     sample = position[:: max(len(position) // _SAMPLE, 1)].astype(np.float64)
@@ -150,11 +138,12 @@ def _cells(position: np.ndarray) -> np.ndarray:
 def point_codes(position: np.ndarray, normal: np.ndarray, material: np.ndarray | None = None) -> np.ndarray:
     """Codes of points, (n,) uint64: the material above where the normal points to above where the point is."""
     by_normal = np.clip((normal + 1) * (0.5 * _NORMAL_CELLS), 0, _NORMAL_CELLS - 1)
-    code = _spread(by_normal) << np.uint64(3 * _POSITION_BITS)
-    code |= _spread(_cells(position))
+    code = interleave(by_normal) << np.uint64(3 * _POSITION_BITS)
+    code |= interleave(_cells(position))
     if material is not None:
-        _, rank = np.unique(material, return_inverse=True)
-        rank = rank.astype(np.uint64) & np.uint64(2**_MATERIAL_BITS - 1)
+        # By first appearance among the points: the numbers themselves may differ from one load of a scene to the next
+        _, appearance, found = np.unique(material, return_index=True, return_inverse=True)
+        rank = np.argsort(np.argsort(appearance))[found].astype(np.uint64) & np.uint64(2**_MATERIAL_BITS - 1)
         code |= rank << np.uint64(3 * (_POSITION_BITS + _NORMAL_BITS))
     return code
 

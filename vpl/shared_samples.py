@@ -2,8 +2,8 @@
 
 [IC] suggests to shade, for each pair of clusters, only one of the points that belong to the same pixel.  Here the
 choice is made once for all pairs: in every small cluster of points each pixel has one point, drawn at random, that
-all the pixel's points in that cluster take their light from.  The mean over draws is the light of all of them,
-texture included.
+all the pixel's points in that cluster take their light from. The mean over draws is the
+light of all of them, texture included, where a pixel's samples have the same weight.
 """
 
 from __future__ import annotations
@@ -33,4 +33,7 @@ def share_samples(tree: PointTree, pixel: np.ndarray, samples: int, generator):
     # The first in a random order stands for its group
     shuffled = generator.permutation(len(pixel))
     _, first = np.unique(group[shuffled], return_index=True)
-    return shuffled[first], group
+    rows = shuffled[first]
+    # Along the tree, so that neighbouring lanes share what they are lit by
+    along = np.argsort(rows)
+    return rows[along], np.argsort(along)[group]

@@ -1,0 +1,24 @@
+"""Morton codes: positions in a grid to places along a curve (NumPy only)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+_SHIFTS = (32, 16, 8, 4, 2)
+_MASKS = (0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
+
+
+def interleave(cells: np.ndarray) -> np.ndarray:
+    """Codes of cells, (n,) uint64 from (n, 3) numbers from 0 to 2^21 - 1, whose fractions are dropped.
+
+    Bit k of the cell along axis a becomes bit 3k + a.
+    """
+    code = np.zeros(len(cells), np.uint64)
+    for axis in range(3):
+        bits = cells[:, axis].astype(np.uint64)
+        # Halve the groups of adjacent bits until bit k stands at 3k
+        for shift, mask in zip(_SHIFTS, _MASKS, strict=True):
+            bits |= bits << np.uint64(shift)
+            bits &= np.uint64(mask)
+        code |= bits << np.uint64(axis)
+    return code
