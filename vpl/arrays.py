@@ -42,7 +42,7 @@ def download(values):
     if dr.depth_v(type(values)) == 1:
         return np.array(values.numpy(), copy=True)
     # Channel by channel: making one array of a vector compiles a kernel for every width
-    return np.stack([download(channel) for channel in values], axis=1)
+    return np.stack(np.broadcast_arrays(*(download(channel) for channel in values)), axis=1)
 
 
 def add_at(target, values, index):
