@@ -132,10 +132,10 @@ def test_points_are_open_traced_or_dark_and_their_light_is_that_of_all_rays(kind
     exact = sum_all_lights(place.scene, place.traits, place.lights, clusters.batch)[0]
     assert np.allclose(download(ours), download(exact), rtol=1e-4, atol=0)
     assert np.array_equal(download(more), asked), "one ray for each point of a pair that is traced, none for open ones"
-    # The open tile is left to its probes, but for small leftovers; the veiled one never is, where light passes it
+    # Open and closed tiles are left to their probes, but for small leftovers; the veiled one never is, if it passes light
     tile = {name: np.array([place.tiles[leaf] == {name} for leaf in clusters.tree.leaf]) for name in ROOFS}
     assert lit[tile["open"]].mean() > 0.8 and asked[tile["veiled"]].all() == (kind != "point")
-    assert not asked[tile["closed"]].any()
+    assert asked[tile["closed"]].mean() < 0.2
 
 
 def test_probing_in_parts_changes_nothing(monkeypatch):
