@@ -167,21 +167,24 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         tree, leaves = clusters.tree, clusters.tree.leaves
         allowed = self.error * np.maximum(bright[leaves], self.dark_floor * job.mean)
         if self.max_cut:
-            # A leaf takes after the last point that is tried before it.  What is 0 could not be raised.
-            allowed = np.maximum(allowed, np.finfo(np.float32).tiny)
-            raised = self._raise_thresholds(job, clusters, np.repeat(allowed, tree.count[leaves]), counter)
-            allowed *= raised[tree.first[leaves] // _TRIED_STRIDE]
+            # A leaf takes after the last point that is tried before it
+            least = self._least_thresholds(job, clusters, np.repeat(allowed, tree.count[leaves]), counter)
+            allowed = np.maximum(allowed, least[tree.first[leaves] // _TRIED_STRIDE])
         return upload_thresholds(tree.gather_up(allowed, leaves, np.minimum))
 
-    def _raise_thresholds(self, job: Shading, clusters: PointClusters, allowed: np.ndarray, counter: BoundCounter):
-        """Factors, at least 1, by which every _TRIED_STRIDE-th point must raise its threshold to have a cut that is not
-        larger than ``max_cut``."""
+    def _least_thresholds(self, job: Shading, clusters: PointClusters, allowed: np.ndarray, counter: BoundCounter):
+        """Thresholds below which cuts are about larger than ``max_cut``, around every _TRIED_STRIDE-th point.
+
+        Cuts grow about as fast as thresholds fall at most, so one that is not full leaves that much room below.
+        """
         rows = np.arange(0, clusters.count, _TRIED_STRIDE)
-        index, threshold = upload(mi.UInt32, rows), upload_thresholds(allowed[rows])
+        # What is 0 could not be raised by any factor
+        tried = np.maximum(allowed[rows], np.finfo(np.float32).tiny)
+        index = upload(mi.UInt32, rows)
         part = clusters.batch.select(index)
-        raised, _, visits = limited_cuts(job.lights, part, threshold, self.max_cut)
+        raised, sizes, visits = limited_cuts(job.lights, part, upload_thresholds(tried), self.max_cut)
         counter.add_at_points(index, visits)
-        return np.maximum(download(raised).astype(np.float64) / np.maximum(allowed[rows], 1e-300), 1)
+        return download(raised).astype(np.float64) * np.minimum(sizes.total() / self.max_cut, 1)
 
     def _pairs(self, job: Shading, clusters: PointClusters, threshold, counter: BoundCounter):
         """Phase II: yield (group of lights, illumination-aware pairs), about _PAIRS_HELD of them at a time."""

@@ -119,7 +119,6 @@ def test_a_largest_cut_below_the_number_of_kinds_ends(clamping):
     assert statistics["cut_size"] < 20 * statistics["gather_points"]
 
 
-@pytest.mark.xfail(reason="thresholds are raised by a factor, which leaves those of zero at zero", strict=True)
 @pytest.mark.parametrize("settings", [{"error": 0.0}, {"dark_floor": 0.0}], ids=str)
 def test_the_largest_cut_is_kept_where_the_threshold_is_zero(settings):
     """Points that Phase I found black have a threshold of zero if there is no floor; so have all with an error of 0."""
@@ -128,9 +127,6 @@ def test_the_largest_cut_is_kept_where_the_threshold_is_zero(settings):
     assert image[..., 3].max() < 300
 
 
-@pytest.mark.xfail(
-    reason="an infinite threshold divided by one of zero is infinite: zero times it, not a number", strict=True
-)
 def test_an_infinite_threshold_is_a_number():
     """Without clamping the bounds of clusters around a point are infinite, and so are thresholds for a tiny cut."""
     image, _ = rendered(mi.load_dict(many_kinds()), vpl_count=300, max_depth=4, error=0.0, max_cut=1, clamping=0.0)
@@ -261,7 +257,6 @@ def broken_normals():
     return mesh
 
 
-@pytest.mark.xfail(reason="the point tree refuses normals that are not finite", strict=True)
 def test_points_without_a_normal_are_black_as_in_the_other_methods():
     scene = mi.load_dict(closed_box({"lamp": area_light()}, square=broken_normals()))
     assert np.isfinite(render(scene, "lightcuts", 1, vpl_count=300)).all()
@@ -278,7 +273,6 @@ def test_same_seed_same_image_and_other_seed_other_image(visibility):
     assert not np.allclose(first[0], other[0], rtol=1e-2)
 
 
-@pytest.mark.xfail(reason="materials are put in the order of Mitsuba's registry, which is that of loading", strict=True)
 def test_the_order_in_which_materials_were_loaded_does_not_matter():
     """Mitsuba loads in parallel: the order can change from run to run."""
     scene = many_kinds()

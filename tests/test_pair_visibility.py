@@ -132,7 +132,7 @@ def test_points_are_open_traced_or_dark_and_their_light_is_that_of_all_rays(kind
     exact = sum_all_lights(place.scene, place.traits, place.lights, clusters.batch)[0]
     assert np.allclose(download(ours), download(exact), rtol=1e-4, atol=0)
     assert np.array_equal(download(more), asked), "one ray for each point of a pair that is traced, none for open ones"
-    # Open and closed tiles are left to their probes, but for small leftovers; the veiled one never is, if it passes light
+    # Open and closed tiles are left to their probes but for leftovers; the veiled one never is, if it passes light
     tile = {name: np.array([place.tiles[leaf] == {name} for leaf in clusters.tree.leaf]) for name in ROOFS}
     assert lit[tile["open"]].mean() > 0.8 and asked[tile["veiled"]].all() == (kind != "point")
     assert asked[tile["closed"]].mean() < 0.2

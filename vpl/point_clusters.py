@@ -46,7 +46,7 @@ class PointClusters:
         material = batch.surfaces.material()
         self.tree: PointTree = build_point_tree(
             download(batch.position),
-            download(batch.normal),
+            _directions(batch.normal),
             leaf_size,
             None if material is None else download(material),
         )
