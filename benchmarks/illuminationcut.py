@@ -42,8 +42,8 @@ from vpl.visibility import shadow_ray  # noqa: E402
 
 NAMES = (*scenes.NAMES, "glossy")
 DEPTH, VPLS, WIDTH, SUBSET, RUNS = 6, 200_000, 512, 4000, 3
-# Tried in turn until the RMSE passes that of lightcuts; between two of them the error is interpolated
-ERRORS = (0.0015, 0.003, 0.006, 0.012, 0.024, 0.048, 0.096, 0.19, 0.38)
+# How often, and how closely, the error that gives a wanted RMSE is tried for
+_TRIES, _NEAR = 4, 0.03
 
 
 @dataclass
@@ -98,18 +98,15 @@ class Problem:
         rmse = np.sqrt(square) / self.mean
         return Found(seconds, rmse, absolute / self.mean, rays / self.points, bounds / self.points, stages)
 
-    def error_for(self, rmse: float, **more) -> float:
-        """The ``error`` at which ``illuminationcut`` has a given RMSE."""
-        before = None
-        for error in ERRORS:
+    def error_for(self, rmse: float, error: float, **more) -> float:
+        """The ``error`` at which ``illuminationcut`` has a given RMSE, to some percent; ``error``: a first guess."""
+        for _ in range(_TRIES):
             reached = self.shade(self.plugin("illuminationcut", error=error, **more)).rmse
-            if reached >= rmse:
+            if abs(reached / rmse - 1) < _NEAR:
                 break
-            before = error, reached
-        if before is None or reached < rmse:
-            return error
-        slope = np.log(error / before[0]) / np.log(reached / before[1])
-        return float(before[0] * (rmse / before[1]) ** slope)
+            # The RMSE grows as about the 0.6th power of the error
+            error *= float(np.clip((rmse / reached) ** (1 / 0.6), 0.2, 5))
+        return error
 
 
 def equal_quality(title: str, names, samples: int, lightcuts_error: float, **settings) -> None:
@@ -123,7 +120,7 @@ def equal_quality(title: str, names, samples: int, lightcuts_error: float, **set
         target = problem.shade(methods["lightcuts"]).rmse
         errors = {"lightcuts": lightcuts_error}
         for visibility in speedups:
-            errors[visibility] = problem.error_for(target, visibility=visibility)
+            errors[visibility] = problem.error_for(target, 2 * lightcuts_error, visibility=visibility)
             methods[visibility] = problem.plugin("illuminationcut", visibility=visibility, error=errors[visibility])
         runs: dict = {label: [] for label in methods}
         for _ in range(RUNS):
