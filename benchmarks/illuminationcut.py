@@ -219,7 +219,6 @@ def many_lights(names) -> None:
 def memory_of(name: str) -> None:
     """Print the growth of this process's peak memory while it renders a large image with many lights."""
     scene = mi.load_file(str(scenes.scene_file(name)), resx=1600, resy=1200)
-    mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=1)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for visibility in ("all", "adaptive"):
         settings = {"max_depth": DEPTH, "vpl_count": 1_200_000, "visibility": visibility}
