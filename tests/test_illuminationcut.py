@@ -1,6 +1,7 @@
 """The integrator ``illuminationcut``: against ``vpl`` with the same lights, and in everything that it adds to it."""
 
 import math
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -8,13 +9,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vpl.arrays import upload
-from vpl.point_tree import build_point_tree
-from vpl.shared_samples import share_samples
+from vpl import pairs
+from vpl.arrays import download, upload
+from vpl.bounds import contribution_bound
 
 from .conftest import area_light, closed_box, render, sensor, wall
-from .test_integrators import ODD_SCENES, assert_same_expectation, passes
-from .test_lightcuts import GLOSSY, many_kinds
+from .test_integrators import ODD_SCENES
+from .test_lightcuts import GLOSSY, many_kinds, prepared
 from .test_pairs import glossy_room
 
 NAME = "illuminationcut"
@@ -84,6 +85,29 @@ def test_adaptive_visibility_changes_nothing_where_nothing_is_in_the_way():
     assert adaptive[1]["shadow_rays"] < 0.7 * every[1]["shadow_rays"]
 
 
+def test_a_pair_is_accepted_only_below_the_threshold_of_all_its_points(monkeypatch):
+    plugin = mi.load_dict({"type": NAME, "max_cut": 0, "error": 0.05})
+    kept, find = [], pairs.find_pairs
+
+    def spy(clusters, lights, group, *more):
+        for found in find(clusters, lights, group, *more):
+            kept.append((clusters, group, found))
+            yield found
+
+    monkeypatch.setattr("integrators.illuminationcut.find_pairs", spy)
+    for job in prepared(glossy_room())[1]:
+        kept.clear()
+        bright = download(plugin.shade(job).phase_one).astype(np.float64)
+        allowed = plugin.error * np.maximum(bright, plugin.dark_floor * job.mean)
+        for clusters, group, found in kept:
+            least = clusters.tree.reduce(allowed, np.minimum)[download(found.points)]
+            points, lights = clusters.gather(found.points), group.tree.gather(found.lights)
+            bound = contribution_bound(group.kind, points.receiver, lights, job.lights.smallest_distance)
+            single = download((points.child == 0) & (lights.escape == found.lights + 1))
+            assert (download(bound) <= least * (1 + 1e-5))[~single].all()
+        assert sum(found.count for _, _, found in kept) > 1000
+
+
 @pytest.mark.parametrize("visibility", ["all", "adaptive"])
 def test_work_in_parts_gives_the_same_image(visibility, monkeypatch):
     scene = glossy_room()
@@ -146,39 +170,7 @@ def test_energy_is_that_of_all_lights():
         scales.append(exact.mean())
     p_values = stats.ttest_1samp(np.array(differences), 0.0).pvalue
     assert p_values.min() > 0.002 / p_values.size, np.mean(differences, 0)
-    assert np.std(np.array(differences)[:, -1]) < 0.1 * np.mean(scales), "a bias of a few percent would be seen"
-
-
-def test_shared_samples_have_the_mean_of_all_of_them():
-    texture = mi.Bitmap(np.random.default_rng(0).uniform(0, 1, (32, 32, 3)).astype(np.float32))
-    painted = {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": texture, "filter_type": "nearest"}}
-    scene = mi.load_dict(closed_box({"lamp": area_light()}, size=8, back=wall([0, 0, -1], [0, 1, 0], 0, bsdf=painted)))
-    settings = {"vpl_count": 100, "max_depth": 3, "error": 0.2, "phase_one_error": 2.0}
-    shared, single = (passes(scene, NAME, 32, 4, 100 * s, share_samples=s == 0, **settings) for s in (0, 1))
-    assert_same_expectation(shared, single)
-    rays = [rendered(scene, 4, share_samples=share, **settings)[1]["shadow_rays"] for share in (True, False)]
-    assert rays[0] < 0.7 * rays[1]
-    alone = [rendered(scene, 1, share_samples=share, **settings)[0] for share in (True, False)]
-    assert np.allclose(*alone, rtol=1e-5)
-
-
-def test_points_stand_for_others_of_their_pixel_nearby_and_all_as_often():
-    rng, samples = np.random.default_rng(0), 4
-    pixel = np.repeat(np.arange(100), samples)
-    position = np.stack([pixel % 10, pixel // 10, np.zeros(400)], 1) + rng.uniform(0, 0.9, (400, 3)) * [1, 1, 0]
-    # One sample of the first pixels lies elsewhere
-    position[: 20 * samples : samples, 2] = 500
-    tree = build_point_tree(position.astype(np.float32), np.tile(np.float32([0, 0, 1]), (400, 1)), 1)
-    pixel, position, chosen = pixel[tree.order], position[tree.order], np.zeros(400)
-    for _ in range(400):
-        rows, stands_for = share_samples(tree, pixel, samples, rng)
-        assert len(np.unique(rows)) == len(rows) and set(stands_for) == set(range(len(rows)))
-        assert np.array_equal(pixel[rows[stands_for]], pixel) and np.array_equal(stands_for[rows], np.arange(len(rows)))
-        assert np.array_equal(position[rows[stands_for], 2], position[:, 2])
-        chosen[rows] += 1
-    size = np.bincount(stands_for)[stands_for]
-    assert 100 < len(rows) < 300 and (size > 1).any()
-    assert np.abs(chosen / 400 - 1 / size).max() < 5 * 0.5 / 20, "all members of a group are drawn alike"
+    assert np.std(np.array(differences)[:, -1]) < 0.01 * np.mean(scales), "a bias of half a percent would be seen"
 
 
 @pytest.mark.parametrize("visibility", ["all", "adaptive"])
@@ -219,8 +211,7 @@ SMALL = {
 }
 
 
-# The Morton order of gather points, which all integrators share, divides by the extent of a single point
-@pytest.mark.filterwarnings("ignore:.*encountered in:RuntimeWarning")
+@pytest.mark.filterwarnings("ignore:.*encountered in:RuntimeWarning")  # see the next test
 @pytest.mark.parametrize("name", SMALL)
 def test_small_things_are_lit_as_by_all_lights(name):
     scene = many_kinds()
@@ -232,6 +223,13 @@ def test_small_things_are_lit_as_by_all_lights(name):
         assert np.abs(ours - expected).mean() < 0.03 * expected.mean() and expected.mean() > 0
     shared, _ = rendered(scene, 16, share_samples=True, **settings)
     assert np.isfinite(shared).all() and shared.max() > 0
+
+
+@pytest.mark.xfail(reason="the Morton order of gather points divides by the extent of a single one", strict=True)
+@pytest.mark.parametrize("integrator", ["vpl", NAME])
+def test_a_single_gather_point_gives_no_warning(integrator):
+    scene = closed_box({"lamp": area_light()}, size=1)
+    assert render(mi.load_dict(scene), integrator, 1, vpl_count=50).max() > 0
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -296,6 +294,14 @@ def test_mono_variant_renders_as_all_lights_do(visibility):
     exact, every = rendered(scene, 4, error=0.0, max_cut=0, **settings)
     assert np.allclose(exact, expected, rtol=1e-4, atol=1e-5 * expected.mean())
     assert statistics["shadow_rays"] < every["shadow_rays"]
+
+
+def test_a_render_that_is_cancelled_ends_before_the_second_phase_is_evaluated():
+    plugin = mi.load_dict({"type": NAME})
+    job = prepared(glossy_room())[1][0]
+    whole, stopped = (plugin.shade(replace(job, stopped=lambda answer=answer: answer)) for answer in (False, True))
+    assert download(whole.radiance).max() > 0 == download(stopped.radiance).max()
+    assert download(stopped.shadow_rays).sum() < 0.5 * download(whole.shadow_rays).sum()
 
 
 BAD = [

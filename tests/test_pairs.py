@@ -222,8 +222,9 @@ def some_pairs(job, clusters, group):
 
 
 def split_in_two(found: Pairs):
-    """Every third pair, and the others."""
-    place = np.arange(found.count)
+    """Every third pair, and the others, to which that of the roots is added: lists of the root must not be lost."""
+    place, root = np.arange(found.count + 1), dr.opaque(mi.UInt32, 0, 1)
+    found = Pairs.join([found, Pairs(root, root)])
     return [found.select(upload(mi.UInt32, place[chosen])) for chosen in (place % 3 > 0, place % 3 == 0)]
 
 
