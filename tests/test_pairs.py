@@ -304,3 +304,26 @@ def test_lists_of_all_single_pairs_are_the_sum_of_all_lights(jobs, number, monke
             total += download(evaluate_lists(job.scene, job.traits, job.lights, group, clusters.batch, lists, row)[0])
     exact_sum = download(sum_all_lights(job.scene, job.traits, job.lights, clusters.batch)[0])
     assert np.allclose(total, exact_sum, rtol=1e-4, atol=1e-6 * exact_sum.mean())
+
+
+def test_a_pair_is_accepted_only_below_the_threshold_of_all_its_points(monkeypatch):
+    plugin = mi.load_dict({"type": "illuminationcut", "max_cut": 0, "error": 0.05})
+    kept = []
+
+    def spy(clusters, lights, group, *more):
+        for found in find_pairs(clusters, lights, group, *more):
+            kept.append((clusters, group, found))
+            yield found
+
+    monkeypatch.setattr("integrators.illuminationcut.find_pairs", spy)
+    for job in prepared(glossy_room())[1]:
+        kept.clear()
+        bright = download(plugin.shade(job).phase_one).astype(np.float64)
+        allowed = plugin.error * np.maximum(bright, plugin.dark_floor * job.mean)
+        for clusters, group, found in kept:
+            least = clusters.tree.reduce(allowed, np.minimum)[download(found.points)]
+            points, lights = clusters.gather(found.points), group.tree.gather(found.lights)
+            bound = contribution_bound(group.kind, points.receiver, lights, job.lights.smallest_distance)
+            single = download((points.child == 0) & (lights.escape == found.lights + 1))
+            assert (download(bound) <= least * (1 + 1e-5))[~single].all()
+        assert sum(found.count for _, _, found in kept) > 1000

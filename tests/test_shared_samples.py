@@ -1,14 +1,19 @@
 """Gather points that stand for others of their pixel: which ones, and what light they all get."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 
+from vpl.arrays import download
 from vpl.point_tree import build_point_tree
 from vpl.shared_samples import share_samples
 
 from .conftest import area_light, closed_box, render, wall
 from .test_illuminationcut import NAME, rendered
 from .test_integrators import assert_same_expectation, passes
+from .test_lightcuts import prepared
+from .test_pairs import glossy_room
 
 
 def test_shared_samples_have_the_mean_of_all_of_them():
@@ -22,6 +27,19 @@ def test_shared_samples_have_the_mean_of_all_of_them():
     assert rays[0] < 0.7 * rays[1]
     alone = [rendered(scene, 1, share_samples=share, **settings)[0] for share in (True, False)]
     assert np.allclose(*alone, rtol=1e-5)
+
+
+def test_the_light_of_a_point_is_that_of_one_of_its_pixel():
+    """Here four neighbouring rays are taken for samples of one pixel."""
+    for job in prepared(glossy_room(), vpl_count=100, max_depth=3)[1]:
+        job, settings = replace(job, samples=4), {"type": NAME, "error": 0.0, "max_cut": 0}
+        own, shown = (
+            download(mi.load_dict({**settings, "share_samples": share}).shade(job).radiance) for share in (False, True)
+        )
+        pixel = download(job.ray) // 4
+        distance = np.abs(shown[:, None] - own[None]).max(2) / own.max()
+        assert np.where(pixel[:, None] == pixel[None], distance, np.inf).min(1).max() < 1e-5
+        assert np.diagonal(distance).max() > 1e-3, "some take over light that is not their own"
 
 
 def test_samples_of_a_pixel_are_known_to_each_other_on_any_film():
