@@ -31,7 +31,13 @@ def relative_error(image, expected):
 
 
 def counts(statistics):
-    return [statistics[name] for name in COUNTED]
+    return np.array([statistics[name] for name in COUNTED], np.float64)
+
+
+def assert_same(one, other):
+    """Whether two (image, statistics) are the same but for rounding: it may let a pair or two pass the threshold."""
+    assert relative_error(one[0], other[0]) < 2e-5
+    assert np.allclose(counts(one[1]), counts(other[1]), rtol=2e-4)
 
 
 def open_floor(size=64, lamps=60):
@@ -78,8 +84,8 @@ def test_adaptive_visibility_traces_fewer_rays_for_about_the_same_image():
 def test_adaptive_visibility_changes_nothing_where_nothing_is_in_the_way():
     scene = mi.load_dict(open_floor())
     every, adaptive = (rendered(scene, 4, visibility=name, error=0.05) for name in ("all", "adaptive"))
-    assert np.allclose(adaptive[0], every[0], rtol=1e-5, atol=0)
-    assert adaptive[1]["cut_size"] == every[1]["cut_size"]
+    assert relative_error(adaptive[0], every[0]) < 2e-5
+    assert np.isclose(adaptive[1]["cut_size"], every[1]["cut_size"], rtol=2e-4)
     assert adaptive[1]["shadow_rays"] < 0.7 * every[1]["shadow_rays"]
 
 
@@ -87,15 +93,13 @@ def test_adaptive_visibility_changes_nothing_where_nothing_is_in_the_way():
 def test_work_in_parts_gives_the_same_image(visibility, monkeypatch):
     scene = glossy_room()
     settings = {"visibility": visibility, "error": 0.1, "vpl_count": 500, "max_depth": 5}
-    whole, expected = rendered(scene, 4, **settings)
+    whole = rendered(scene, 4, **settings)
     for name, value in (
         ("vpl.pairs._FRONTIER", 1000), ("integrators.illuminationcut._PAIRS_HELD", 900),
         ("vpl.approximate_image._PAIRS_PER_KERNEL", 700), ("vpl.pair_visibility._PROBES_PER_KERNEL", 1100),
     ):  # fmt: skip
         monkeypatch.setattr(name, value)
-    parts, found = rendered(scene, 4, **settings)
-    assert np.allclose(parts, whole, rtol=1e-4, atol=1e-6 * whole.mean())
-    assert counts(found) == counts(expected)
+    assert_same(rendered(scene, 4, **settings), whole)
 
 
 def test_the_largest_cut_is_about_kept():
@@ -163,10 +167,9 @@ def test_energy_is_that_of_all_lights():
 def test_aovs_count_what_statistics_count_and_leave_the_image_alone(visibility):
     scene = glossy_room()
     settings = {"vpl_count": 2000, "max_depth": 5, "visibility": visibility}
-    plain, expected = rendered(scene, 4, **settings)
+    plain = rendered(scene, 4, **settings)
     image, found = rendered(scene, 4, aovs="shadow_rays,upper_bounds,cut_size", **settings)
-    assert np.allclose(image[..., :3], plain, rtol=1e-4, atol=1e-6 * plain.mean())
-    assert counts(found) == counts(expected)
+    assert_same((image[..., :3], found), plain)
     assert np.allclose(4 * image[..., 3:].sum((0, 1)), counts(found), rtol=1e-6)
     assert image[..., 4].min() > 0 and image[..., 4].std() > 0
 
@@ -252,8 +255,7 @@ def test_same_seed_same_image_and_other_seed_other_image(visibility):
     scene = glossy_room()
     settings = {"vpl_count": 1000, "max_depth": 4, "visibility": visibility, "share_samples": True}
     first, again, other = (rendered(scene, 4, seed, **settings) for seed in (3, 3, 4))
-    assert np.allclose(first[0], again[0], rtol=1e-4, atol=1e-6 * first[0].mean())
-    assert counts(first[1]) == counts(again[1])
+    assert_same(first, again)
     assert not np.allclose(first[0], other[0], rtol=1e-2)
 
 
@@ -264,8 +266,7 @@ def test_the_order_in_which_materials_were_loaded_does_not_matter():
     one, other = (
         rendered(mi.load_dict({key: scene[key] for key in keys}), **settings) for keys in (scene, reversed(scene))
     )
-    assert counts(one[1]) == counts(other[1])
-    assert np.allclose(one[0], other[0], rtol=1e-4, atol=1e-6 * one[0].mean())
+    assert_same(one, other)
 
 
 @pytest.mark.usefixtures("restore_variant")
