@@ -200,7 +200,6 @@ SMALL = {
 }
 
 
-@pytest.mark.filterwarnings("ignore:.*encountered in:RuntimeWarning")  # see the next test
 @pytest.mark.parametrize("name", SMALL)
 def test_small_things_are_lit_as_by_all_lights(name):
     scene = many_kinds()
@@ -214,7 +213,6 @@ def test_small_things_are_lit_as_by_all_lights(name):
     assert np.isfinite(shared).all() and shared.max() > 0
 
 
-@pytest.mark.xfail(reason="the Morton order of gather points divides by the extent of a single one", strict=True)
 @pytest.mark.parametrize("integrator", ["vpl", NAME])
 def test_a_single_gather_point_gives_no_warning(integrator):
     scene = closed_box({"lamp": area_light()}, size=1)

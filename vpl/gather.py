@@ -193,7 +193,8 @@ def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughpu
 def _morton_order(position: np.ndarray) -> np.ndarray:
     """Order of points, (n, 3) float32, along a Morton curve through their bounding box."""
     low, high = position.min(0), position.max(0)
-    cell = (position - low) * (1023.0 / max(float((high - low).max()), np.finfo(np.float32).tiny))
+    extent = float((high - low).max())
+    cell = (position - low) * (1023.0 / extent if extent > 0 else 0.0)
     return np.argsort(interleave(np.minimum(cell, 1023)), kind="stable")
 
 
