@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.approximate_image import approximate_radiance
-from vpl.arrays import download, upload
+from vpl.arrays import add_at, download, upload
 from vpl.cuts import limited_cuts, upload_thresholds
 from vpl.pair_lists import evaluate_lists, list_pairs
 from vpl.pair_visibility import decide_visibility
@@ -220,8 +220,8 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         lists = list_pairs(group, clusters, traced, seen)
         radiance, rays = evaluate_lists(job.scene, job.traits, job.lights, group, shown.batch, lists, shown.rows)
         shaded.radiance += dr.gather(type(radiance), radiance, shown.of)
-        dr.scatter_add(shaded.shadow_rays, rays, shown.rows)
-        dr.scatter_add(shaded.cut_size, dr.gather(mi.UInt32, lists.length, shown.rows), shown.rows)
+        add_at(shaded.shadow_rays, rays, shown.rows)
+        add_at(shaded.cut_size, dr.gather(mi.UInt32, lists.length, shown.rows), shown.rows)
         dr.eval(shaded.radiance, shaded.shadow_rays, shaded.cut_size)
         clock.lap("evaluate")
 

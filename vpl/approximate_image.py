@@ -37,6 +37,7 @@ def _coarse_enough(clusters: PointClusters, group: LightGroup, negligible: float
     largest, least = dr.opaque(mi.Float, _SIZE_TO_DISTANCE * float(whole[0])), dr.opaque(mi.Float, negligible)
 
     def accept(points, lights, bound, index):
+        """Whether a pair is coarse enough, or its bound negligible."""
         receiver, radius = points.receiver, points.radius
         narrow = (points.child == 0) | (receiver.normal_cosine > _APERTURE)
         if at_infinity:

@@ -44,15 +44,12 @@ class PointClusters:
     def __init__(self, batch: Batch):
         leaf_size = _GLOSSY_LEAF if batch.proxy.glossy else _LAMBERTIAN_LEAF
         material = batch.surfaces.material()
-        self.tree: PointTree = build_point_tree(
-            download(batch.position),
-            _directions(batch.normal),
-            leaf_size,
-            None if material is None else download(material),
-        )
+        material = None if material is None else download(material)
+        position, normal = download(batch.position), _directions(batch.normal)
+        self.tree: PointTree = build_point_tree(position, normal, leaf_size, material)
         self.order = upload(mi.UInt32, self.tree.order)
         self.batch = batch.select(self.order)
-        self._records = upload(mi.Float, _records(self.tree, batch))
+        self._records = upload(mi.Float, _records(self.tree, position, normal, download(batch.proxy.base)))
         proxy = batch.proxy
         self._lobes = upload(mi.Float, _lobe_records(self.tree, proxy)) if proxy.glossy else None
         self._no_cosine = None
@@ -91,14 +88,13 @@ def _directions(vectors) -> np.ndarray:
     return values
 
 
-def _records(tree: PointTree, batch: Batch) -> np.ndarray:
+def _records(tree: PointTree, position: np.ndarray, normal: np.ndarray, base: np.ndarray) -> np.ndarray:
     """(m, _RECORD) float32."""
-    position = download(batch.position)
     records = np.zeros((tree.size, _RECORD), np.float32)
     # One pass for all bounds: the largest of -x is the least of x
-    largest = tree.reduce(np.hstack([-position, position, download(batch.proxy.base)]), np.maximum)
+    largest = tree.reduce(np.hstack([-position, position, base]), np.maximum)
     records[:, 0:3], records[:, 3:6], records[:, 10:13] = -largest[:, 0:3], largest[:, 3:6], largest[:, 6:9]
-    records[:, 6:9], records[:, 9] = tree.cones(_directions(batch.normal))
+    records[:, 6:9], records[:, 9] = tree.cones(normal)
     for column, values in ((13, tree.first), (14, tree.count), (15, tree.child)):
         records[:, column] = values.view(np.float32)
     return records
