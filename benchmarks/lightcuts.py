@@ -114,7 +114,7 @@ def _seconds_alone(plugin, job) -> float:
     threshold, sizes, _ = limited_cuts(job.lights, job.batch, threshold, plugin.max_cut)
     seconds = count = 0.0
     for chunk in collect_cuts(job.lights, job.batch, threshold, sizes):
-        light, _ = chunk.representatives()
+        light, _ = chunk.group.representatives(chunk.nodes)
         surface, kind = chunk.batch.surfaces_at(chunk.rows), chunk.group.kind
         active = dr.any(contribution(kind, surface, light, job.lights.smallest_distance) > 0)
         ray = shadow_ray(kind, surface.interaction, light)

@@ -190,10 +190,6 @@ class CutChunk:
     nodes: object
     visits: object
 
-    def representatives(self, second=False):
-        """The light that stands for each node, or its second one, and its factor: see :class:`LightGroup`."""
-        return self.group.representatives(self.nodes, second)
-
 
 def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
     """Yield the cuts of a batch as :class:`CutChunk`, evaluated, each of bounded size."""
@@ -223,7 +219,7 @@ def evaluate_cuts(scene, traits: SceneTraits, lights: LightSet, batch: Batch, th
     radiance = dr.zeros(mi.UnpolarizedSpectrum, batch.count)
     rays, visits = dr.zeros(mi.UInt32, batch.count), dr.zeros(mi.UInt32, batch.count)
     for chunk in collect_cuts(lights, batch, threshold, sizes):
-        light, scale = chunk.representatives(second)
+        light, scale = chunk.group.representatives(chunk.nodes, second)
         surface = chunk.batch.surfaces_at(chunk.rows)
         value, traced = evaluate_pairs(scene, traits, lights, chunk.group, surface, light, scale)
         traced = dr.select(traced, mi.UInt32(1), mi.UInt32(0))
