@@ -15,7 +15,7 @@ import_drjit()
 
 import mitsuba as mi  # noqa: E402  (after the check that turns its import error into advice)
 
-PLUGINS = ("vpl", "lightcuts", "illuminationcut")
+PLUGINS = ("vpl", "lightcuts", "illuminationcut", "adaptivedirect", "unoccludeddirect")
 _SUPPORTED = (
     "llvm_ad_rgb",
     "llvm_ad_mono",
@@ -44,7 +44,7 @@ def _register(_old: str | None, variant: str) -> None:
             mi.register_integrator(name, _refuse(name, variant))
         return
     check_backend(variant)
-    for name in ("common", *PLUGINS):
+    for name in ("gathering", "common", *PLUGINS):
         full_name = f"{__name__}.{name}"
         if full_name in sys.modules:
             importlib.reload(sys.modules[full_name])

@@ -51,9 +51,9 @@ def words(props, name: str, allowed: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def depth(props) -> float:
+def depth(props, default: int) -> float:
     """``max_depth`` as Mitsuba's ``path`` has it: -1 (returned as infinity) or a count of at least 0."""
-    value = props.get("max_depth", -1)
+    value = props.get("max_depth", default)
     if isinstance(value, bool) or not isinstance(value, int) or value < -1:
         _fail(props, "max_depth", "-1 (no limit) or an integer of at least 0", value)
     return math.inf if value == -1 else value

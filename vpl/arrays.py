@@ -11,7 +11,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-_NUMPY_DTYPES = {dr.VarType.Float32: np.float32, dr.VarType.UInt32: np.uint32, dr.VarType.Int32: np.int32}
+_NUMPY_DTYPES = {
+    dr.VarType.Float32: np.float32, dr.VarType.Float64: np.float64,
+    dr.VarType.UInt32: np.uint32, dr.VarType.Int32: np.int32,
+}  # fmt: skip
 
 
 def upload(array_type, values):
@@ -75,3 +78,10 @@ def ones(count: int):
     make the kernels that first use them other kernels than those that follow."""
     channels = [dr.opaque(mi.Float, 1.0, count) for _ in range(dr.size_v(mi.UnpolarizedSpectrum))]
     return mi.UnpolarizedSpectrum(*channels)
+
+
+def select_record(mask, chosen, otherwise):
+    """``dr.select`` for the fields of a dataclass."""
+    return type(otherwise)(
+        **{name: dr.select(mask, getattr(chosen, name), value) for name, value in vars(otherwise).items()}
+    )

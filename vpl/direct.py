@@ -78,28 +78,38 @@ class ExtendedEmitters:
         return density
 
 
-@dr.syntax
 def _scattered_emission(scene, extended: ExtendedEmitters, traits, si, sample, depth, max_depth, sampler, active):
     """Radiance of emitters along a BSDF sample, weighted against emitter sampling; beyond delta surfaces, in full."""
     direction = si.to_world(sample.wo)
     hit = scene.ray_intersect(si.spawn_ray(direction), active)
     weight = power_heuristic(sample.pdf, extended.density(si, hit, direction, active))
     radiance = emitted_towards(extended.emitters, hit, active) * weight
-    if dr.hint(traits.delta, mode="scalar"):
-        factor = dr.full(mi.UnpolarizedSpectrum, 1, dr.width(si.p))
-        depth = mi.UInt32(depth) + 1
-        going = active & hit.is_valid() & (depth < max_depth)
-        while dr.hint(going, exclude=[traits]):
-            onward, share = hit.bsdf().sample(
-                mi.BSDFContext(), hit, sampler.next_1d(going), sampler.next_2d(going), going
-            )
-            going &= mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
-            factor *= mi.unpolarized_spectrum(share)
-            hit = scene.ray_intersect(hit.spawn_ray(hit.to_world(onward.wo)), going)
-            radiance += dr.select(going, factor * emitted_towards(extended.emitters, hit, going), 0)
-            depth += 1
-            going &= hit.is_valid() & (depth < max_depth) & (dr.max(factor) > 0)
+    if traits.delta:
+        radiance += emission_beyond_delta(
+            scene, extended.emitters, traits, hit, mi.UInt32(depth) + 1, max_depth, sampler, active
+        )
     return finite_or_zero(radiance)
+
+
+@dr.syntax
+def emission_beyond_delta(scene, emitters: Emitters, traits, hit, depth, max_depth, sampler, active):
+    """Radiance of emitters that a ray finds by way of mirrors, glass and masks.
+
+    ``hit``: the first surface that it met, ``depth``: edges from the camera to it.
+    """
+    hit, depth = mi.SurfaceInteraction3f(hit), mi.UInt32(depth)
+    radiance = dr.zeros(mi.UnpolarizedSpectrum, dr.width(hit.p))
+    factor = dr.full(mi.UnpolarizedSpectrum, 1, dr.width(hit.p))
+    going = active & hit.is_valid() & (depth < max_depth)
+    while dr.hint(going, exclude=[traits]):
+        onward, share = hit.bsdf().sample(mi.BSDFContext(), hit, sampler.next_1d(going), sampler.next_2d(going), going)
+        going &= mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
+        factor *= mi.unpolarized_spectrum(share)
+        hit = scene.ray_intersect(hit.spawn_ray(hit.to_world(onward.wo)), going)
+        radiance += dr.select(going, factor * emitted_towards(emitters, hit, going), 0)
+        depth += 1
+        going &= hit.is_valid() & (depth < max_depth) & (dr.max(factor) > 0)
+    return radiance
 
 
 @dr.syntax

@@ -7,7 +7,7 @@ cannot (environment maps, projectors, textured spots) are called directly, one b
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -111,7 +111,7 @@ class AreaEmitters:
         self._shapes = upload(mi.UInt32, self.shape_index)
 
     def row(self, si, active=True):
-        """Row of the emitter that a hit lies on, plus one; 0 where it lies on none."""
+        """Row of the emitter that a hit (surface interaction or preliminary) lies on, plus one; 0 where on none."""
         index = dr.reinterpret_array(mi.UInt32, si.shape)
         return dr.gather(mi.UInt32, self._row_of_shape, index, active & (index < dr.width(self._row_of_shape)))
 
@@ -150,6 +150,11 @@ class Emitters:
     environment: object | None
     others: list
     dropped: int
+
+    def extended_only(self) -> Emitters:
+        """These emitters without points, spots and directional ones."""
+        none = {name: getattr(self, name).select(slice(0)) for name in ("points", "spots", "directional")}
+        return replace(self, **none)
 
     @property
     def count(self) -> int:

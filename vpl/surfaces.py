@@ -40,6 +40,18 @@ class LambertianSurface(Surface):
         """BSDF times cosine for light from a world space direction."""
         return rgb_to_spectrum(self.albedo * dr.maximum(dr.dot(self.normal, to_light), 0)) & active
 
+    def reflected_with_density(self, to_light, active):
+        """(BSDF times cosine, density of :meth:`sample`) for light from a world space direction."""
+        density = dr.maximum(dr.dot(self.normal, to_light), 0) * dr.inv_pi
+        return self.reflected(to_light, active), density & active
+
+    def sample(self, sample1, sample2, active):
+        """Draw a direction: (world space direction, BSDF times cosine over density, density per solid angle)."""
+        local = mi.warp.square_to_cosine_hemisphere(sample2)
+        density = mi.warp.square_to_cosine_hemisphere_pdf(local)
+        weight = rgb_to_spectrum(self.albedo * dr.pi) & active
+        return mi.Frame3f(self.normal).to_world(local), weight, density & active
+
 
 @dataclass
 class ScatteringSurface(Surface):
@@ -53,6 +65,22 @@ class ScatteringSurface(Surface):
         """BSDF times cosine for light from a world space direction."""
         si = self.interaction
         return mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_light), active))
+
+    def reflected_with_density(self, to_light, active):
+        """(BSDF times cosine, density of :meth:`sample`) for light from a world space direction."""
+        si = self.interaction
+        value, density = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(to_light), active)
+        return mi.unpolarized_spectrum(value), density
+
+    def sample(self, sample1, sample2, active):
+        """Draw a direction: (world space direction, BSDF times cosine over density, density per solid angle).
+
+        Samples of delta lobes have no weight and no density here.
+        """
+        si = self.interaction
+        sample, value = si.bsdf().sample(mi.BSDFContext(), si, sample1, sample2, active)
+        smooth = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Smooth)
+        return si.to_world(sample.wo), mi.unpolarized_spectrum(value) & smooth, sample.pdf & smooth
 
 
 @dataclass

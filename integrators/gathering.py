@@ -1,0 +1,177 @@
+"""The base class of all integrators: camera rays in, radiance out; what lights the gather points is left open."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from time import perf_counter
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from vpl.adaptive_direct import PixelGrid
+from vpl.arrays import download
+from vpl.gather import CameraPaths, SceneTraits, follow_camera_rays, refuse_media, scene_traits
+from vpl.lights import Emitters, read_emitters
+
+from . import properties
+
+
+class Clock:
+    """Seconds by stage; a stage ends when the device has finished."""
+
+    def __init__(self):
+        self.seconds: dict[str, float] = {}
+        self._start = perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """End the current stage and name it."""
+        dr.sync_thread()
+        now = perf_counter()
+        self.split({stage: now - self._start})
+
+    def split(self, seconds: dict[str, float]) -> None:
+        """Add the times of stages that were taken elsewhere; the current stage begins now."""
+        for stage, spent in seconds.items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
+        self._start = perf_counter()
+
+
+def whole_sum(values) -> int:
+    """Sum of a counter over all points (None: nothing was counted); shares of a count add up to whole numbers."""
+    return 0 if values is None else round(float(download(values).sum(dtype="float64")))
+
+
+@dataclass
+class Start:
+    """What every render begins with: a seed drawn from the sampler, the scene's emitters, and the camera's paths.
+
+    ``valid``: camera rays that are opaque in the film's alpha, where an environment counts, as in ``path``.
+    """
+
+    seed: int
+    emitters: Emitters
+    traits: SceneTraits
+    paths: CameraPaths
+    valid: object
+    clock: Clock
+
+    @property
+    def dark(self) -> bool:
+        """Whether there is nothing to light, or nothing to light it with."""
+        return self.paths.points.count == 0 or self.emitters.count == 0
+
+
+class GatheringIntegrator(mi.SamplingIntegrator):
+    """Base class: follows camera rays to gather points, asks ``light`` for their radiance, and sums up.
+
+    Lights belong to one call of ``sample``: a scene that was edited in between is never lit by the lights of the old
+    one, and each pass of a render with several passes gets new ones.  Seeds are drawn from the sampler, so that
+    wrappers such as ``moment`` and ``aov``, which only call ``sample``, work like ``mi.render``.
+    """
+
+    offered_aovs = ()
+
+    def __init__(self, props, default_depth: int):
+        super().__init__(props)
+        self.max_depth = properties.depth(props, default_depth)
+        self.rr_depth = properties.integer(props, "rr_depth", 5, 1)
+        self.aovs = properties.words(props, "aovs", self.offered_aovs)
+        # Read by the base class too, which does not show it
+        self.samples_per_pass = properties.integer(props, "samples_per_pass", 2**32 - 1, 1)
+        self.statistics: dict = {}
+
+    def light(self, scene, sampler, start: Start):
+        """Light the gather points of ``start``: (radiance, {channel: values}, {name: statistic}).
+
+        All per gather point; a channel that nobody offers is not shown.
+        """
+        raise NotImplementedError
+
+    def aov_names(self):
+        """Channels that ``sample`` returns besides the radiance."""
+        return list(self.aovs)
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        """Radiance along camera rays; see ``mi.SamplingIntegrator.sample`` for this interface."""
+        if medium is not None:
+            raise ValueError(
+                "the camera is inside a participating medium; many-light integrators support surfaces only"
+            )
+        refuse_media(scene)
+        with dr.suspend_grad():
+            start = self.begin(scene, sampler, mi.Ray3f(ray), active)
+            radiance, channels, found = self.light(scene, sampler, start)
+            image, counters = self._assemble(start, radiance, channels, found)
+        finite = dr.all(dr.isfinite(image)) & (self.max_depth > 0)
+        return dr.select(finite, mi.Spectrum(image), 0), start.valid, counters
+
+    def begin(self, scene, sampler, ray, active=True) -> Start:
+        """Emitters and camera paths."""
+        clock = Clock()
+        seed = int(dr.reinterpret_array(mi.UInt32, dr.detach(sampler.next_1d()))[0])
+        emitters, traits = read_emitters(scene), scene_traits(scene)
+        if emitters.count == 0:
+            mi.Log(mi.LogLevel.Warn, "The scene has no emitters: the image will be black.")
+        clock.lap("scene")
+        skip = self.skip_area_emitters if self.hide_emitters else None
+        paths = follow_camera_rays(
+            scene, emitters, traits, sampler, seed, ray, active, self.max_depth, self.rr_depth, skip
+        )
+        clock.lap("gather")
+        sky = emitters.environment is not None and not self.hide_emitters
+        return Start(seed, emitters, traits, paths, paths.valid | (active & sky), clock)
+
+    def pixel_grid(self, scene, sampler) -> PixelGrid:
+        """How the camera rays of this pass lie in the image.
+
+        Mitsuba puts the rays of a pixel next to each other. A wrapper may render in passes of its own, in which no
+        sensor has as many pixels as there would have to be: then every ray counts as a pixel, eight to a row.
+        """
+        samples = min(sampler.sample_count(), self.samples_per_pass)
+        for sensor in scene.sensors():
+            film = sensor.film()
+            border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+            size = np.array(film.crop_size(), np.int64) + border
+            if sampler.wavefront_size() == samples * int(np.prod(size)):
+                return PixelGrid(int(size[0]), samples)
+        return PixelGrid(8, 1)
+
+    def _assemble(self, start: Start, radiance, channels: dict, found: dict):
+        """Bring what gather points found to their camera rays: (radiance, requested channels); fills ``statistics``."""
+        points = start.paths.points
+        image, bad_samples = mi.UnpolarizedSpectrum(start.paths.emission), 0
+        counters = [dr.zeros(mi.Float, dr.width(start.paths.valid)) for _ in self.aovs]
+        if points.count:
+            lit = points.weight * radiance
+            bad = ~dr.all(dr.isfinite(lit))
+            dr.scatter_add(image, dr.select(bad, 0, lit), points.ray)
+            for name, counter in zip(self.aovs, counters, strict=True):
+                if name in channels:
+                    dr.scatter(counter, mi.Float(channels[name]), points.ray)
+            bad_samples = int(dr.count(bad)[0])
+        dr.eval(image, counters)
+        if bad_samples:
+            mi.Log(mi.LogLevel.Warn, f"{bad_samples} sample(s) with values that are not finite were dropped.")
+        self.statistics = {"gather_points": points.count, **found, "seconds": start.clock.seconds}
+        self.statistics["dropped"] = self.statistics.get("dropped", 0) + bad_samples
+        return image, counters
+
+    def describe(self) -> dict:
+        """Properties and their values, for ``to_string`` and file metadata."""
+        depth = -1 if math.isinf(self.max_depth) else self.max_depth
+        return {"max_depth": depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
+
+    def to_string(self):
+        """One line a property, as Mitsuba's plugins print themselves."""
+        lines = ",\n".join(f"  {name} = {value}" for name, value in self.describe().items())
+        return f"{type(self).__name__}[\n{lines}\n]"
+
+    def render_forward(self, *args, **kwargs):
+        """Not supported: what is sampled is chosen by what was seen, which is not continuous."""
+        raise NotImplementedError(f"{type(self).__name__} cannot be differentiated: use Mitsuba's prb integrators.")
+
+    def render_backward(self, *args, **kwargs):
+        """Not supported: what is sampled is chosen by what was seen, which is not continuous."""
+        raise NotImplementedError(f"{type(self).__name__} cannot be differentiated: use Mitsuba's prb integrators.")
