@@ -19,7 +19,8 @@ from vpl.shared_samples import share_samples
 from vpl.surfaces import Batch
 
 from . import properties
-from .common import AOVS, Clock, ManyLightIntegrator, Shaded, Shading
+from .common import AOVS, ManyLightIntegrator, Shaded, Shading
+from .gathering import Clock
 from .manual import manual_page
 
 # Pairs held before they are evaluated: bounds the memory whatever the image and the error

@@ -10,7 +10,8 @@ from vpl.arrays import download, upload
 from vpl.cuts import evaluate_cuts, limited_cuts
 
 from . import properties
-from .common import Clock, ManyLightIntegrator, Shaded, Shading
+from .common import ManyLightIntegrator, Shaded, Shading
+from .gathering import Clock
 from .manual import manual_page
 
 # A point's radiance is estimated from coarse cuts at every eighth point, averaged over sixteen neighbours on the

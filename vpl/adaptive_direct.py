@@ -1,8 +1,8 @@
 """Direct light at all gather points of an image, from few sources or many [IAS].
 
-Points become sites, sites form groups, groups get their cuts through the sources; then every group is lit by the
-cheaper of two ways: by iterative adaptive sampling (:mod:`vpl.site_passes`) or, where its sources are few, by summing over all
-of them (:mod:`vpl.all_sources`).
+Points become sites, sites form groups, groups get their cuts through the sources; then each is lit by the cheaper of two
+ways: by iterative adaptive sampling (:mod:`vpl.site_passes`) or, where its sources are few, by summing over all of them
+(:mod:`vpl.all_sources`).
 
 [IAS] Donikian et al. 2006, Accurate direct illumination using iterative adaptive sampling.
 """
