@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import drjit as dr
 import mitsuba as mi
 
 from vpl.adaptive_direct import FIELDS, DirectOptions, light_directly
@@ -9,6 +12,7 @@ from vpl.sampling import derived_seed
 from vpl.sources import Sources
 
 from . import properties
+from .bands import fits_one_band, render_in_bands
 from .gathering import GatheringIntegrator, Start, whole_sum
 from .manual import direct_manual_page
 
@@ -101,6 +105,7 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
 
     def __init__(self, props):
         super().__init__(props, 2)
+        self._in_base, self._grid = False, None
         self.error = properties.number(props, "error", 0.03, 1e-4)
         self.dark_floor = properties.number(props, "dark_floor", 0.1, 0)
         self.max_samples = properties.integer(props, "max_samples", 20_000, 1)
@@ -128,6 +133,34 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
             self.samples_per_cluster, self.min_samples, self.bsdf_share, evaluated, 1.0 if evaluated else 0.0,
             self.combine == "inverse_variance", self.antialiasing, self.time,
         )  # fmt: skip
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """Render as Mitsuba does, but large images in bands of rows; see :mod:`integrators.bands`."""
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        samples = spp or sensor.sampler().sample_count()
+        # The base class calls this method again
+        if self._in_base or self.samples_per_pass < samples or fits_one_band(sensor.film(), samples):
+            self._in_base = True
+            try:
+                return super().render(scene, sensor, seed, spp, develop, evaluate)
+            finally:
+                self._in_base = False
+        with dr.suspend_grad():
+            render_in_bands(self, scene, sensor, int(mi.UInt32(seed)[0]), samples, partial(self._trace_band, scene))
+        if develop:
+            return sensor.film().develop()
+        return mi.TensorXf()
+
+    def _trace_band(self, scene, sampler, ray, grid):
+        self._grid = grid
+        try:
+            return self.sample(scene, sampler, ray)
+        finally:
+            self._grid = None
+
+    def pixel_grid(self, scene, sampler):
+        """How the camera rays of this pass or band lie in the image."""
+        return self._grid or super().pixel_grid(scene, sampler)
 
     def light(self, scene, sampler, start: Start):
         """Direct light of all emitters; see :func:`vpl.adaptive_direct.light_directly`."""

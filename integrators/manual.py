@@ -123,8 +123,7 @@ mirrors, glass and masks are followed, but no light that was reflected by a matt
 
     - Surfaces only: a scene with a participating medium is refused.
     - ``*_rgb`` and ``*_mono`` variants only. Not differentiable.
-    - All emitters of Mitsuba. Kernels do not grow with their number; cylinders and textured spheres and disks are the
-      exception.
+    - All emitters of Mitsuba. Kernels do not grow with their number, but for cylinders and textured disks.
     - Point lights, spots and directional emitters are blocked by masks and thin glass, as in ``path``.
 """
 

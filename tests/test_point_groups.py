@@ -252,8 +252,7 @@ def test_cuts_of_one_group_do_not_depend_on_the_others():
     cuts = cut_clusters(nodes, groups, 0.02)
     assert len(np.unique(cuts.size)) > 3
     for g in range(groups.count):
-        alone = PointGroups(*(x[g : g + 1] for x in (groups.low, groups.high, groups.axis, groups.cone_cos)))
-        assert cut_of(cut_clusters(nodes, alone, 0.02), 0).tolist() == cut_of(cuts, g).tolist()
+        assert cut_of(cut_clusters(nodes, groups.select([g]), 0.02), 0).tolist() == cut_of(cuts, g).tolist()
 
 
 @pytest.mark.parametrize(("radius", "wide"), [(0.0, False), (0.15, False), (0.2, True)])

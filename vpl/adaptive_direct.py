@@ -1,8 +1,8 @@
 """Direct light at all gather points of an image, from few sources or many [IAS].
 
-Points become sites, sites form groups, groups get their cuts through the sources; then each is lit by the cheaper of two
-ways: by iterative adaptive sampling (:mod:`vpl.site_passes`) or, where its sources are few, by summing over all of them
-(:mod:`vpl.all_sources`).
+Points become sites, sites form groups, groups get their cuts through the sources; then each is lit by the cheaper of
+two ways: by iterative adaptive sampling (:mod:`vpl.site_passes`) or, where its sources are few, by summing over all of
+them (:mod:`vpl.all_sources`).
 
 [IAS] Donikian et al. 2006, Accurate direct illumination using iterative adaptive sampling.
 """
@@ -50,6 +50,7 @@ class DirectOptions:
     max_samples: int = 20000
     samples_per_cluster: float = 1.5
     least_samples: int = 50
+    most_samples: int = 400
     bsdf_share: float = 0.125
     evaluated: bool = True
     prior: float = 1.0

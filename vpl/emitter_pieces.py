@@ -2,7 +2,7 @@
 
 Sampling a point on an emitter, or the density of having sampled it, then needs no virtual call: kernels stay as small
 as they are for one emitter, however many shapes the scene has.  Shapes of another form (cylinders, for example) stay
-whole and are sampled by their own routine; so are spheres with a textured emission.
+whole and are sampled by their own routine; so are disks with a textured emission.
 """
 
 from __future__ import annotations
@@ -55,6 +55,7 @@ class EmitterPieces:
         self._first_piece = upload(mi.UInt32, np.cumsum(counts) - counts)
         self._has_meshes = upload(mi.UInt32, np.array([_is_mesh(shape) for shape in shapes], np.uint32))
         self._kinds = set(np.unique(kind).tolist())
+        self._hollow = bool((first[kind == SPHERE, 1] < 0).any())
         self._bound(kind, corner, first, second, normal, size, row, shapes)
 
     def _store(self, kind, corner, first, second, normal, size, row):
@@ -76,7 +77,7 @@ class EmitterPieces:
         lengths = np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)
         # An ellipse lies within the sum of its half-axes whatever their angle
         self.radius[disk] = np.hypot(*lengths)[disk]
-        self.radius[sphere] = lengths[0][sphere]
+        self.radius[sphere] = first[sphere, 0]
         for index in np.flatnonzero(kind == SHAPE):
             box = shapes[row[index]].bbox()
             low, high = np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel()
@@ -110,14 +111,13 @@ class EmitterPieces:
         pdf = _flat_density(interaction.p, p, normal, size)
         found = PieceSample(p, normal, self._texture_coordinates(piece, a, b, active), pdf)
         if SPHERE in self._kinds:
-            found = select_record(
-                kind == SPHERE, _sample_sphere(interaction.p, corner, first.x, sample, found.uv), found
-            )
+            of_sphere = self._sample_sphere(interaction.p, corner, first, second, normal, size, sample)
+            found = select_record(kind == SPHERE, of_sphere, found)
         if SHAPE in self._kinds:
             whole = active & (kind == SHAPE)
-            ds = self._area.shape(row, whole).sample_direction(interaction, sample, whole)
-            facing = dr.dot(ds.d, ds.n) < 0
-            other = PieceSample(ds.p, ds.n, ds.uv, dr.select(facing, ds.pdf, 0))
+            # By area, because texture coordinates come with positions only
+            ps = self._area.shape(row, whole).sample_position(interaction.time, sample, whole)
+            other = PieceSample(ps.p, ps.n, ps.uv, _flat_density(interaction.p, ps.p, ps.n, size))
             found = select_record(whole, other, found)
         active = active & (found.pdf > 0)
         radiance = self._area.emitted_in_front(row, found, active)
@@ -132,23 +132,44 @@ class EmitterPieces:
         piece = dr.gather(mi.UInt32, self._first_piece, row, active) + dr.select(mesh, preliminary.prim_index, 0)
         kind, corner, first, second, normal, size, _ = self._fetch(piece, active)
         p = ray(preliminary.t)
-        round_one = kind == SPHERE
-        normal = mi.Normal3f(dr.select(round_one, dr.normalize(p - corner), normal))
-        pdf = _flat_density(ray.o, p, normal, size)
+        hit = PieceSample(
+            p, normal, self._coordinates_of(piece, p, corner, first, second, active),
+            _flat_density(ray.o, p, normal, size),
+        )  # fmt: skip
         if SPHERE in self._kinds:
-            outside = dr.dot(ray.d, normal) < 0
-            pdf = dr.select(round_one, dr.select(outside, _sphere_density(ray.o, corner, first.x), 0), pdf)
-        hit = PieceSample(p, normal, self._coordinates_of(piece, p, corner, first, second, active), pdf)
+            outward = mi.Normal3f(dr.normalize(p - corner))
+            of_sphere = PieceSample(p, outward * first.y, self._on_sphere(outward, second, normal, first.z), None)
+            by_area = _flat_density(ray.o, p, of_sphere.n, size)
+            seen = dr.select(dr.dot(ray.d, of_sphere.n) < 0, _sphere_density(ray.o, corner, first.x), 0)
+            of_sphere.pdf = dr.select(first.y > 0, seen, by_area)
+            hit = select_record(kind == SPHERE, of_sphere, hit)
         if SHAPE in self._kinds:
             whole = active & (kind == SHAPE)
             si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, whole)
-            ds = dr.zeros(mi.DirectionSample3f, dr.width(p))
-            ds.p, ds.n, ds.uv, ds.d, ds.dist = si.p, si.n, si.uv, ray.d, preliminary.t
-            pdf = self._area.shape(row, whole).pdf_direction(si, ds, whole)
-            other = PieceSample(si.p, si.n, si.uv, dr.select(dr.dot(ray.d, si.n) < 0, pdf, 0))
+            other = PieceSample(si.p, si.n, si.uv, _flat_density(ray.o, si.p, si.n, size))
             hit = select_record(whole, other, hit)
         shown = active & (hit.pdf > 0)
         return piece, active, self._area.emitted_in_front(row, hit, shown), hit.pdf & shown
+
+    def _sample_sphere(self, origin, center, first, second, axis, size, sample) -> PieceSample:
+        """A point on a sphere: on its visible part, uniform in solid angle, or by area where it emits inwards."""
+        n = _visible_normal(origin, center, first.x, sample)
+        if self._hollow:
+            n = dr.select(first.y > 0, n, mi.Normal3f(mi.warp.square_to_uniform_sphere(sample)))
+        p = center + first.x * n
+        pdf = dr.select(
+            first.y > 0, _sphere_density(origin, center, first.x), _flat_density(origin, p, n * first.y, size)
+        )
+        return PieceSample(p, n * first.y, self._on_sphere(n, second, axis, first.z), pdf)
+
+    def _on_sphere(self, outward, across, axis, handed):
+        """Texture coordinates of a point of a sphere with the given x and z axes."""
+        if self._uv is None:
+            return mi.Point2f(0)
+        y = dr.cross(axis, across) * handed
+        azimuth = dr.atan2(dr.dot(outward, y), dr.dot(outward, across))
+        azimuth = dr.select(azimuth < 0, azimuth + dr.two_pi, azimuth)
+        return mi.Point2f(azimuth * dr.inv_two_pi, dr.safe_acos(dr.dot(outward, axis)) * dr.inv_pi)
 
     def _texture_coordinates(self, piece, a, b, active):
         if self._uv is None:
@@ -187,8 +208,8 @@ def _sphere_density(origin, center, radius):
     return dr.select(cap > 0, dr.inv_two_pi / cap, 0)
 
 
-def _sample_sphere(origin, center, radius, sample, uv) -> PieceSample:
-    """A point on the visible part of a sphere, uniform in solid angle."""
+def _visible_normal(origin, center, radius, sample):
+    """Normal of a sphere at a point that is uniform in solid angle as seen from ``origin``."""
     cap, distance2 = _cap(origin, center, radius)
     below = sample.x * cap  # 1 - cosine, which single precision keeps for small spheres far away
     sine2 = below * (2 - below)
@@ -197,8 +218,7 @@ def _sample_sphere(origin, center, radius, sample, uv) -> PieceSample:
     local = mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), 1 - below)
     direction = mi.Frame3f(dr.normalize(center - origin)).to_world(local)
     distance = dr.sqrt(distance2) * (1 - below) - dr.safe_sqrt(dr.square(radius) - distance2 * sine2)
-    n = mi.Normal3f(dr.normalize(origin + distance * direction - center))
-    return PieceSample(center + radius * n, n, uv, dr.select(cap > 0, dr.inv_two_pi / cap, 0))
+    return mi.Normal3f(dr.normalize(origin + distance * direction - center))
 
 
 # ---- Reading shapes
@@ -208,8 +228,11 @@ _COLUMNS = ("kind", "corner", "first", "second", "normal", "uv")
 
 @dataclass
 class _Pieces:
-    """Pieces of one shape: corner, edges (half-axes of disks, (radius, 0, 0) of spheres), normal; ``uv`` (k, 6):
-    texture coordinates at the corner and their change along both edges."""
+    """Pieces of one shape: corner, edges (half-axes of disks), normal; ``uv`` (k, 6): texture coordinates at the corner
+    and their change along both edges.
+
+    Of spheres: centre, (radius, side that emits: 1 is outside, handedness of the frame), x axis, z axis.
+    """
 
     kind: np.ndarray
     corner: np.ndarray
@@ -254,11 +277,13 @@ def _pieces_of(shape, textured: bool) -> _Pieces:
     if name == "Rectangle":
         normal = np.linalg.inv(linear).T[:, 2] * (-1 if shape.has_flipped_normals() else 1)
         return _one(PARALLELOGRAM, origin - linear[:, 0] - linear[:, 1], 2 * linear[:, 0], 2 * linear[:, 1], normal)
-    # Its texture coordinates are polar, those of a sphere are too
+    # Its texture coordinates are polar
     if name == "Disk" and not textured:
         return _one(DISK, origin, linear[:, 0], linear[:, 1], np.linalg.inv(linear).T[:, 2])
-    if name == "Sphere" and not textured and not shape.has_flipped_normals():
-        return _one(SPHERE, origin, (np.linalg.norm(linear[:, 0]), 0, 0), (0, 0, 0), (0, 0, 1))
+    if name == "Sphere":
+        radius = np.linalg.norm(linear[:, 0])
+        facts = (radius, -1 if shape.has_flipped_normals() else 1, np.sign(np.linalg.det(linear)))
+        return _one(SPHERE, origin, facts, linear[:, 0] / radius, linear[:, 2])
     return _one(SHAPE, (0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 1))
 
 
@@ -278,6 +303,10 @@ def _triangles(mesh, textured: bool) -> _Pieces:
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     # A triangle without area is never drawn; its normal only has to be a number
     normal = np.where(length > 0, normal / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
+    if mesh.has_vertex_normals() and not mesh.has_face_normals():
+        # Mitsuba lets meshes emit to the side of their shading normals, which mirrored ones have the other way round
+        shading = download(parameters["vertex_normals"]).astype(np.float64).reshape(-1, 3)[faces].sum(1)
+        normal = np.where(np.einsum("ij,ij->i", normal, shading)[:, None] < 0, -normal, normal)
     if mesh.has_flipped_normals():
         normal = -normal
     uv = np.tile([0.0, 0, 1, 0, 0, 1], (len(faces), 1))

@@ -108,7 +108,8 @@ class SitePasses:
 
     def _full_pass(self) -> np.ndarray:
         """Samples of each half in a whole pass [IAS section 5.8], (2, s); 0 for sites that no cluster lights."""
-        of_pixel = np.maximum(self.options.samples_per_cluster * self.size, self.options.least_samples)
+        options = self.options
+        of_pixel = np.clip(options.samples_per_cluster * self.size, options.least_samples, options.most_samples)
         half = np.maximum(np.ceil(of_pixel * self.share / 2).astype(np.int64), _LEAST_HALF)
         return np.where(self.size > 0, half, 0) * np.ones((2, 1), np.int64)
 

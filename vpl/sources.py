@@ -186,7 +186,10 @@ class Sources:
             dr.gather(type(self._cumulative), self._cumulative, index, active)
             for index in (rank, rank + 1, node.first, node.last)
         )
-        return dr.select(node.last == node.first + 1, 1, mi.Float((high - low) / (end - begin)))
+        # Where the sources of a node vanish beside those before it, :func:`find_interval` always finds the last
+        rise = end - begin
+        share = dr.select(rise > 0, (high - low) / rise, dr.select(rank + 1 == node.last, 1, 0))
+        return dr.select(node.last == node.first + 1, 1, mi.Float(share))
 
     def sample(self, rank, interaction, member, sample, active) -> SourceSample:
         """A point on the source of each rank as seen from ``interaction``; numbers as in the classes called."""
@@ -243,5 +246,7 @@ class Sources:
             radiance = dr.select(sky, self._regions.radiance(ray.d, sky), radiance)
             row, pdf = dr.select(sky, region + int(self._begin[4]), row), dr.select(sky, density, pdf)
             found |= sky
+        if not self.extended:
+            return radiance, mi.UInt32(self.count), pdf
         rank = dr.gather(mi.UInt32, self._rank, row, found)
         return radiance & found, dr.select(found, rank, self.count), pdf & found
