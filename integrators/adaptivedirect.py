@@ -49,6 +49,10 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
        - |int|
        - Fewest emitter samples of a pixel in a pass. (Default: 50)
 
+     * - pass_limit
+       - |int|
+       - Most emitter samples of a pixel in a pass, at least ``min_samples``. (Default: 400)
+
      * - guide
        - |string|
        - How clusters are chosen. ``evaluated``: by what they would send if nothing was between, corrected by what
@@ -99,7 +103,7 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
 
     offered_aovs = FIELDS
     own_properties = (
-        "lights", "cluster_angle", "max_passes", "samples_per_cluster", "min_samples", "guide", "combine",
+        "lights", "cluster_angle", "max_passes", "samples_per_cluster", "min_samples", "pass_limit", "guide", "combine",
         "antialiasing",
     )  # fmt: skip
 
@@ -121,6 +125,7 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
         self.max_passes = properties.integer(props, "max_passes", 15, 1)
         self.samples_per_cluster = properties.number(props, "samples_per_cluster", 1.5, 0)
         self.min_samples = properties.integer(props, "min_samples", 50, 1)
+        self.pass_limit = properties.integer(props, "pass_limit", 400, self.min_samples)
         self.antialiasing = properties.boolean(props, "antialiasing", True)
         self.guide = properties.choice(props, "guide", "evaluated", ("evaluated", "sampled"))
         self.combine = properties.choice(props, "combine", "fixed", ("fixed", "inverse_variance"))
@@ -129,9 +134,11 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
         """The properties as the renderer's core takes them."""
         evaluated = self.guide == "evaluated"
         return DirectOptions(
-            self.error, self.dark_floor, self.lights, self.cluster_angle, self.max_passes, self.max_samples,
-            self.samples_per_cluster, self.min_samples, self.bsdf_share, evaluated, 1.0 if evaluated else 0.0,
-            self.combine == "inverse_variance", self.antialiasing, self.time,
+            error=self.error, dark_floor=self.dark_floor, lights=self.lights, solid_angle=self.cluster_angle,
+            max_passes=self.max_passes, max_samples=self.max_samples, samples_per_cluster=self.samples_per_cluster,
+            least_samples=self.min_samples, most_samples=self.pass_limit, bsdf_share=self.bsdf_share,
+            evaluated=evaluated, prior=1.0 if evaluated else 0.0,
+            inverse_variance=self.combine == "inverse_variance", antialiasing=self.antialiasing, time=self.time,
         )  # fmt: skip
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):

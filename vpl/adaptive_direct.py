@@ -33,12 +33,14 @@ from .unoccluded_passes import UnoccludedPasses
 
 # Entries (pairs of a site and a cluster) that are worked on at a time: some 28 bytes each
 _ENTRIES = 12_000_000
+# Sums trace twice as many rays in a second as passes do, have no noise, and two passes are needed at least
+_SUM_WORTH = 4
 # Sites of the pilot, which finds the mean radiance of the image
 _PILOT_SITES = 4096
 FIELDS = ("noise", "passes", "shadow_rays", "regions", "visible")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DirectOptions:
     """What users choose; see the plugin ``adaptivedirect``."""
 
@@ -131,18 +133,27 @@ class _BatchLight:
         """Cuts of all groups, and which of them sum over all sources."""
         options, nodes = self.options, sources.nodes
         self._cuts = cut_clusters(nodes, bounds, 0.0 if options.lights == "unoccluded" else options.solid_angle)
-        held = (nodes.last.astype(np.int64) - nodes.first)[self._cuts.node]
-        sources_of = np.bincount(np.repeat(np.arange(bounds.count), self._cuts.size), held, bounds.count)
-        self._summed = (
-            sources_of <= _few(self._cuts.size, options)
-            if options.lights == "auto"
-            else np.full(bounds.count, options.lights == "all")
-        )
+        if options.lights == "auto":
+            self._summed = self._worth_summing(nodes, bounds.count)
+        else:
+            self._summed = np.full(bounds.count, options.lights == "all")
         self._leaves = all_leaves(nodes, bounds, np.flatnonzero(self._summed))
         # Emitter samples alone are enough for small sources and matt surfaces, unless light comes by way of a mirror
         self._bsdf = np.ones(bounds.count) * options.bsdf_share
         if isinstance(self.batch.surfaces, LambertianSurface) and self._beyond is None:
             self._bsdf *= has_wide_source(sources.nodes, bounds, self._cuts)
+
+    def _worth_summing(self, nodes, count: int) -> np.ndarray:
+        """Groups whose sources, all without extent, are so few that to sum over them all is cheaper, (g,) bool."""
+        if self._beyond is not None:
+            return np.zeros(count, bool)
+        group, node = np.repeat(np.arange(count), self._cuts.size), self._cuts.node
+        held, extended = (
+            np.bincount(group, values, count)
+            for values in ((nodes.last.astype(np.int64) - nodes.first)[node], nodes.extended[node])
+        )
+        a_pass = np.maximum(self.options.samples_per_cluster * self._cuts.size, self.options.least_samples)
+        return (extended == 0) & (held <= _SUM_WORTH * a_pass)
 
     def pilot(self, seed: int) -> float:
         """Mean radiance of the batch's points, roughly: one pass over some of the groups."""
@@ -186,9 +197,9 @@ class _BatchLight:
             return part, passes.result()
         part, leaves = _select(self.sites, self._leaves, groups)
         share = part.points / self.grid.samples
-        rounds = SourceRounds(
-            self._scenery(part, leaves), part, share, self._bsdf[groups][part.group], level, self.options
-        )
+        # Where it was chosen by itself, no source has an extent
+        bsdf = self._bsdf[groups][part.group] * (self.options.lights == "all")
+        rounds = SourceRounds(self._scenery(part, leaves), part, share, bsdf, level, self.options)
         rounds.run(seed, halt)
         return part, rounds.result()
 
@@ -200,11 +211,6 @@ class _BatchLight:
             np.repeat(np.arange(part.count), part.points), self._standing[part.order] == part.order, part.count
         )
         return np.concatenate([radiance, np.stack([noise, passes, rays / part.points, regions, visible], 1)], 1)
-
-
-def _few(clusters: np.ndarray, options: DirectOptions) -> np.ndarray:
-    """Up to how many sources summing over all of them is the cheaper way, for groups with so many clusters."""
-    return np.maximum(options.samples_per_cluster * clusters, options.least_samples)
 
 
 def _groups_of(standing, pixel, width, position, normal) -> np.ndarray:

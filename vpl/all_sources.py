@@ -35,7 +35,8 @@ class SourceRounds:
         if table.entries == 0:
             return
         size = download(table.size).astype(np.int64)
-        halves = 2 if self.scenery.sources.extended else 1
+        extended = self.scenery.sources.nodes.extended[download(table.node)].any() or self.bsdf_share.any()
+        halves = 2 if extended else 1
         active = np.flatnonzero(size)
         for number in range(halves * self.options.max_passes):
             if len(active) == 0 or stopped():

@@ -31,7 +31,8 @@ class Nodes:
     the centre means nothing. ``axis`` (m, 3), ``cone_cos`` (m,): cone of the directions that sources face (-1: all);
     for nodes at infinity, of the directions from which their light comes. ``intensity`` (m,): radiant intensity, or
     irradiance of nodes at infinity. ``centroid`` (m, 3): mean position by intensity. ``escape`` (m,): the node after
-    this node's subtree. ``first``, ``last`` (m,): ranks of its sources. All float64 or uint32.
+    this node's subtree. ``first``, ``last`` (m,): ranks of its sources. All float64 or uint32. ``extended`` (m,): how
+    many of them have an extent.
     """
 
     center: np.ndarray
@@ -43,6 +44,7 @@ class Nodes:
     escape: np.ndarray
     first: np.ndarray
     last: np.ndarray
+    extended: np.ndarray
 
     @property
     def count(self) -> int:
@@ -107,7 +109,9 @@ class Sources:
         finite, rows = self._finite_sources()
         forest = build_cluster_forest(*finite)
         order = rows[forest.leaf_order]
-        nodes = Nodes(**{field.name: getattr(forest, field.name) for field in fields(Nodes)})
+        extended = np.cumsum(np.concatenate([[0], (order >= self._begin[2])]))
+        counts = extended[forest.last] - extended[forest.first]
+        nodes = Nodes(**{f.name: counts if f.name == "extended" else getattr(forest, f.name) for f in fields(Nodes)})
         single, more = self._single_nodes(scene, len(order))
         joined = Nodes(*(np.concatenate([getattr(nodes, f.name), getattr(single, f.name)]) for f in fields(Nodes)))
         joined.escape[nodes.count :] = np.arange(nodes.count, joined.count) + 1
@@ -149,7 +153,7 @@ class Sources:
         ranks = (rank + np.arange(count)).astype(np.uint32)
         nodes = Nodes(
             nothing, -np.ones(count), axis[keep], cone_cos[keep], intensity[keep], nothing,
-            np.zeros(count, np.uint32), ranks, ranks + np.uint32(1),
+            np.zeros(count, np.uint32), ranks, ranks + np.uint32(1), (keep >= suns.count).astype(np.int64),
         )  # fmt: skip
         return nodes, self._begin[3] + keep
 
