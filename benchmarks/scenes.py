@@ -20,8 +20,9 @@ _HEIGHTS = {"cornell": 256, "glossy": 256, "everything8003": 256, "bistro_interi
 
 def scene_file(name: str) -> Path:
     """The XML file of a scene; FileNotFoundError with the reason where it is absent."""
-    if name in ("cornell", "glossy", "hall"):
-        return PROJECT / "scenes" / f"{name}.xml"
+    own = PROJECT / "scenes" / f"{name}.xml"
+    if own.exists():
+        return own
     path = SHARED / "scenes" / name / "scene.xml"
     if not path.exists():
         raise FileNotFoundError(f"{path} is absent: the scenes of other people are not part of this project")

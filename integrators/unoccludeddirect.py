@@ -61,8 +61,8 @@ class UnoccludedDirectIntegrator(AdaptiveDirectIntegrator):
         # As many passes as the limit of samples allows
         return DirectOptions(
             error=self.error, dark_floor=self.dark_floor, lights="unoccluded", max_samples=self.max_samples,
-            max_passes=1 << 20, least_samples=self.samples_per_ray, most_samples=self.samples_per_ray, bsdf_share=self.bsdf_share,
-            antialiasing=False, time=self.time,
+            max_passes=1 << 20, least_samples=self.samples_per_ray, most_samples=self.samples_per_ray,
+            bsdf_share=self.bsdf_share, antialiasing=False, time=self.time,
         )  # fmt: skip
 
 

@@ -1,0 +1,236 @@
+"""``adaptivedirect`` against its reference method, against the sum over all lights, and against Mitsuba.
+
+    ./run -- python benchmarks/adaptivedirect.py [--scenes NAME ...] [--parts table paper lights cold]
+
+table   direct light (``max_depth`` 2) of each scene at the same convergence rule: seconds, shadow rays per pixel and
+        relMSE of ``adaptivedirect`` and ``unoccludeddirect``; and how long that one, ``lights="all"``, ``direct`` and
+        ``path`` would take for the same relMSE.
+paper   the same with the method as the paper prints it: ``guide="sampled"``, ``combine="inverse_variance"``.
+lights  the hall with 100 to 100 000 lights: seconds to the same error.
+cold    first render in a fresh process with an empty kernel cache.
+
+Images are rendered with 16 camera rays a pixel and compared with path-traced references (made once, then kept), whose
+own noise is taken off. Variance falls as 1 / time, so a method's time for another error is its own time, scaled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+mi.set_variant("llvm_ad_rgb")
+
+import integrators  # noqa: E402, F401
+from benchmarks import scenes  # noqa: E402
+from comparison import references  # noqa: E402
+from comparison.metrics import compare  # noqa: E402
+from comparison.scene_files import SceneFile  # noqa: E402
+
+NAMES = (
+    "kitchen_lamps", "kitchen_windows", "forest_lights", "concourse", "everything8003", "bistro_interior", "staircase2",
+    "living_room",
+)  # fmt: skip
+RAYS, REPEATS, REFERENCE_SPP = 16, 3, 4096
+PAPER = {"guide": "sampled", "combine": "inverse_variance", "lights": "clusters"}
+
+
+class Problem:
+    """A scene with its reference, and renders of it with their times and errors."""
+
+    def __init__(self, name: str, width: int, reference_spp: int):
+        self.scene = scenes.load(name, width)
+        size = self.scene.sensors()[0].film().crop_size()
+        self.pixels = int(size[0]) * int(size[1])
+        file = SceneFile(
+            str(scenes.scene_file(name)), {"max_depth": "2", "resx": str(int(size[0])), "resy": str(int(size[1]))}
+        )
+        self.reference = references.path_traced(file, reference_spp, references.default_cache())
+
+    def error(self, image) -> float:
+        """relMSE of an image, its largest 0.1% of pixels left out and the reference's noise taken off."""
+        known = self.reference
+        return compare(np.array(image, np.float64)[..., :3], known.image, known.standard_error)["relmse_trimmed"]
+
+    def race(self, methods: dict) -> dict:
+        """Render with each of {label: (integrator, samples)}, in turn: {label: (seconds, relMSE, rays per pixel)}."""
+        for integrator, samples in methods.values():
+            mi.render(self.scene, integrator=integrator, spp=samples, seed=99)
+        seconds, errors, rays = ({label: [] for label in methods} for _ in range(3))
+        for seed in range(REPEATS):
+            for label, (integrator, samples) in methods.items():
+                image, spent = scenes.timed(
+                    lambda: mi.render(self.scene, integrator=integrator, spp=samples, seed=seed)  # noqa: B023
+                )
+                seconds[label].append(spent)
+                errors[label].append(self.error(image))
+                rays[label].append(getattr(integrator, "statistics", {}).get("shadow_rays", 0) / self.pixels)
+        return {
+            label: (float(np.median(seconds[label])), float(np.mean(errors[label])), float(np.mean(rays[label])))
+            for label in methods
+        }
+
+
+def plugin(name: str, **more):
+    """An integrator for direct light."""
+    return mi.load_dict({"type": name, **more})
+
+
+def table(names, options) -> None:
+    """Part "table"."""
+    print(f"\n## at the same rule, error {100 * options.error:g}%, {RAYS} camera rays, width {options.width}, warm")
+    print(
+        "scene | adaptive: s, rays/px, relMSE | unoccluded: s, rays/px, relMSE | faster | fewer rays | at equal relMSE:"
+        " unoccluded | all | direct | path"
+    )
+    ratios = {label: [] for label in ("faster", "fewer", "unoccluded", "all", "direct", "path")}
+    for name in names:
+        problem = Problem(name, options.width, options.reference_spp)
+        found = problem.race(
+            {
+                "adaptive": (plugin("adaptivedirect", error=options.error), RAYS),
+                "unoccluded": (plugin("unoccludeddirect", error=options.error), RAYS),
+                "all": (plugin("adaptivedirect", error=options.error, lights="all"), RAYS),
+                "direct": (plugin("direct", emitter_samples=1, bsdf_samples=1), options.spp),
+                "path": (plugin("path", max_depth=2), options.spp),
+            }
+        )
+        seconds, error, rays = found["adaptive"]
+        slower = {label: found[label][0] * found[label][1] / (seconds * error) for label in found}
+        base = found["unoccluded"]
+        slower |= {"faster": base[0] / seconds, "fewer": base[2] / rays}
+        for label in ratios:
+            ratios[label].append(slower[label])
+        print(
+            f"{name} | {seconds:.2f}, {rays:.0f}, {error:.5f} | {base[0]:.2f}, {base[2]:.0f}, {base[1]:.5f} | "
+            f"{slower['faster']:.1f} | {slower['fewer']:.1f} | {slower['unoccluded']:.1f} | {slower['all']:.1f} | "
+            f"{slower['direct']:.1f} | {slower['path']:.1f}",
+            flush=True,
+        )
+    means = {label: f"{scenes.geometric_mean(values):.1f}" for label, values in ratios.items()}
+    print("geometric means:", ", ".join(f"{label} {value}" for label, value in means.items()))
+
+
+def as_printed(names, options) -> None:
+    """Part "paper": what the departures from the paper bring."""
+    print("\n## the method as printed, and with what was changed, at the same rule")
+    print("scene | ours: s, rays/px, relMSE, bias | as printed: s, rays/px, relMSE, bias | ours at equal relMSE: times")
+    for name in names:
+        problem = Problem(name, options.width, options.reference_spp)
+        methods = {
+            "ours": (plugin("adaptivedirect", error=options.error, lights="clusters"), RAYS),
+            "printed": (plugin("adaptivedirect", error=options.error, pass_limit=20_000, **PAPER), RAYS),
+        }
+        found = problem.race(methods)
+        bias = {}
+        for label, (integrator, samples) in methods.items():
+            image = np.array(mi.render(problem.scene, integrator=integrator, spp=samples, seed=7))
+            bias[label] = 100 * (image.mean() / problem.reference.image.mean() - 1)
+        columns = [
+            ", ".join([f"{found[label][0]:.2f}", f"{found[label][2]:.0f}", f"{found[label][1]:.5f}",
+                       f"{bias[label]:+.2f}%"])
+            for label in ("ours", "printed")
+        ]  # fmt: skip
+        ratio = found["printed"][0] * found["printed"][1] / (found["ours"][0] * found["ours"][1])
+        print(f"{name} | {columns[0]} | {columns[1]} | {ratio:.1f}", flush=True)
+
+
+def number_of_lights(options) -> None:
+    """Part "lights"."""
+    print(f"\n## the hall with N lights: error {100 * options.error:g}% (compared with renders of 1% and 64 rays)")
+    print("lights | load s | auto: s, rays/px, relMSE | all: s, rays/px, relMSE | time to equal relMSE, all / auto")
+    for count in (100, 1000, 10_000, 100_000):
+        with tempfile.TemporaryDirectory() as folder:
+            file = str(Path(folder) / "hall.xml")
+            generator = str(scenes.PROJECT / "scenes" / "hall.py")
+            subprocess.run([sys.executable, generator, "--lights", str(count), "--output", file], check=True)
+            scene, load = scenes.timed(lambda: mi.load_file(file, resx=options.width, resy=options.width * 9 // 16))  # noqa: B023
+        fine = plugin("adaptivedirect", error=0.01, max_passes=40)
+        exact = np.mean([np.array(mi.render(scene, integrator=fine, spp=64, seed=k), np.float64) for k in (8, 9)], 0)
+        pixels = exact.shape[0] * exact.shape[1]
+        results = {}
+        for lights in ("auto", "all"):
+            if lights == "all" and count > 10_000:
+                continue
+            integrator = plugin("adaptivedirect", error=options.error, lights=lights)
+            mi.render(scene, integrator=integrator, spp=RAYS, seed=1)
+            image, seconds = scenes.timed(lambda: mi.render(scene, integrator=integrator, spp=RAYS, seed=0))  # noqa: B023
+            rays = integrator.statistics["shadow_rays"] / pixels
+            results[lights] = seconds, rays, compare(np.array(image, np.float64), exact)["relmse_trimmed"]
+        shown = [", ".join(f"{x:.3g}" for x in results[k]) if k in results else "-" for k in ("auto", "all")]
+        ratio = "-"
+        if "all" in results:
+            ratio = f"{results['all'][0] * results['all'][2] / (results['auto'][0] * results['auto'][2]):.2f}"
+        print(f"{count} | {load:.1f} | {shown[0]} | {shown[1]} | {ratio}", flush=True)
+
+
+_COLD = """
+import sys
+sys.path.insert(0, {project!r})
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+import integrators
+from benchmarks import scenes
+scene = mi.load_file({file!r}, resx=256, resy=144)
+integrator = mi.load_dict({plugin!r})
+print(scenes.timed(lambda: mi.render(scene, integrator=integrator, spp=1, seed=0))[1])
+print(scenes.timed(lambda: mi.render(scene, integrator=integrator, spp=1, seed=1))[1])
+"""
+
+
+def cold_starts(options) -> None:
+    """Part "cold"."""
+    print("\n## first render in a fresh process with an empty kernel cache, and the second (1 sample a pixel)")
+    print("scene | adaptivedirect: first s, second s | path: first s, second s")
+    with tempfile.TemporaryDirectory() as folder:
+        files = {}
+        for count in (100, 1000, 10_000):
+            files[f"hall, {count} lights"] = str(Path(folder) / f"hall{count}.xml")
+            generator = str(scenes.PROJECT / "scenes" / "hall.py")
+            command = [sys.executable, generator, "--lights", str(count), "--output", files[f"hall, {count} lights"]]
+            subprocess.run(command, check=True)
+        for name in scenes.available(["everything8003"]):
+            files[name] = str(scenes.scene_file(name))
+        for name, file in files.items():
+            shown = []
+            for kind in ("adaptivedirect", "path"):
+                with tempfile.TemporaryDirectory() as cache:
+                    code = _COLD.format(project=str(scenes.PROJECT), file=file, plugin={"type": kind, "max_depth": 2})
+                    environment = {**os.environ, "DRJIT_CACHE_DIR": cache}
+                    done = subprocess.run(
+                        [sys.executable, "-c", code], env=environment, check=True, capture_output=True, text=True
+                    )
+                shown.append(", ".join(f"{float(line):.1f}" for line in done.stdout.split()[-2:]))
+            print(f"{name} | {shown[0]} | {shown[1]}", flush=True)
+
+
+def main() -> None:
+    """Parse the command line and run the parts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(NAMES), choices=NAMES)
+    parser.add_argument("--parts", nargs="+", default=["table", "paper", "lights", "cold"])
+    parser.add_argument("--error", type=float, default=0.03, help="the rule of parts table and paper (default: 0.03)")
+    parser.add_argument("--width", type=int, default=256, help="pixels (default: 256)")
+    parser.add_argument("--spp", type=int, default=256, help="samples a pixel of direct and path (default: 256)")
+    parser.add_argument("--reference-spp", type=int, default=REFERENCE_SPP, help="samples a pixel (default: 4096)")
+    options = parser.parse_args()
+    names = scenes.available(options.scenes)
+    if "table" in options.parts:
+        table(names, options)
+    if "paper" in options.parts:
+        as_printed(names, options)
+    if "lights" in options.parts:
+        number_of_lights(options)
+    if "cold" in options.parts:
+        cold_starts(options)
+
+
+if __name__ == "__main__":
+    main()
