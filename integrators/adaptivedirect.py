@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import dataclass, replace
+from time import perf_counter
 
 import drjit as dr
 import mitsuba as mi
 
-from vpl.adaptive_direct import FIELDS, DirectOptions, light_directly
+from vpl.adaptive_direct import FIELDS, DirectOptions, PixelGrid, light_directly
+from vpl.arrays import download
 from vpl.sampling import derived_seed
 from vpl.sources import Sources
 
 from . import properties
-from .bands import fits_one_band, render_in_bands
-from .gathering import GatheringIntegrator, Start, whole_sum
+from .bands import fits_one_band, random_rays, render_in_bands
+from .gathering import GatheringIntegrator, Start, add_statistics, whole_sum
 from .manual import direct_manual_page
+
+_LEVEL_RAYS = 4096
+
+
+@dataclass
+class Band:
+    """What a band of rows knows of the image: how its pixels lie, the mean radiance, and its share of the time."""
+
+    grid: PixelGrid
+    level: float
+    time: float
 
 
 @direct_manual_page
@@ -109,10 +122,10 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
 
     def __init__(self, props):
         super().__init__(props, 2)
-        self._in_base, self._grid = False, None
+        self._in_base, self._band = False, None
         self.error = properties.number(props, "error", 0.03, 1e-4)
         self.dark_floor = properties.number(props, "dark_floor", 0.1, 0)
-        self.max_samples = properties.integer(props, "max_samples", 20_000, 1)
+        self.max_samples = properties.integer(props, "max_samples", 20_000, 1, 100_000)
         self.bsdf_share = properties.number(props, "bsdf_share", 0.125, 0)
         self.regions = properties.integer(props, "regions", 300, 1)
         self.time = properties.number(props, "time", 0.0, 0)
@@ -153,21 +166,40 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
             finally:
                 self._in_base = False
         with dr.suspend_grad():
-            render_in_bands(self, scene, sensor, int(mi.UInt32(seed)[0]), samples, partial(self._trace_band, scene))
-        if develop:
-            return sensor.film().develop()
-        return mi.TensorXf()
+            self._render_bands(scene, sensor, int(mi.UInt32(seed)[0]), samples)
+        return sensor.film().develop() if develop else mi.TensorXf()
 
-    def _trace_band(self, scene, sampler, ray, grid):
-        self._grid = grid
-        try:
-            return self.sample(scene, sampler, ray)
-        finally:
-            self._grid = None
+    def _render_bands(self, scene, sensor, seed: int, samples: int) -> None:
+        """One level of brightness and one budget of time for all bands."""
+        level, start, totals = self._find_level(scene, sensor, derived_seed(seed, 1)), perf_counter(), {}
+
+        def trace(sampler, ray, grid, share):
+            left = max(self.time - (perf_counter() - start), 1e-3) * share if self.time > 0 else 0.0
+            self._band = Band(grid, level, left)
+            try:
+                return self.sample(scene, sampler, ray)
+            finally:
+                self._band = None
+                add_statistics(totals, self.statistics)
+
+        render_in_bands(self, scene, sensor, derived_seed(seed, 2), samples, trace)
+        self.statistics = totals
+
+    def _find_level(self, scene, sensor, seed: int) -> float:
+        """Mean radiance of direct light over the film, from one pass at few points."""
+        start = self.begin(scene, *random_rays(sensor, seed, _LEVEL_RAYS))
+        if start.dark or self.max_depth < 2:
+            return 0.0
+        quick = replace(self.options(), max_passes=1, lights="clusters", antialiasing=False)
+        found = light_directly(
+            scene, start.traits, Sources(scene, start.emitters, self.regions), start.paths.points, PixelGrid(8, 1),
+            self.max_depth, quick, derived_seed(seed, 1), level=0.0,
+        )  # fmt: skip
+        return float(download(found.radiance).sum(dtype="float64")) / (3 * _LEVEL_RAYS)
 
     def pixel_grid(self, scene, sampler):
         """How the camera rays of this pass or band lie in the image."""
-        return self._grid or super().pixel_grid(scene, sampler)
+        return self._band.grid if self._band else super().pixel_grid(scene, sampler)
 
     def light(self, scene, sampler, start: Start):
         """Direct light of all emitters; see :func:`vpl.adaptive_direct.light_directly`."""
@@ -176,17 +208,16 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
             return mi.UnpolarizedSpectrum(0), {}, {"shadow_rays": 0}
         sources = Sources(scene, start.emitters, self.regions)
         start.clock.lap("sources")
+        options, level = self.options(), None
+        if self._band:
+            options, level = replace(options, time=self._band.time), self._band.level
         found = light_directly(
-            scene, start.traits, sources, points, self.pixel_grid(scene, sampler), self.max_depth, self.options(),
-            derived_seed(start.seed, 30), self.should_stop,
+            scene, start.traits, sources, points, self.pixel_grid(scene, sampler), self.max_depth, options,
+            derived_seed(start.seed, 30), self.should_stop, level,
         )  # fmt: skip
         start.clock.lap("direct")
-        counts = {
-            "sources": sources.count,
-            "shadow_rays": whole_sum(found.shadow_rays),
-            "dropped": start.emitters.dropped,
-        }
-        return found.radiance, vars(found), counts
+        counts = {"sources": sources.count, "shadow_rays": whole_sum(found.shadow_rays)}
+        return found.radiance, vars(found), counts | {"dropped": start.emitters.dropped}
 
     def describe(self):
         """All properties and their values."""

@@ -18,9 +18,9 @@ LARGEST_BAND = 1 << 22
 
 
 def rows_of_a_band(film, samples: int) -> int:
-    """Rows that are rendered at a time, a multiple of the blocks' size."""
-    width = int(film.crop_size()[0]) + 2 * _border(film)
-    return max(1, LARGEST_BAND // (width * samples * BLOCK)) * BLOCK
+    """Rows that are rendered at a time, a multiple of the blocks' size where that many fit."""
+    rows = max(1, LARGEST_BAND // ((int(film.crop_size()[0]) + 2 * _border(film)) * samples))
+    return rows if rows < BLOCK else rows - rows % BLOCK
 
 
 def fits_one_band(film, samples: int) -> bool:
@@ -32,8 +32,23 @@ def _border(film) -> int:
     return film.rfilter().border_size() if film.sample_border() else 0
 
 
+def random_rays(sensor, seed: int, count: int):
+    """Sampler and camera rays all over the film."""
+    sampler = sensor.sampler().clone()
+    sampler.set_sample_count(1)
+    sampler.set_samples_per_wavefront(1)
+    sampler.seed(seed, count)
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, sampler.next_2d(), aperture)
+    return sampler, ray
+
+
 def render_in_bands(integrator, scene, sensor, seed: int, samples: int, trace) -> None:
-    """Render into the sensor's film.  ``trace(sampler, ray, grid)`` does what ``integrator.sample`` does."""
+    """Render into the sensor's film.
+
+    ``trace(sampler, ray, grid, share)`` does what ``integrator.sample`` does; ``share``: of the rows that are left,
+    those of the band.
+    """
     film = sensor.film()
     film.prepare(integrator.aov_names())
     border, crop = _border(film), film.crop_size()
@@ -52,7 +67,7 @@ def render_in_bands(integrator, scene, sensor, seed: int, samples: int, trace) -
         corner = mi.ScalarVector2i(film.crop_offset()) - border + mi.ScalarVector2i(0, first)
         pixel = mi.Vector2i(mi.Int32(index - row * width), mi.Int32(row)) + mi.Vector2i(corner)
         ray, weight, position = _camera_rays(sensor, film, sampler, pixel)
-        radiance, valid, channels = trace(sampler, ray, PixelGrid(width, samples))
+        radiance, valid, channels = trace(sampler, ray, PixelGrid(width, samples), count / (height - first))
         block = film.create_block(mi.ScalarVector2u(width, count), False, not film.rfilter().is_box_filter())
         block.set_offset(mi.ScalarPoint2i(corner))
         _put(block, film, position, radiance * weight, valid, channels)

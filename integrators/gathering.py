@@ -43,6 +43,15 @@ def whole_sum(values) -> int:
     return 0 if values is None else round(float(download(values).sum(dtype="float64")))
 
 
+def add_statistics(totals: dict, more: dict) -> None:
+    """Add counters to counters of the same name, and dictionaries of them."""
+    for name, value in more.items():
+        if isinstance(value, dict):
+            add_statistics(totals.setdefault(name, {}), value)
+        else:
+            totals[name] = totals.get(name, 0) + value
+
+
 @dataclass
 class Start:
     """What every render begins with: a seed drawn from the sampler, the scene's emitters, and the camera's paths.

@@ -96,7 +96,8 @@ _DIRECT_PARAMETERS = """\
 
      * - max_samples
        - |int|
-       - Most emitter samples of a pixel. (Default: 20000)
+       - Most emitter samples of a pixel, up to 100000; at least four are taken for each half of the estimate.
+         (Default: 20000)
 
      * - bsdf_share
        - |float|
@@ -123,7 +124,8 @@ mirrors, glass and masks are followed, but no light that was reflected by a matt
 
     - Surfaces only: a scene with a participating medium is refused.
     - ``*_rgb`` and ``*_mono`` variants only. Not differentiable.
-    - All emitters of Mitsuba. Kernels do not grow with their number, but for cylinders and textured disks.
+    - All emitters of Mitsuba. Kernels do not grow with the number of points, spots, and areas of one colour on meshes,
+      rectangles, disks and spheres; they do with textured areas, projectors and textured spots.
     - Point lights, spots and directional emitters are blocked by masks and thin glass, as in ``path``.
 """
 

@@ -9,11 +9,12 @@ def _fail(props, name: str, allowed: str, value):
     raise ValueError(f'{props.plugin_name()}: property "{name}" must be {allowed}, got {value!r}')
 
 
-def integer(props, name: str, default: int, minimum: int) -> int:
-    """An integer of at least ``minimum``; a ValueError names property, value and what is allowed."""
+def integer(props, name: str, default: int, minimum: int, maximum: float = math.inf) -> int:
+    """An integer from ``minimum`` to ``maximum``; a ValueError names property, value and what is allowed."""
     value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
-        _fail(props, name, f"an integer of at least {minimum}", value)
+    if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= maximum:
+        limits = f"of at least {minimum}" if maximum == math.inf else f"from {minimum} to {maximum}"
+        _fail(props, name, f"an integer {limits}", value)
     return value
 
 

@@ -146,7 +146,7 @@ BAD = [(plugin, *bad) for plugin in PLUGINS for bad in BOTH_BAD] + [
 ALLOWED = {
     "lights": '"auto", "clusters", "all"', "guide": '"evaluated", "sampled"', "combine": '"fixed", "inverse_variance"',
     "antialiasing": "true or false", "error": "a number of at least 0.0001", "samples_per_ray": "at least 2",
-    "max_samples": "an integer of at least 1", "aovs": ", ".join(f'"{name}"' for name in AOVS),
+    "max_samples": "an integer from 1 to 100000", "aovs": ", ".join(f'"{name}"' for name in AOVS),
 }  # fmt: skip
 
 
@@ -358,7 +358,7 @@ def test_aovs_have_their_names_and_ranges(mixed):
         assert rays.sum() * 4 == pytest.approx(integrator.statistics["shadow_rays"], rel=1e-5)
         assert 0 < integrator.statistics["shadow_rays"] and rays[~lit].max() == 0
         # BSDF samples that found light are counted among those that the emitter samples are
-        assert 0 < regions.max() <= 4 and visible.max() <= 1.5 and visible.mean() > 0.05
+        assert 0 < regions.max() <= 4 and visible.max() <= 1 and visible.mean() > 0.05
         if plugin == "adaptivedirect" and more["lights"] == "clusters":
             assert passes.max() <= 15
 

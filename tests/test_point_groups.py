@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vpl.cluster_cuts import PointGroups, all_leaves, cut_clusters, has_wide_source
+from vpl.cluster_cuts import GroupCuts, PointGroups, cut_clusters, has_wide_source
 from vpl.cluster_forest import build_cluster_forest
 from vpl.pixel_regions import representatives
 from vpl.point_groups import BLOCK, bound_groups, find_groups, find_sites, normal_class
@@ -46,7 +46,7 @@ def nodes_of(center, radius, axis, cone_cos, infinite_axis=(), infinite_cos=()):
         (forest.axis, np.reshape(infinite_axis, (more, 3))), (forest.cone_cos, np.asarray(infinite_cos, float)),
         (forest.intensity, np.ones(more)), (forest.centroid, nothing),
         (forest.escape, (size + np.arange(more) + 1).astype(np.uint32)), (forest.first, ranks),
-        (forest.last, ranks + np.uint32(1)),
+        (forest.last, ranks + np.uint32(1)), (np.zeros(size, np.int64), np.ones(more, np.int64)),
     ]  # fmt: skip
     return Nodes(*(np.concatenate(pair) for pair in joined))
 
@@ -110,7 +110,7 @@ def lighting_sources(rng, nodes, groups, group, samples=300):
 
 
 def leaf_cuts(nodes, groups):
-    return all_leaves(nodes, groups, np.arange(groups.count))
+    return cut_clusters(nodes, groups, 0.0)
 
 
 def cut_of(cuts, group):
@@ -197,10 +197,25 @@ def test_leaves_of_chosen_groups_are_those_among_all_groups(seed):
     rng = np.random.default_rng(seed)
     nodes, groups = random_nodes(rng), random_groups(rng)
     chosen = np.flatnonzero(rng.random(groups.count) < 0.5)
-    every, some = leaf_cuts(nodes, groups), all_leaves(nodes, groups, chosen)
-    assert len(some.size) == groups.count
-    for group in range(groups.count):
-        assert cut_of(some, group).tolist() == (cut_of(every, group).tolist() if group in chosen else [])
+    every, some = leaf_cuts(nodes, groups), leaf_cuts(nodes, groups.select(chosen))
+    assert len(some.size) == len(chosen)
+    for place, group in enumerate(chosen):
+        assert cut_of(some, place).tolist() == cut_of(every, group).tolist()
+
+
+def test_groups_without_a_cluster_can_be_given_the_first():
+    cuts = GroupCuts(np.array([4, 7, 9], np.uint32), np.array([0, 0, 2, 2, 3, 3]))
+    filled = cuts.without_empty()
+    assert [cut_of(filled, group).tolist() for group in range(5)] == [[0], [4, 7], [0], [9], [0]]
+
+
+def test_many_groups_are_cut_like_few():
+    rng = np.random.default_rng(3)
+    nodes = random_nodes(rng)
+    groups = [random_groups(rng) for _ in range(3)]
+    joined = PointGroups(*(np.concatenate([getattr(g, f) for g in groups]) for f in vars(groups[0])))
+    few = np.concatenate([cut_clusters(nodes, g, 0.1).node for g in groups])
+    assert np.array_equal(cut_clusters(nodes, joined, 0.1).node, few)
 
 
 def lamps(center, axis, cone_cos=1.0, radius=0.0):
@@ -380,7 +395,7 @@ def test_sites_are_the_pairs_of_group_and_pixel(seed, count, groups, size):
     rng = np.random.default_rng(seed)
     group = np.unique(rng.integers(0, groups, count), return_inverse=True)[1]
     pixel = rng.integers(0, size, count)
-    sites = find_sites(group, pixel)
+    sites = find_sites(group, pixel, np.random.default_rng(0))
     assert np.array_equal(sites.group[sites.point_site], group)
     assert np.array_equal(sites.pixel[sites.point_site], pixel)
     pairs = np.stack([sites.group, sites.pixel], 1).tolist()
@@ -405,7 +420,7 @@ def test_sites_are_the_pairs_of_group_and_pixel(seed, count, groups, size):
 
 def bounds(group, position, normal, two_sided=None):
     group = np.asarray(group)
-    sites = find_sites(group, np.arange(len(group))[::-1])
+    sites = find_sites(group, np.arange(len(group))[::-1], np.random.default_rng(0))
     two_sided = np.zeros(len(group), bool) if two_sided is None else np.asarray(two_sided)
     return bound_groups(sites, position, normal, two_sided)
 
@@ -451,6 +466,10 @@ def test_one_two_sided_point_opens_the_cone_of_its_group_alone():
 # ---- Regions of pixels
 
 
+def standing_of(*columns):
+    return representatives(*columns, np.random.default_rng(0))
+
+
 def check_representatives(standing, pixel, shape, normal):
     """Assert what holds for all points; returns the number of regions."""
     assert np.array_equal(standing[standing], standing)
@@ -472,7 +491,7 @@ def test_points_stand_only_for_their_like(seed, count, kinds, scale):
     shape = rng.integers(0, kinds, count).astype(np.uint32) * np.uint32(1000)
     normal = random_unit(rng, count).astype(np.float32)
     position = (scale * rng.normal(size=(count, 3))).astype(np.float32)
-    regions = check_representatives(representatives(pixel, shape, position, normal), pixel, shape, normal)
+    regions = check_representatives(standing_of(pixel, shape, position, normal), pixel, shape, normal)
     assert regions >= len(np.unique(np.stack([pixel, shape, normal_class(normal)], 1), axis=0))
 
 
@@ -487,7 +506,7 @@ def test_a_plane_has_four_regions_in_each_pixel(seed):
     normal = np.cross(along, across)
     normal = np.tile(normal / np.linalg.norm(normal), (len(pixel), 1)).astype(np.float32)
     shape = np.zeros(len(pixel), np.uint32)
-    standing = representatives(pixel, shape, position, normal)
+    standing = standing_of(pixel, shape, position, normal)
     regions = check_representatives(standing, pixel, shape, normal)
     assert 3.5 * side**2 <= regions <= 4.1 * side**2
     # Nobody stands for points farther away than across half the pixel
@@ -503,8 +522,8 @@ def test_points_off_the_plane_have_regions_of_their_own():
     step = rng.random(count) < 0.5
     normal = np.tile(UP, (count, 1))
     zero = np.zeros(count, int)
-    flat = representatives(zero, zero, np.column_stack([plane, 1e-3 * step]), normal)
-    deep = representatives(zero, zero, np.column_stack([plane, 0.5 * step]), normal)
+    flat = standing_of(zero, zero, np.column_stack([plane, 1e-3 * step]), normal)
+    deep = standing_of(zero, zero, np.column_stack([plane, 0.5 * step]), normal)
     assert check_representatives(flat, zero, zero, normal) == 4
     assert check_representatives(deep, zero, zero, normal) == 8
     assert np.array_equal(step[deep], step)
@@ -514,9 +533,10 @@ def test_shapes_classes_and_pixels_never_merge():
     normal = np.array([UP, UP, UP, UP, DOWN, UP])
     pixel = np.array([0, 0, 1, 1, 1, 0])
     shape = np.array([7, 3, 3, 7, 3, 7], np.uint32)
-    standing = representatives(pixel, shape, np.zeros((6, 3)), normal)
-    assert standing.tolist() == [0, 1, 2, 3, 4, 0]
+    standing = standing_of(pixel, shape, np.zeros((6, 3)), normal)
+    assert standing[1:5].tolist() == [1, 2, 3, 4]
+    assert standing[0] == standing[5] and standing[0] in (0, 5)
 
 
 def test_a_single_point_stands_for_itself():
-    assert representatives(np.array([5]), np.array([2], np.uint32), np.ones((1, 3)), np.array([UP])).tolist() == [0]
+    assert standing_of(np.array([5]), np.array([2], np.uint32), np.ones((1, 3)), np.array([UP])).tolist() == [0]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 
 import drjit as dr
@@ -19,7 +20,7 @@ import numpy as np
 
 from .all_sources import SourceRounds
 from .arrays import download, upload
-from .cluster_cuts import GroupCuts, all_leaves, cut_clusters, has_wide_source
+from .cluster_cuts import GroupCuts, cut_clusters, has_wide_source
 from .gather import GatherPoints
 from .pixel_regions import representatives
 from .point_groups import Sites, bound_groups, find_groups, find_sites
@@ -44,7 +45,7 @@ FIELDS = ("noise", "passes", "shadow_rays", "regions", "visible")
 class DirectOptions:
     """What users choose; see the plugin ``adaptivedirect``."""
 
-    error: float = 0.02
+    error: float
     dark_floor: float = 0.1
     lights: str = "auto"
     solid_angle: float = 0.02
@@ -85,22 +86,26 @@ class DirectLight:
 
 def light_directly(
     scene, traits, sources: Sources, points: GatherPoints, grid: PixelGrid, max_depth, options: DirectOptions,
-    seed: int, stopped: Callable[[], bool] = lambda: False,
+    seed: int, stopped: Callable[[], bool] = lambda: False, level: float | None = None,
 ) -> DirectLight:  # fmt: skip
-    """Direct light of ``sources`` at all gather points."""
+    """Direct light of ``sources`` at all gather points.
+
+    ``level``: mean radiance of the image, which ``dark_floor`` is a fraction of; estimated where it is None.
+    """
+    start = perf_counter()
     found = np.zeros((points.count, 3 + len(FIELDS)), np.float32)
     if sources.count or sources.extended:
-        shapes = download(dr.reinterpret_array(mi.UInt32, points.si.shape))
         parts = [
-            _BatchLight(scene, traits, sources, points, batch, shapes, grid, max_depth, options)
-            for batch in make_batches(points, probe_materials(points, traits))
+            _BatchLight(scene, traits, sources, points, batch, grid, max_depth, options, derived_seed(seed, 2, k))
+            for k, batch in enumerate(make_batches(points, probe_materials(points, traits)))
         ]
-        rays = max(points.count, 1)
-        level = sum(part.pilot(derived_seed(seed, 0, k)) * part.batch.count / rays for k, part in enumerate(parts))
-        start, done = perf_counter(), 0
+        if level is None:
+            level = sum(part.pilot(derived_seed(seed, 0, k)) * part.batch.count for k, part in enumerate(parts))
+            level /= points.count
+        done = 0
         for number, part in enumerate(parts):
             done += part.batch.count
-            deadline = start + options.time * done / rays if options.time > 0 else np.inf
+            deadline = start + options.time * done / points.count if options.time > 0 else np.inf
             found[part.rows] = part.solve(level, derived_seed(seed, 1, number), stopped, deadline)
     columns = [upload(mi.Float, column) for column in found.T.copy()]
     radiance = mi.UnpolarizedSpectrum(*columns[: dr.size_v(mi.UnpolarizedSpectrum)])
@@ -110,98 +115,114 @@ def light_directly(
 class _BatchLight:
     """Direct light at the points of one batch."""
 
-    def __init__(self, scene, traits, sources, points, batch: Batch, shapes, grid, max_depth, options):
-        self.batch, self.options, self.grid = batch, options, grid
+    def __init__(self, scene, traits, sources, points, batch: Batch, grid, max_depth, options, seed: int):
+        self.batch, self.options, self.grid, self.nodes = batch, options, grid, sources.nodes
         self._common = scene, traits, sources, batch
         self._beyond = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF))) if traits.delta and max_depth > 2 else None
         self.rows = download(batch.index)
         pixel = download(points.ray)[self.rows].astype(np.int64) // grid.samples
         position, normal = download(batch.position), download(batch.normal)
+        generator = np.random.default_rng(seed)
+        self._standing = np.arange(batch.count)
+        if options.antialiasing and grid.samples > 1:
+            # What is seen by way of a mirror is no neighbour of what is seen directly
+            surface = download(dr.reinterpret_array(mi.UInt32, points.si.shape)).astype(np.int64) << 8
+            surface += np.minimum(download(points.depth), 255)
+            self._standing = representatives(pixel, surface[self.rows], position, normal, generator)
+        group = _groups_of(self._standing, pixel, grid.width, position, normal)
+        self.sites = find_sites(group, pixel, generator)
         two_sided = np.zeros(batch.count, bool)
         if batch.proxy.without_cosines:
             two_sided |= download(batch.proxy.no_cosine)
         self._two_sided = upload(mi.UInt32, two_sided) == 1
-        self._standing = np.arange(batch.count)
-        if options.antialiasing and grid.samples > 1:
-            self._standing = representatives(pixel, shapes[self.rows], position, normal)
-        group = _groups_of(self._standing, pixel, grid.width, position, normal)
-        self.sites = find_sites(group, pixel)
-        bounds = bound_groups(self.sites, position, normal, two_sided)
-        self._choose(sources, bounds)
+        self._bounds = bound_groups(self.sites, position, normal, two_sided)
+        self._choose()
 
-    def _choose(self, sources: Sources, bounds) -> None:
-        """Cuts of all groups, and which of them sum over all sources."""
-        options, nodes = self.options, sources.nodes
-        self._cuts = cut_clusters(nodes, bounds, 0.0 if options.lights == "unoccluded" else options.solid_angle)
-        if options.lights == "auto":
-            self._summed = self._worth_summing(nodes, bounds.count)
-        else:
-            self._summed = np.full(bounds.count, options.lights == "all")
-        self._leaves = all_leaves(nodes, bounds, np.flatnonzero(self._summed))
+    def _choose(self) -> None:
+        """Cuts of all groups, which of them sum over all sources, and their share of BSDF samples."""
+        options, count = self.options, self._bounds.count
+        self._cuts = self._cut(np.arange(count), options.solid_angle)
+        group = np.repeat(np.arange(count), self._cuts.size)
+        held = (self.nodes.last.astype(np.int64) - self.nodes.first)[self._cuts.node]
+        # Sources of each group, and how many of them have an extent
+        self._held, extended = (np.bincount(group, x, count) for x in (held, self.nodes.extended[self._cuts.node]))
+        self._summed = np.full(count, options.lights == "all")
+        if options.lights == "auto" and self._beyond is None:
+            a_pass = np.maximum(options.samples_per_cluster * self._cuts.size, options.least_samples)
+            self._summed = (extended == 0) & (self._held <= _SUM_WORTH * a_pass)
         # Emitter samples alone are enough for small sources and matt surfaces, unless light comes by way of a mirror
-        self._bsdf = np.ones(bounds.count) * options.bsdf_share
+        self._bsdf = np.ones(count) * options.bsdf_share
         if isinstance(self.batch.surfaces, LambertianSurface) and self._beyond is None:
-            self._bsdf *= has_wide_source(sources.nodes, bounds, self._cuts)
+            self._bsdf *= has_wide_source(self.nodes, self._bounds, self._cuts)
 
-    def _worth_summing(self, nodes, count: int) -> np.ndarray:
-        """Groups whose sources, all without extent, are so few that to sum over them all is cheaper, (g,) bool."""
-        if self._beyond is not None:
-            return np.zeros(count, bool)
-        group, node = np.repeat(np.arange(count), self._cuts.size), self._cuts.node
-        held, extended = (
-            np.bincount(group, values, count)
-            for values in ((nodes.last.astype(np.int64) - nodes.first)[node], nodes.extended[node])
-        )
-        a_pass = np.maximum(self.options.samples_per_cluster * self._cuts.size, self.options.least_samples)
-        return (extended == 0) & (held <= _SUM_WORTH * a_pass)
+    def _cut(self, groups, solid_angle: float) -> GroupCuts:
+        cuts = cut_clusters(self.nodes, self._bounds.select(groups), solid_angle)
+        # Where light comes by way of mirrors, BSDF samples are taken even if nothing lights a group directly
+        return cuts if self._beyond is None or self.nodes.count == 0 else cuts.without_empty()
 
     def pilot(self, seed: int) -> float:
         """Mean radiance of the batch's points, roughly: one pass over some of the groups."""
-        groups = len(self._summed)
-        step = max(1, self.sites.count // _PILOT_SITES)
-        chosen = np.arange(0, groups, step)
-        passes, part = self._passes(chosen, 0.0)
+        order = np.random.default_rng(seed).permutation(self._bounds.count)
+        sites = np.diff(self.sites.group_first)[order]
+        enough = (np.cumsum(sites) <= _PILOT_SITES) & (np.cumsum(sites * self._cuts.size[order]) <= _ENTRIES)
+        chosen = np.sort(order[: max(1, int(enough.sum()))])
+        part, cuts = _select(self.sites, self._cuts, chosen)
+        passes = SitePasses(*self._task(part, cuts, chosen), 0.0, self.options)
         passes.max_passes = 1
-        passes.run(self._two_sided, seed, lambda: False)
+        passes.run(self._two_sided, seed, lambda number: False)
         return float(np.average(passes.result()[0].mean(1), weights=part.points))
 
-    def _passes(self, groups, level: float):
-        part, cuts = _select(self.sites, self._cuts, groups)
-        share = part.points / self.grid.samples
-        method = UnoccludedPasses if self.options.lights == "unoccluded" else SitePasses
-        return method(self._scenery(part, cuts), share, self._bsdf[groups][part.group], level, self.options), part
-
-    def _scenery(self, part: Sites, cuts: GroupCuts) -> Scenery:
-        return Scenery(*self._common, SiteTable.of(part, cuts, self._standing[part.order]), self._beyond)
+    def _task(self, part: Sites, cuts: GroupCuts, groups):
+        """(Scenery, share of the pixel's rays, share of BSDF samples) of the sites of some groups."""
+        table = SiteTable.of(part, cuts, self._standing[part.order])
+        return (
+            Scenery(*self._common, table, self._beyond),
+            part.points / self.grid.samples,
+            self._bsdf[groups][part.group],
+        )
 
     def solve(self, level: float, seed: int, stopped, deadline: float) -> np.ndarray:
         """The columns of :class:`DirectLight` per point, the radiance as three."""
         per_site = np.zeros((self.sites.count, 3 + len(FIELDS)), np.float32)
         start, spent, number = perf_counter(), 0, 0
         for summed in (True, False):
-            cuts = self._leaves if summed else self._cuts
-            for groups in _portions(np.flatnonzero(self._summed == summed), self.sites, cuts, not summed):
+            for groups in self._portions(np.flatnonzero(self._summed == summed), summed):
                 spent += len(groups)
                 until = start + (deadline - start) * spent / len(self._summed)
-                halt = lambda until=until: stopped() or perf_counter() > until  # noqa: E731
-                part, result = self._light(groups, summed, level, derived_seed(seed, number), halt)
+                halted = partial(_halted, stopped, until)
+                part, result = self._light(groups, summed, level, derived_seed(seed, number), halted)
                 sites = np.concatenate([np.arange(*self.sites.group_first[[g, g + 1]]) for g in groups])
                 per_site[sites] = self._columns(part, result)
                 number += 1
         return per_site[self.sites.point_site]
 
-    def _light(self, groups, summed: bool, level, seed, halt):
-        if not summed:
-            passes, part = self._passes(groups, level)
-            passes.run(self._two_sided, seed, halt)
-            return part, passes.result()
-        part, leaves = _select(self.sites, self._leaves, groups)
-        share = part.points / self.grid.samples
-        # Where it was chosen by itself, no source has an extent
-        bsdf = self._bsdf[groups][part.group] * (self.options.lights == "all")
-        rounds = SourceRounds(self._scenery(part, leaves), part, share, bsdf, level, self.options)
-        rounds.run(seed, halt)
-        return part, rounds.result()
+    def _portions(self, groups: np.ndarray, summed: bool):
+        """Divide groups into portions that need little enough memory."""
+        if summed:
+            entries = self._held[groups]
+        else:
+            size = self._held if self.options.lights == "unoccluded" else self._cuts.size
+            entries = size[groups] * np.diff(self.sites.group_first)[groups]
+        entries, first = np.cumsum(entries), 0
+        while first < len(groups):
+            before = entries[first - 1] if first else 0
+            last = max(first + 1, int(np.searchsorted(entries, before + _ENTRIES, side="right")))
+            yield groups[first:last]
+            first = last
+
+    def _light(self, groups, summed: bool, level, seed, halted):
+        """Light some groups: (their sites, what :meth:`SitePasses.result` says of them)."""
+        single = summed or self.options.lights == "unoccluded"
+        part, cuts = _select(self.sites, self._cuts, groups)
+        scenery, share, bsdf = self._task(part, self._cut(groups, 0.0) if single else cuts, groups)
+        if summed:
+            # Where it was chosen by itself, no source has an extent
+            method = SourceRounds(scenery, part, share, bsdf * (self.options.lights == "all"), level, self.options)
+            method.run(seed, halted)
+        else:
+            method = (UnoccludedPasses if single else SitePasses)(scenery, share, bsdf, level, self.options)
+            method.run(self._two_sided, seed, halted)
+        return part, method.result()
 
     def _columns(self, part: Sites, result) -> np.ndarray:
         radiance, variance, passes, rays, visible = result
@@ -219,20 +240,9 @@ def _groups_of(standing, pixel, width, position, normal) -> np.ndarray:
     return find_groups(pixel[shaded], width, position[shaded], normal[shaded])[place]
 
 
-def _portions(groups: np.ndarray, sites: Sites, cuts: GroupCuts | None, by_entry: bool):
-    """Divide groups into portions with few enough entries; those that keep no entries are not divided."""
-    if len(groups) == 0:
-        return
-    if not by_entry:
-        yield groups
-        return
-    entries = np.cumsum(cuts.size[groups] * np.diff(sites.group_first)[groups])
-    first = 0
-    while first < len(groups):
-        before = entries[first - 1] if first else 0
-        last = max(first + 1, int(np.searchsorted(entries, before + _ENTRIES, side="right")))
-        yield groups[first:last]
-        first = last
+def _halted(stopped, until: float, number: int) -> bool:
+    """Whether to stop before a pass; for want of time never before the first."""
+    return stopped() or (number > 0 and perf_counter() > until)
 
 
 def _select(sites: Sites, cuts: GroupCuts, groups: np.ndarray) -> tuple[Sites, GroupCuts]:

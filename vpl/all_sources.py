@@ -15,6 +15,8 @@ from .point_groups import Sites
 from .sampling import derived_seed
 from .site_table import Lanes, Scenery
 
+_LEAST_ROUNDS = 2  # of each half, before their difference is believed
+
 
 class SourceRounds:
     """Rounds of summing over all sources for the sites of a table whose clusters are single sources.
@@ -29,8 +31,8 @@ class SourceRounds:
         self.total, self.rounds = np.zeros((2, count, 3)), np.zeros((2, count), np.int64)
         self.rays, self.seen, self.samples = np.zeros(count), np.zeros(count), np.zeros(count)
 
-    def run(self, seed: int, stopped) -> None:
-        """Sum until all groups are done."""
+    def run(self, seed: int, halted) -> None:
+        """Sum until all groups are done.  ``halted``: asked before every round."""
         table = self.scenery.table
         if table.entries == 0:
             return
@@ -38,8 +40,8 @@ class SourceRounds:
         extended = self.scenery.sources.nodes.extended[download(table.node)].any() or self.bsdf_share.any()
         halves = 2 if extended else 1
         active = np.flatnonzero(size)
-        for number in range(halves * self.options.max_passes):
-            if len(active) == 0 or stopped():
+        for number in range(halves * self.options.max_samples):
+            if len(active) == 0 or halted(number):
                 break
             half = number % 2
             drawn = self._round(active, half, size, derived_seed(seed, number))
@@ -50,8 +52,9 @@ class SourceRounds:
             self.samples[active] += size[active]
             if halves == 1:
                 break
-            if half == 1:
-                active = np.flatnonzero((size > 0) & self._unfinished()[self.sites.group])
+            if half == 1 and number + 1 >= 2 * _LEAST_ROUNDS:
+                affordable = self.samples + 2 * size <= self.options.max_samples
+                active = np.flatnonzero((size > 0) & affordable & self._unfinished()[self.sites.group])
 
     def _round(self, active, half: int, size, seed: int) -> Drawn:
         bsdf = np.ceil(size[active] * self.bsdf_share[active])
@@ -79,4 +82,4 @@ class SourceRounds:
         """Per site: radiance (s, 3), its estimated variance, rounds, rays, and the share of samples that saw light."""
         radiance, variance = self._estimate()
         seen = self.seen / np.maximum(self.samples, 1)
-        return radiance, variance, self.rounds.sum(0), self.rays, np.minimum(seen, 1)
+        return radiance, variance, self.rounds.max(0), self.rays, np.minimum(seen, 1)

@@ -16,6 +16,8 @@ from .sources import Nodes
 
 # Sources without neighbours that fill more than this, in steradians, are hard to sample by area alone
 _WIDE = 0.1
+# Pairs of a group and a node that are looked at together, some 300 bytes each; a cut has rarely more nodes than this
+_PAIRS, _USUAL_CUT = 1 << 20, 1024
 _SLACK = 1e-5  # angles below are rounded towards keeping a cluster
 
 
@@ -50,32 +52,34 @@ class GroupCuts:
         """(g,) int64, clusters of each group."""
         return np.diff(self.first)
 
+    def without_empty(self) -> GroupCuts:
+        """The same with the first node for groups that have none."""
+        empty = np.flatnonzero(self.size == 0)
+        size = np.maximum(self.size, 1)
+        node = np.insert(self.node, self.first[empty], np.zeros(len(empty), np.uint32))
+        return GroupCuts(node, np.concatenate([[0], np.cumsum(size)]))
+
 
 def cut_clusters(nodes: Nodes, groups: PointGroups, solid_angle: float) -> GroupCuts:
-    """The coarsest clusters that fill at most ``solid_angle`` steradians each, per group."""
-    ratio2 = _squared_sine(solid_angle)
-    roots = _roots(nodes)
-    group, node = np.repeat(np.arange(groups.count), len(roots)), np.tile(roots, groups.count)
-    taken = [np.zeros((2, 0), np.int64)]
-    while len(group):
-        lit = _may_light(nodes, node, groups, group)
-        group, node = group[lit], node[lit]
-        single = nodes.escape[node] == node + 1
-        nearest = np.clip(nodes.center[node], groups.low[group], groups.high[group]) - nodes.center[node]
-        small = np.square(nodes.radius[node]) < ratio2 * np.einsum("ij,ij->i", nearest, nearest)
-        done = single | small
-        taken.append(np.stack([group[done], node[done]]))
-        group, left = np.tile(group[~done], 2), node[~done] + 1
-        node = np.concatenate([left, nodes.escape[left].astype(np.int64)])
-    return _by_group(np.concatenate(taken, axis=1), nodes.count, groups.count)
-
-
-def all_leaves(nodes: Nodes, groups: PointGroups, chosen: np.ndarray) -> GroupCuts:
-    """Cuts of single sources only, for the groups ``chosen``; the others get none."""
-    cuts = cut_clusters(nodes, groups.select(chosen), 0.0)
-    size = np.zeros(groups.count, np.int64)
-    size[chosen] = cuts.size
-    return GroupCuts(cuts.node, np.concatenate([[0], np.cumsum(size)]))
+    """The coarsest clusters that fill at most ``solid_angle`` steradians each, per group; 0 gives single sources."""
+    roots, pairs, first = _roots(nodes), [np.zeros((2, 0), np.int64)], 0
+    # How far cuts go down is not known: few groups at a time where there are many nodes
+    step = max(1, _PAIRS // max(1, min(nodes.count, _USUAL_CUT) if solid_angle > 0 else nodes.count))
+    for first in range(0, groups.count, step):
+        chosen = np.arange(first, min(first + step, groups.count))
+        group, node = np.repeat(chosen, len(roots)), np.tile(roots, len(chosen))
+        while len(group):
+            lit = _may_light(nodes, node, groups, group)
+            group, node = group[lit], node[lit]
+            single = nodes.escape[node] == node + 1
+            nearest = np.clip(nodes.center[node], groups.low[group], groups.high[group]) - nodes.center[node]
+            # 2 pi (1 - cos asin(r / d)) < solid_angle
+            small = np.square(nodes.radius[node]) < _squared_sine(solid_angle) * np.einsum("ij,ij->i", nearest, nearest)
+            done = single | small
+            pairs.append(np.stack([group[done], node[done]]))
+            group, left = np.tile(group[~done], 2), node[~done] + 1
+            node = np.concatenate([left, nodes.escape[left].astype(np.int64)])
+    return _by_group(np.concatenate(pairs, axis=1), nodes.count, groups.count)
 
 
 def has_wide_source(nodes: Nodes, groups: PointGroups, cuts: GroupCuts) -> np.ndarray:

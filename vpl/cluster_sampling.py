@@ -58,22 +58,27 @@ def draw_samples(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
     own = lanes.half * dr.opaque(mi.UInt32, table.entries) + site.entry
     total, last, differences = dr.zeros(mi.UnpolarizedSpectrum, count), mi.Float(0), mi.Float(0)
     rays, seen = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
-    i, k, below = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count), dr.zeros(mi.Float, count)
+    i, k = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
+    # In double precision: what is left of a number after many clusters still has to choose among their sources
+    precise = dr.float64_array_t(mi.Float)
+    below = dr.zeros(precise, count)
     p = dr.gather(mi.Float, scenery.probability, site.entry)
     while dr.hint(i < lanes.samples, exclude=[scenery, table, statistics, sources, lanes, site, own, shift]):
         # ---- Cluster: strata are equal parts of the sum of probabilities
-        target = (mi.Float(i) + random.next_1d()) / site.samples
-        while dr.hint((below + p <= target) & (k + 1 < site.size), exclude=[scenery, site, target]):
-            below += p
+        target = (precise(i) + precise(random.next_1d())) / precise(site.samples)
+        while dr.hint((below + precise(p) <= target) & (k + 1 < site.size), exclude=[scenery, site, target]):
+            below += precise(p)
             k += 1
             p = dr.gather(mi.Float, scenery.probability, site.entry + k)
-        inside = dr.clip((target - below) / p, 0, dr.one_minus_epsilon(mi.Float))
-        value, arrives, visible = _emitter_sample(scenery, site, k, p, inside, _recurrence(shift, i))
-        # ---- Statistics: lanes never share an entry, so nothing has to be locked
+        inside = dr.clip(mi.Float((target - below) / precise(p)), 0, dr.one_minus_epsilon(mi.Float))
+        value, weight, arrives, visible = _emitter_sample(scenery, site, k, p, inside, _recurrence(shift, i))
+        # ---- Statistics: lanes never share an entry, so nothing has to be locked. The weight is left out, or a cluster
+        # that BSDF samples find more often would be sampled ever less
         gain = channel_mean(value) * p / dr.gather(mi.Float, scenery.importance, site.entry + k)
         dr.scatter_add(statistics.gain, gain, own + k, mode=dr.ReduceMode.NoConflicts)
         one = dr.select(visible, mi.UInt32(SEEN + 1), mi.UInt32(1))
         dr.scatter_add(statistics.counts, one, own + k, mode=dr.ReduceMode.NoConflicts)
+        value *= weight
         level = channel_mean(value)
         # Neighbouring strata differ little: what stratification has removed already is not counted as variance
         differences += dr.select(i > 0, dr.square(level - last), 0)
@@ -104,8 +109,8 @@ def sum_sources(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
     k = dr.zeros(mi.UInt32, count)
     while dr.hint(k < site.size, exclude=[scenery, lanes, site]):
         point = mi.Point3f(random.next_1d(), random.next_1d(), random.next_1d())
-        value, arrives, visible = _emitter_sample(scenery, site, k, mi.Float(1), random.next_1d(), point)
-        total += value
+        value, weight, arrives, visible = _emitter_sample(scenery, site, k, mi.Float(1), random.next_1d(), point)
+        total += value * weight
         rays += dr.select(arrives, 1, 0)
         seen += dr.select(visible, 1, 0)
         k += 1
@@ -123,7 +128,8 @@ def _emitter_sample(scenery: Scenery, site: _Site, k, p, inside, point):
     """A point on the k-th cluster of each site, drawn with probability ``p``.
 
     ``inside``: uniform number that picks the source; ``point``: three more.
-    Returns (radiance over density, whether anything would arrive if nothing was between, whether it does).
+    Returns (radiance over density, its weight among emitter and BSDF samples, whether anything would arrive if nothing
+    was between, whether it does).
     """
     node = scenery.sources.node(dr.gather(mi.UInt32, scenery.table.node, site.cut + k))
     rank, share = scenery.sources.member(node, inside)
@@ -133,10 +139,11 @@ def _emitter_sample(scenery: Scenery, site: _Site, k, p, inside, point):
     reflected, bsdf_pdf = surface.reflected_with_density(drawn.direction, mi.Bool(True))
     pdf = p * share * drawn.pdf
     weight = dr.select(drawn.pdf > 0, power_heuristic(site.samples * pdf, site.bsdf_samples * bsdf_pdf), 1)
-    value = finite_or_zero(reflected * drawn.value * (weight / (p * share)))
+    value = finite_or_zero(reflected * drawn.value / (p * share))
     arrives = dr.any(value > 0)
     visible = arrives & ~scenery.scene.ray_test(surface.interaction.spawn_ray_to(drawn.p), arrives)
-    return dr.select(visible, value, 0), arrives, visible
+    # A direction that does not exist (a point on the source itself) has no weight either
+    return dr.select(visible, value, 0), dr.select(visible, weight, 0), arrives, visible
 
 
 @dr.syntax

@@ -21,8 +21,8 @@ _UNIFORM_SHARE = 0.5
 
 def power_heuristic(pdf_a, pdf_b):
     """Weight of a sample drawn with density a among densities a and b (power 2)."""
-    a, b = dr.square(pdf_a), dr.square(pdf_b)
-    return dr.select(pdf_a > 0, a / (a + b), 0)
+    # As a ratio, because squares of densities leave the range of single precision
+    return dr.select(pdf_a > 0, dr.rcp(1 + dr.square(pdf_b / pdf_a)), 0)
 
 
 class ExtendedEmitters:

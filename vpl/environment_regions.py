@@ -17,9 +17,9 @@ from .environment_strata import cones, stratify
 from .lights import finite_or_zero
 from .sampling import independent_sampler
 
-_EVALUATIONS = 4  # per cell, along each of both axes of a cell half of them
+_EVALUATIONS = 2  # along each of both axes of a cell, at least
 _STRATA_WIDTH = 256  # columns of the grid that regions are made of
-_DEFAULT_WIDTH, _LARGEST_WIDTH = 512, 2048
+_DEFAULT_WIDTH, _LARGEST_WIDTH = 1024, 2048
 # Share of a region's light that is spread evenly over its cells: their table is made from few evaluations
 _EVEN_SHARE = 0.02
 
@@ -120,28 +120,33 @@ def find_interval(cumulative, first, last, sample):
 
 def _table_width(environment) -> int:
     """Columns of the table: those of an image, as far as that pays, a power of two."""
-    parameters = mi.traverse(environment)
     if environment.class_name() == "ConstantBackgroundEmitter":
         return 64
-    if "data" not in parameters:
-        return _DEFAULT_WIDTH
-    return int(np.clip(2 ** np.ceil(np.log2(parameters["data"].shape[1] - 1)), 64, _LARGEST_WIDTH))
+    columns = _image_width(environment) or _DEFAULT_WIDTH
+    return int(np.clip(2 ** np.ceil(np.log2(columns)), 64, _LARGEST_WIDTH))
+
+
+def _image_width(environment) -> int:
+    """Columns of the image of an environment, 0 where it has none."""
+    parameters = mi.traverse(environment)
+    # The first column is there twice
+    return max(1, parameters["data"].shape[1] - 1) if "data" in parameters else 0
 
 
 def _read(environment, width: int) -> np.ndarray:
     """Mean radiance of every cell, (width / 2, width) float64; values that are not finite count as black."""
     height = width // 2
-    count = width * height
+    count, across = width * height, max(_EVALUATIONS, -(-_image_width(environment) // width))
     sampler = independent_sampler(0, count)
     cell = dr.arange(mi.UInt32, count)
     total = dr.zeros(mi.Float, count)
     row, column = mi.Float(cell // width), mi.Float(cell % width)
-    for k in range(_EVALUATIONS):
-        jitter = (mi.Point2f(k % 2, k // 2) + sampler.next_2d()) * 0.5
+    for k in range(across**2):
+        jitter = (mi.Point2f(k % across, k // across) + sampler.next_2d()) / across
         polar, azimuth = (row + jitter.x) * (np.pi / height), (column + jitter.y) * (2 * np.pi / width)
         sine, cosine = dr.sincos(polar)
         si = dr.zeros(mi.SurfaceInteraction3f, count)
         si.wi = -mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), cosine)
         total += channel_mean(finite_or_zero(mi.unpolarized_spectrum(environment.eval(si))))
         dr.eval(total, sampler)
-    return download(total).astype(np.float64).reshape(height, width) / _EVALUATIONS
+    return download(total).astype(np.float64).reshape(height, width) / across**2

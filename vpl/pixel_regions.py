@@ -19,12 +19,19 @@ from .point_groups import normal_class
 _OFF_PLANE = 0.2
 
 
-def representatives(pixel, shape, position, normal) -> np.ndarray:
-    """The point that stands for each in the shading, (n,) int64.
+def representatives(pixel, shape, position, normal, generator) -> np.ndarray:
+    """The point that stands for each in the shading, (n,) int64: one at random of every region.
 
-    ``pixel``, ``shape`` (n,): whole numbers; ``position``, ``normal`` (n, 3), world units. Points of the same pixel are
-    in no particular order: the first one of a region stands for it.
+    ``pixel``, ``shape`` (n,): whole numbers; ``position``, ``normal`` (n, 3), world units; ``generator``: of NumPy.
     """
+    shuffled = generator.permutation(len(pixel))
+    standing = np.empty(len(pixel), np.int64)
+    standing[shuffled] = shuffled[_first_points(*(x[shuffled] for x in (pixel, shape, position, normal)))]
+    return standing
+
+
+def _first_points(pixel, shape, position, normal) -> np.ndarray:
+    """For each point the first of its region."""
     surface = _number(_number(pixel.astype(np.int64), shape), normal_class(normal))
     quarter = _number(surface, _quarters(surface, position))
     first = _first_of(quarter)

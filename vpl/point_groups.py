@@ -92,15 +92,18 @@ def _split_at_gaps(group, position) -> np.ndarray:
     return np.unique(refined, return_inverse=True)[1]
 
 
-def find_sites(group: np.ndarray, pixel: np.ndarray) -> Sites:
-    """The sites of points in the groups and pixels given, both (n,)."""
+def find_sites(group: np.ndarray, pixel: np.ndarray, generator) -> Sites:
+    """The sites of points in the groups and pixels given, both (n,).
+
+    ``generator``: of NumPy; it shuffles the points of each site.
+    """
     key, site, counts = np.unique(
         group.astype(np.int64) * (int(pixel.max()) + 1) + pixel, return_inverse=True, return_counts=True
     )
     of_site = key // (int(pixel.max()) + 1)
     group_first = np.searchsorted(of_site, np.arange(of_site[-1] + 2))
     return Sites(
-        of_site, key % (int(pixel.max()) + 1), site, np.argsort(site, kind="stable"),
+        of_site, key % (int(pixel.max()) + 1), site, np.lexsort((generator.permutation(len(pixel)), site)),
         np.concatenate([[0], np.cumsum(counts)]), group_first,
     )  # fmt: skip
 

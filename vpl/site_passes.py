@@ -19,11 +19,12 @@ from .cluster_sampling import draw_samples
 from .sampling import derived_seed
 from .site_table import Lanes, Scenery, Statistics
 
-_LEAST_HALF = 4  # samples of a half in a pass: fewer say nothing about the variance
+LEAST_HALF = 4  # samples of a half in a pass: fewer say nothing about the variance
 _INCREMENT = 25  # samples, where little is missing [IAS section 5.8]
 # Nothing is called black before so many passes and samples without light [IAS section 5.9]
 _BLACK_PASSES, _BLACK_SAMPLES = 3, 250
 _BSDF_LEAST = 2
+_LEAST_VARIANCE = 0.01  # of a pass, relative to the mean over sites, where passes are weighted by it
 # Shares of the uniform function after the first pass, and how the block's gives way to the pixel's [IAS fig. 2]
 _UNIFORM_SHARE, _BLOCK_DECAY = 0.1, 0.7
 
@@ -44,10 +45,13 @@ class SitePasses:
         # Per half and site: sums of weighted estimates, of weights, and of squared weights times variances
         self.total, self.weight, self.spread = np.zeros((2, count, 3)), np.zeros((2, count)), np.zeros((2, count))
         self.samples, self.seen = np.zeros((2, count), np.int64), np.zeros((2, count), np.int64)
-        self.rays, self.passes = np.zeros(count), np.zeros(count, np.int64)
+        self.tried, self.rays, self.passes = np.zeros(count), np.zeros(count), np.zeros(count, np.int64)
 
-    def run(self, two_sided, seed: int, stopped: Callable[[], bool]) -> None:
-        """Sample until all sites are done.  ``two_sided``: Bool per point of the batch, lit from both sides."""
+    def run(self, two_sided, seed: int, halted: Callable[[int], bool]) -> None:
+        """Sample until all sites are done.
+
+        ``two_sided``: Bool per point of the batch, lit from both sides; ``halted``: asked before every pass.
+        """
         scenery, table = self.scenery, self.scenery.table
         if table.entries == 0:
             return
@@ -61,7 +65,7 @@ class SitePasses:
         wanted = self._full_pass()
         for number in range(self.max_passes):
             active = np.flatnonzero(wanted.any(0))
-            if len(active) == 0 or stopped():
+            if len(active) == 0 or halted(number):
                 break
             sum_over_groups(table, scenery.statistics, of_groups, upload(mi.UInt32, self._places(active)))
             update_probabilities(scenery, of_groups, self._mixture(number), upload(mi.UInt32, active))
@@ -76,19 +80,22 @@ class SitePasses:
         Estimates are weighted by their samples times ``weight``.  Weights that do not depend on what was found leave
         the combination unbiased; in the paper they are the inverse of the variance that each pass estimates (eq. 7, 8).
         """
-        half, site = np.nonzero(wanted > 0)
+        half, site = np.nonzero(wanted)
         samples = wanted[half, site]
         bsdf = np.where(self.bsdf_share > 0, np.maximum(np.ceil(wanted * self.bsdf_share), _BSDF_LEAST), 0)[half, site]
         drawn = draw_samples(self.scenery, Lanes(*(upload(mi.UInt32, x) for x in (site, half, samples, bsdf))), seed)
         variance = download(drawn.variance).astype(np.float64)
         weight = samples * weight
         if self.options.inverse_variance:
-            weight = 1 / np.maximum(variance, np.finfo(np.float32).tiny)
+            # A pass that saw nothing has no variance: it counts as much as one with little
+            typical = np.mean(variance * samples) / samples
+            weight = 1 / np.maximum(variance, np.maximum(_LEAST_VARIANCE * typical, np.finfo(np.float32).tiny))
         self.total[half, site] += weight[:, None] * download(drawn.radiance)
         self.weight[half, site] += weight
         self.spread[half, site] += np.square(weight) * variance
         self.samples[half, site] += samples
         self.seen[half, site] += download(drawn.seen)
+        np.add.at(self.tried, site, samples + bsdf)
         self.passes[site] = number + 1
         np.add.at(self.rays, site, download(drawn.rays))
 
@@ -110,7 +117,8 @@ class SitePasses:
         """Samples of each half in a whole pass [IAS section 5.8], (2, s); 0 for sites that no cluster lights."""
         options = self.options
         of_pixel = np.clip(options.samples_per_cluster * self.size, options.least_samples, options.most_samples)
-        half = np.maximum(np.ceil(of_pixel * self.share / 2).astype(np.int64), _LEAST_HALF)
+        of_pixel = np.minimum(of_pixel, options.max_samples)
+        half = np.maximum(np.ceil(of_pixel * self.share / 2).astype(np.int64), LEAST_HALF)
         return np.where(self.size > 0, half, 0) * np.ones((2, 1), np.int64)
 
     def _estimates(self):
@@ -134,12 +142,13 @@ class SitePasses:
         excess = expected / np.maximum(allowed, np.finfo(np.float64).tiny)
         missing = np.ceil(np.minimum(excess - 1, 1) * samples[::-1])
         few = np.minimum(np.maximum(missing, np.ceil(_INCREMENT * self.share / 2)), full)
-        wanted = np.where(excess >= 2, full, np.maximum(few, _LEAST_HALF))
+        wanted = np.where(excess >= 2, full, np.maximum(few, LEAST_HALF))
         dark = self.seen == 0
-        black = (number + 1 >= _BLACK_PASSES) & (self.samples.sum(0) >= _BLACK_SAMPLES * self.share)
+        black = (number + 1 >= _BLACK_PASSES) & (2 * self.samples >= _BLACK_SAMPLES * self.share)
         wanted = np.where(dark, np.where(black, 0, full), np.where(excess <= 1, 0, wanted))
-        wanted = np.where(self.samples.sum(0) >= options.max_samples * self.share, 0, wanted)
-        return np.where(self.size > 0, wanted, 0).astype(np.int64)[::-1]
+        wanted = np.where(self.size > 0, wanted, 0).astype(np.int64)[::-1]
+        left = np.floor(options.max_samples * self.share / 2 - self.samples).astype(np.int64)
+        return np.where(left >= LEAST_HALF, np.minimum(wanted, left), 0)
 
     def result(self):
         """Per site: radiance (s, 3), its estimated variance, passes, rays, and the share of samples that saw light."""
@@ -150,5 +159,5 @@ class SitePasses:
         mean = np.where(counted[..., None], radiance, 0).sum(0) / halves[:, None]
         return (
             mean, np.where(counted, variance, 0).sum(0) / np.square(halves), self.passes, self.rays,
-            self.seen.sum(0) / np.maximum(self.samples.sum(0), 1),
+            self.seen.sum(0) / np.maximum(self.tried, 1),
         )  # fmt: skip
