@@ -9,8 +9,9 @@ paper   the same with the method as the paper prints it: ``guide="sampled"``, ``
 lights  the hall with 100 to 100 000 lights: seconds to the same error.
 cold    first render in a fresh process with an empty kernel cache.
 
-Images are rendered with 16 camera rays a pixel and compared with path-traced references (made once, then kept), whose
-own noise is taken off. Variance falls as 1 / time, so a method's time for another error is its own time, scaled.
+Images are rendered with 64 camera rays a pixel (256 by ``direct`` and ``path``) from a multijitter sampler, and compared
+with path-traced references (made once, then kept), whose own noise is taken off. Variance falls as 1 / time, so a
+method's time for another error is its own time, scaled.
 """
 
 from __future__ import annotations
@@ -38,43 +39,47 @@ NAMES = (
     "kitchen_lamps", "kitchen_windows", "forest_lights", "concourse", "everything8003", "bistro_interior", "staircase2",
     "living_room",
 )  # fmt: skip
-RAYS, REPEATS, REFERENCE_SPP = 16, 3, 4096
-PAPER = {"guide": "sampled", "combine": "inverse_variance", "lights": "clusters"}
+RAYS, REFERENCE_SPP = 64, 2048
+PAPER = {"guide": "sampled", "combine": "inverse_variance", "pass_limit": 20_000}
 
 
 class Problem:
     """A scene with its reference, and renders of it with their times and errors."""
 
     def __init__(self, name: str, width: int, reference_spp: int):
-        self.scene = scenes.load(name, width)
-        size = self.scene.sensors()[0].film().crop_size()
-        self.pixels = int(size[0]) * int(size[1])
-        file = SceneFile(
-            str(scenes.scene_file(name)), {"max_depth": "2", "resx": str(int(size[0])), "resy": str(int(size[1]))}
-        )
-        self.reference = references.path_traced(file, reference_spp, references.default_cache())
+        path, height = str(scenes.scene_file(name)), scenes.height(name, width)
+        defines = {"max_depth": "2", "resx": str(width), "resy": str(height)}
+        self.pixels = width * height
+        self.reference = references.path_traced(SceneFile(path, defines), reference_spp, references.default_cache())
+        file = SceneFile(path, defines)
+        file.set_sampler("multijitter")
+        self.scene = file.load()
 
     def error(self, image) -> float:
         """relMSE of an image, its largest 0.1% of pixels left out and the reference's noise taken off."""
         known = self.reference
         return compare(np.array(image, np.float64)[..., :3], known.image, known.standard_error)["relmse_trimmed"]
 
-    def race(self, methods: dict) -> dict:
-        """Render with each of {label: (integrator, samples)}, in turn: {label: (seconds, relMSE, rays per pixel)}."""
-        for integrator, samples in methods.values():
-            mi.render(self.scene, integrator=integrator, spp=samples, seed=99)
-        seconds, errors, rays = ({label: [] for label in methods} for _ in range(3))
-        for seed in range(REPEATS):
-            for label, (integrator, samples) in methods.items():
-                image, spent = scenes.timed(
-                    lambda: mi.render(self.scene, integrator=integrator, spp=samples, seed=seed)  # noqa: B023
-                )
-                seconds[label].append(spent)
-                errors[label].append(self.error(image))
-                rays[label].append(getattr(integrator, "statistics", {}).get("shadow_rays", 0) / self.pixels)
+    def race(self, ours: str, methods: dict) -> dict:
+        """Render with {label: (plugin, its properties, samples)}: ``ours`` before each of the others and at the end.
+
+        Returns {label: (median of the seconds, mean relMSE, mean rays per pixel)}.
+        """
+        for kind, more, _ in methods.values():
+            mi.render(self.scene, integrator=plugin(kind, **{k: v for k, v in more.items() if k != "error"}), spp=2)
+        found = {label: [] for label in methods}
+        others = [label for label in methods if label != ours]
+        for number, label in enumerate([x for other in others for x in (ours, other)] + [ours]):
+            kind, more, samples = methods[label]
+            integrator = plugin(kind, **more)
+            image, seconds = scenes.timed(
+                lambda: mi.render(self.scene, integrator=integrator, spp=samples, seed=number)  # noqa: B023
+            )
+            rays = getattr(integrator, "statistics", {}).get("shadow_rays", 0) / self.pixels
+            found[label].append((seconds, self.error(image), rays))
         return {
-            label: (float(np.median(seconds[label])), float(np.mean(errors[label])), float(np.mean(rays[label])))
-            for label in methods
+            label: (float(np.median([r[0] for r in runs])), *(float(np.mean([r[k] for r in runs])) for k in (1, 2)))
+            for label, runs in found.items()
         }
 
 
@@ -93,14 +98,16 @@ def table(names, options) -> None:
     ratios = {label: [] for label in ("faster", "fewer", "unoccluded", "all", "direct", "path")}
     for name in names:
         problem = Problem(name, options.width, options.reference_spp)
+        rule = {"error": options.error}
         found = problem.race(
+            "adaptive",
             {
-                "adaptive": (plugin("adaptivedirect", error=options.error), RAYS),
-                "unoccluded": (plugin("unoccludeddirect", error=options.error), RAYS),
-                "all": (plugin("adaptivedirect", error=options.error, lights="all"), RAYS),
-                "direct": (plugin("direct", emitter_samples=1, bsdf_samples=1), options.spp),
-                "path": (plugin("path", max_depth=2), options.spp),
-            }
+                "adaptive": ("adaptivedirect", rule, RAYS),
+                "unoccluded": ("unoccludeddirect", rule, RAYS),
+                "all": ("adaptivedirect", rule | {"lights": "all", "time": 30.0}, RAYS),
+                "direct": ("direct", {"emitter_samples": 1, "bsdf_samples": 1}, options.spp),
+                "path": ("path", {"max_depth": 2}, options.spp),
+            },
         )
         seconds, error, rays = found["adaptive"]
         slower = {label: found[label][0] * found[label][1] / (seconds * error) for label in found}
@@ -124,14 +131,15 @@ def as_printed(names, options) -> None:
     print("scene | ours: s, rays/px, relMSE, bias | as printed: s, rays/px, relMSE, bias | ours at equal relMSE: times")
     for name in names:
         problem = Problem(name, options.width, options.reference_spp)
+        rule = {"error": options.error, "lights": "clusters"}
         methods = {
-            "ours": (plugin("adaptivedirect", error=options.error, lights="clusters"), RAYS),
-            "printed": (plugin("adaptivedirect", error=options.error, pass_limit=20_000, **PAPER), RAYS),
+            "ours": ("adaptivedirect", rule, RAYS),
+            "printed": ("adaptivedirect", rule | PAPER, RAYS),
         }
-        found = problem.race(methods)
+        found = problem.race("ours", methods)
         bias = {}
-        for label, (integrator, samples) in methods.items():
-            image = np.array(mi.render(problem.scene, integrator=integrator, spp=samples, seed=7))
+        for label, (kind, more, samples) in methods.items():
+            image = np.array(mi.render(problem.scene, integrator=plugin(kind, **more), spp=samples, seed=7))
             bias[label] = 100 * (image.mean() / problem.reference.image.mean() - 1)
         columns = [
             ", ".join([f"{found[label][0]:.2f}", f"{found[label][2]:.0f}", f"{found[label][1]:.5f}",
@@ -219,7 +227,7 @@ def main() -> None:
     parser.add_argument("--error", type=float, default=0.03, help="the rule of parts table and paper (default: 0.03)")
     parser.add_argument("--width", type=int, default=256, help="pixels (default: 256)")
     parser.add_argument("--spp", type=int, default=256, help="samples a pixel of direct and path (default: 256)")
-    parser.add_argument("--reference-spp", type=int, default=REFERENCE_SPP, help="samples a pixel (default: 4096)")
+    parser.add_argument("--reference-spp", type=int, default=REFERENCE_SPP, help="samples a pixel (default: 2048)")
     options = parser.parse_args()
     names = scenes.available(options.scenes)
     if "table" in options.parts:

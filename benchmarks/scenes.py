@@ -15,7 +15,10 @@ NAMES = (
     "veach_ajar", "everything8003",
 )  # fmt: skip
 # Heights at a width of 256, by the aspect of the references
-_HEIGHTS = {"cornell": 256, "glossy": 256, "everything8003": 256, "bistro_interior": 192}
+_HEIGHTS = {
+    "cornell": 256, "glossy": 256, "everything8003": 256, "bistro_interior": 192, "kitchen_lamps": 192,
+    "kitchen_windows": 192, "forest_lights": 192, "concourse": 192,
+}  # fmt: skip
 
 
 def scene_file(name: str) -> Path:
@@ -35,10 +38,14 @@ def reference_file(name: str) -> Path | None:
     return path if path.exists() else None
 
 
+def height(name: str, width: int) -> int:
+    """Height of a scene's image at a width in pixels."""
+    return round(_HEIGHTS.get(name, 144) * width / 256)
+
+
 def load(name: str, width: int = 256):
     """Load a scene at a width in pixels."""
-    height = round(_HEIGHTS.get(name, 144) * width / 256)
-    return mi.load_file(str(scene_file(name)), resx=width, resy=height)
+    return mi.load_file(str(scene_file(name)), resx=width, resy=height(name, width))
 
 
 def available(names) -> list[str]:

@@ -75,6 +75,11 @@ class SceneFile:
         properties = mi.Properties(films[0].props if films else mi.Properties("hdrfilm"))
         return properties.get("width", 768), properties.get("height", 576)
 
+    def set_sampler(self, name):
+        """Replace the type of all samplers; they keep their parameters."""
+        for sampler in self._nodes(mi.ObjectType.Sampler):
+            sampler.props.set_plugin_name(name)
+
     def set_width(self, width):
         """Render `width` pixels wide, keeping the aspect of the first film."""
         old_width, old_height = self.size

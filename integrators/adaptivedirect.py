@@ -78,10 +78,10 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
          ``inverse_variance``: by their estimated variances (equation 8 of the paper), which favours passes that missed
          something. (Default: ``fixed``)
 
-     * - antialiasing
+     * - shade_regions
        - |bool|
-       - Shade one point for the camera rays of a pixel that meet the same surface close to each other, instead of each;
-         with several samples a pixel. (Default: yes)
+       - With several camera rays a pixel: shade one point for all that meet the same surface close to each other, as
+         in the paper, instead of any of their points. (Default: no)
 
      {common parameters}
 
@@ -97,9 +97,10 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
     (``combine``); each half of a pixel's samples decides whether the other half goes on, so that no pixel ends because
     it happened to look converged; dark pixels are held to a fraction of the image's mean (``dark_floor``); emitter
     samples are combined with BSDF samples for glossy surfaces and near emitters (``bsdf_share``); variances come from
-    neighbouring strata. Cuts, groups, regions and clusters differ in detail: see :mod:`vpl.cluster_cuts`,
-    :mod:`vpl.point_groups`, :mod:`vpl.pixel_regions` and :mod:`vpl.cluster_forest`. A black pixel is given up after
-    three passes and 250 samples without light, as in the paper.
+    neighbouring strata; a sample takes the point of any camera ray of its pixel, which costs no more than the points of
+    regions and is less noisy (``shade_regions``). Cuts, groups, regions and clusters differ in detail: see
+    :mod:`vpl.cluster_cuts`, :mod:`vpl.point_groups`, :mod:`vpl.pixel_regions` and :mod:`vpl.cluster_forest`. A black
+    pixel is given up after three passes and 250 samples without light, as in the paper.
 
     .. tabs::
         .. code-tab:: xml
@@ -115,9 +116,10 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
     """
 
     offered_aovs = FIELDS
+    along_curve = False  # the pixels' points stay together
     own_properties = (
         "lights", "cluster_angle", "max_passes", "samples_per_cluster", "min_samples", "pass_limit", "guide", "combine",
-        "antialiasing",
+        "shade_regions",
     )  # fmt: skip
 
     def __init__(self, props):
@@ -139,7 +141,7 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
         self.samples_per_cluster = properties.number(props, "samples_per_cluster", 1.5, 0)
         self.min_samples = properties.integer(props, "min_samples", 50, 1)
         self.pass_limit = properties.integer(props, "pass_limit", 400, self.min_samples)
-        self.antialiasing = properties.boolean(props, "antialiasing", True)
+        self.shade_regions = properties.boolean(props, "shade_regions", False)
         self.guide = properties.choice(props, "guide", "evaluated", ("evaluated", "sampled"))
         self.combine = properties.choice(props, "combine", "fixed", ("fixed", "inverse_variance"))
 
@@ -151,7 +153,7 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
             max_passes=self.max_passes, max_samples=self.max_samples, samples_per_cluster=self.samples_per_cluster,
             least_samples=self.min_samples, most_samples=self.pass_limit, bsdf_share=self.bsdf_share,
             evaluated=evaluated, prior=1.0 if evaluated else 0.0,
-            inverse_variance=self.combine == "inverse_variance", antialiasing=self.antialiasing, time=self.time,
+            inverse_variance=self.combine == "inverse_variance", shade_regions=self.shade_regions, time=self.time,
         )  # fmt: skip
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
@@ -190,7 +192,7 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
         start = self.begin(scene, *random_rays(sensor, seed, _LEVEL_RAYS))
         if start.dark or self.max_depth < 2:
             return 0.0
-        quick = replace(self.options(), max_passes=1, lights="clusters", antialiasing=False)
+        quick = replace(self.options(), max_passes=1, lights="clusters")
         found = light_directly(
             scene, start.traits, Sources(scene, start.emitters, self.regions), start.paths.points, PixelGrid(8, 1),
             self.max_depth, quick, derived_seed(seed, 1), level=0.0,

@@ -140,8 +140,7 @@ class ManyLightIntegrator(GatheringIntegrator):
         """Direct light of extended emitters by adaptive sampling: (radiance, rays)."""
         # Points, spots and directional emitters are virtual lights already
         sources = Sources(scene, start.emitters.extended_only(), REGIONS)
-        # Every camera ray is shaded by the method anyway: it keeps a point of its own
-        options = DirectOptions(error=self.direct_error, antialiasing=False)
+        options = DirectOptions(error=self.direct_error)
         found = light_directly(
             scene, start.traits, sources, start.paths.points, grid, self.max_depth, options,
             derived_seed(start.seed, 30), self.should_stop,

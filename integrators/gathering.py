@@ -81,6 +81,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
     """
 
     offered_aovs = ()
+    along_curve = True  # whether gather points are sorted by their place
 
     def __init__(self, props, default_depth: int):
         super().__init__(props)
@@ -126,7 +127,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         clock.lap("scene")
         skip = self.skip_area_emitters if self.hide_emitters else None
         paths = follow_camera_rays(
-            scene, emitters, traits, sampler, seed, ray, active, self.max_depth, self.rr_depth, skip
+            scene, emitters, traits, sampler, seed, ray, active, self.max_depth, self.rr_depth, skip, self.along_curve
         )
         clock.lap("gather")
         sky = emitters.environment is not None and not self.hide_emitters

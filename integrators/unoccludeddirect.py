@@ -62,7 +62,7 @@ class UnoccludedDirectIntegrator(AdaptiveDirectIntegrator):
         return DirectOptions(
             error=self.error, dark_floor=self.dark_floor, lights="unoccluded", max_samples=self.max_samples,
             max_passes=1 << 20, least_samples=self.samples_per_ray, most_samples=self.samples_per_ray,
-            bsdf_share=self.bsdf_share, antialiasing=False, time=self.time,
+            bsdf_share=self.bsdf_share, time=self.time,
         )  # fmt: skip
 
 

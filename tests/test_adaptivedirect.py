@@ -137,7 +137,7 @@ ADAPTIVE_BAD = [
     ("lights", "some"), ("lights", 3), ("lights", "unoccluded"), ("cluster_angle", -0.1), ("cluster_angle", "x"),
     ("max_passes", 0), ("max_passes", 2.0), ("samples_per_cluster", -1.0), ("samples_per_cluster", True),
     ("min_samples", 0), ("min_samples", 0.5), ("guide", "evaluate"), ("guide", True), ("combine", "variance"),
-    ("antialiasing", 1), ("antialiasing", "yes"),
+    ("shade_regions", 1), ("shade_regions", "yes"),
 ]  # fmt: skip
 BAD = [(plugin, *bad) for plugin in PLUGINS for bad in BOTH_BAD] + [
     *(("adaptivedirect", *bad) for bad in ADAPTIVE_BAD),
@@ -145,7 +145,7 @@ BAD = [(plugin, *bad) for plugin in PLUGINS for bad in BOTH_BAD] + [
 ]
 ALLOWED = {
     "lights": '"auto", "clusters", "all"', "guide": '"evaluated", "sampled"', "combine": '"fixed", "inverse_variance"',
-    "antialiasing": "true or false", "error": "a number of at least 0.0001", "samples_per_ray": "at least 2",
+    "shade_regions": "true or false", "error": "a number of at least 0.0001", "samples_per_ray": "at least 2",
     "max_samples": "an integer from 1 to 100000", "aovs": ", ".join(f'"{name}"' for name in AOVS),
 }  # fmt: skip
 
@@ -175,7 +175,7 @@ def test_properties_reach_the_sampler_under_their_own_names():
     given = {
         "error": 0.25, "dark_floor": 0.5, "lights": "clusters", "cluster_angle": 0.125, "max_passes": 7,
         "max_samples": 1234, "samples_per_cluster": 2.5, "min_samples": 77, "bsdf_share": 0.75, "guide": "sampled",
-        "combine": "inverse_variance", "antialiasing": False, "time": 9.0,
+        "combine": "inverse_variance", "shade_regions": False, "time": 9.0,
     }  # fmt: skip
     plugin = mi.load_dict({"type": "adaptivedirect", **given})
     options, text = vars(plugin.options()), str(plugin)
@@ -195,7 +195,7 @@ METHODS = {
     "clusters": ("adaptivedirect", {"lights": "clusters"}),
     "all": ("adaptivedirect", {"lights": "all"}),
     "sampled": ("adaptivedirect", {"lights": "clusters", "guide": "sampled"}),
-    "each ray": ("adaptivedirect", {"lights": "clusters", "antialiasing": False}),
+    "regions": ("adaptivedirect", {"lights": "clusters", "shade_regions": True}),
     "unoccluded": ("unoccludeddirect", {"samples_per_ray": 30}),
 }
 
@@ -204,9 +204,7 @@ METHODS = {
 def test_expectation_equals_direct(mixed, reference, method):
     plugin, more = METHODS[method]
     # So coarse an error that pixels end at very different times
-    ours = repeat(
-        mixed, plugin, 16 if method == "each ray" else 32, 1 if plugin == "unoccludeddirect" else 4, error=0.2, **more
-    )
+    ours = repeat(mixed, plugin, 32, 4, error=0.2, **more)
     assert len({image.mean() for image in ours}) == len(ours)
     assert_same_expectation(ours, reference)
 
@@ -249,7 +247,7 @@ def test_emitters_seen_by_the_camera_equal_path(mixed, plugin):
 
 def test_hidden_emitters_equal_path(mixed, reference):
     more = {"hide_emitters": True}
-    ours = repeat(mixed, "adaptivedirect", 16, 4, error=0.2, antialiasing=False, **more)
+    ours = repeat(mixed, "adaptivedirect", 16, 4, error=0.2, shade_regions=False, **more)
     hidden = repeat(mixed, "path", 16, 256, 1000, max_depth=2, **more)
     assert_same_expectation(ours, hidden)
     assert hidden.mean() < 0.95 * reference.mean()
@@ -383,9 +381,9 @@ def test_noise_is_calibrated(mixed, method):
     assert actual < 0.2
 
 
-def test_antialiasing_shades_fewer_points(mixed):
+def test_shade_regions_shades_fewer_points(mixed):
     together, alone = (
-        render(mixed, "adaptivedirect", 16, lights="clusters", error=0.1, antialiasing=on, aovs="regions")[..., 3]
+        render(mixed, "adaptivedirect", 16, lights="clusters", error=0.1, shade_regions=on, aovs="regions")[..., 3]
         for on in (True, False)
     )
     assert together.max() <= 16 and alone.max() == 16

@@ -395,7 +395,7 @@ def test_sites_are_the_pairs_of_group_and_pixel(seed, count, groups, size):
     rng = np.random.default_rng(seed)
     group = np.unique(rng.integers(0, groups, count), return_inverse=True)[1]
     pixel = rng.integers(0, size, count)
-    sites = find_sites(group, pixel, np.random.default_rng(0))
+    sites = find_sites(group, pixel)
     assert np.array_equal(sites.group[sites.point_site], group)
     assert np.array_equal(sites.pixel[sites.point_site], pixel)
     pairs = np.stack([sites.group, sites.pixel], 1).tolist()
@@ -420,7 +420,7 @@ def test_sites_are_the_pairs_of_group_and_pixel(seed, count, groups, size):
 
 def bounds(group, position, normal, two_sided=None):
     group = np.asarray(group)
-    sites = find_sites(group, np.arange(len(group))[::-1], np.random.default_rng(0))
+    sites = find_sites(group, np.arange(len(group))[::-1])
     two_sided = np.zeros(len(group), bool) if two_sided is None else np.asarray(two_sided)
     return bound_groups(sites, position, normal, two_sided)
 
@@ -444,7 +444,7 @@ def test_groups_contain_their_points_and_normals(seed, count, spread):
         assert np.array_equal(found.low[g], inside.min(0))
         assert np.array_equal(found.high[g], inside.max(0))
         # As narrow as may be around this axis
-        assert found.cone_cos[g] == pytest.approx(max(cosine[group == g].min(), -1), abs=1e-5)
+        assert found.cone_cos[g] == pytest.approx(max(cosine[group == g].min(), -1), abs=3e-5)
     if spread < 1e-3:
         assert (found.cone_cos > 0.999).all()
 
@@ -453,7 +453,7 @@ def test_opposite_normals_fill_the_whole_cone():
     found = bounds([0, 0, 1], np.zeros((3, 3)), np.array([UP, DOWN, UP]))
     assert found.cone_cos[0] == -1
     assert np.linalg.norm(found.axis[0]) == pytest.approx(1)
-    assert found.cone_cos[1] == pytest.approx(1, abs=1e-5)
+    assert found.cone_cos[1] == pytest.approx(1, abs=3e-5)
 
 
 def test_one_two_sided_point_opens_the_cone_of_its_group_alone():

@@ -23,7 +23,7 @@ from .arrays import download, upload
 from .cluster_cuts import GroupCuts, cut_clusters, has_wide_source
 from .gather import GatherPoints
 from .pixel_regions import representatives
-from .point_groups import Sites, bound_groups, find_groups, find_sites
+from .point_groups import Sites, bound_groups, divide_points
 from .proxies import probe_materials
 from .sampling import derived_seed
 from .site_passes import SitePasses
@@ -58,7 +58,7 @@ class DirectOptions:
     evaluated: bool = True
     prior: float = 1.0
     inverse_variance: bool = False
-    antialiasing: bool = True
+    shade_regions: bool = False
     time: float = 0.0
 
 
@@ -123,14 +123,15 @@ class _BatchLight:
         pixel = download(points.ray)[self.rows].astype(np.int64) // grid.samples
         position, normal = download(batch.position), download(batch.normal)
         generator = np.random.default_rng(seed)
+        self._single = options.lights == "unoccluded"  # sources instead of clusters
         self._standing = np.arange(batch.count)
-        if options.antialiasing and grid.samples > 1:
+        if options.shade_regions and grid.samples > 1:
             # What is seen by way of a mirror is no neighbour of what is seen directly
             surface = download(dr.reinterpret_array(mi.UInt32, points.si.shape)).astype(np.int64) << 8
             surface += np.minimum(download(points.depth), 255)
             self._standing = representatives(pixel, surface[self.rows], position, normal, generator)
-        group = _groups_of(self._standing, pixel, grid.width, position, normal)
-        self.sites = find_sites(group, pixel, generator)
+        # Only the reference method takes the points of a site in their order
+        self.sites = divide_points(pixel, grid.width, position, normal, generator if self._single else None)
         two_sided = np.zeros(batch.count, bool)
         if batch.proxy.without_cosines:
             two_sided |= download(batch.proxy.no_cosine)
@@ -201,7 +202,7 @@ class _BatchLight:
         if summed:
             entries = self._held[groups]
         else:
-            size = self._held if self.options.lights == "unoccluded" else self._cuts.size
+            size = self._held if self._single else self._cuts.size
             entries = size[groups] * np.diff(self.sites.group_first)[groups]
         entries, first = np.cumsum(entries), 0
         while first < len(groups):
@@ -212,7 +213,7 @@ class _BatchLight:
 
     def _light(self, groups, summed: bool, level, seed, halted):
         """Light some groups: (their sites, what :meth:`SitePasses.result` says of them)."""
-        single = summed or self.options.lights == "unoccluded"
+        single = summed or self._single
         part, cuts = _select(self.sites, self._cuts, groups)
         scenery, share, bsdf = self._task(part, self._cut(groups, 0.0) if single else cuts, groups)
         if summed:
@@ -220,7 +221,7 @@ class _BatchLight:
             method = SourceRounds(scenery, part, share, bsdf * (self.options.lights == "all"), level, self.options)
             method.run(seed, halted)
         else:
-            method = (UnoccludedPasses if single else SitePasses)(scenery, share, bsdf, level, self.options)
+            method = (UnoccludedPasses if self._single else SitePasses)(scenery, share, bsdf, level, self.options)
             method.run(self._two_sided, seed, halted)
         return part, method.result()
 
@@ -232,12 +233,6 @@ class _BatchLight:
             np.repeat(np.arange(part.count), part.points), self._standing[part.order] == part.order, part.count
         )
         return np.concatenate([radiance, np.stack([noise, passes, rays / part.points, regions, visible], 1)], 1)
-
-
-def _groups_of(standing, pixel, width, position, normal) -> np.ndarray:
-    """Group of every point: that of the point which stands for it."""
-    shaded, place = np.unique(standing, return_inverse=True)
-    return find_groups(pixel[shaded], width, position[shaded], normal[shaded])[place]
 
 
 def _halted(stopped, until: float, number: int) -> bool:

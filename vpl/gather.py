@@ -54,7 +54,7 @@ def shape_in(shape, indices: tuple):
 
 @dataclass
 class GatherPoints:
-    """Points to be shaded, in Morton order of their positions.
+    """Points to be shaded, in Morton order of their positions or in the order of their camera rays.
 
     ``si``: surface interactions (evaluated); ``ray``: index of the camera ray that each belongs to; ``weight``: what
     radiance leaving the point contributes to that ray; ``depth``: edges from the camera to the point.
@@ -198,8 +198,10 @@ def _morton_order(position: np.ndarray) -> np.ndarray:
     return np.argsort(interleave(np.minimum(cell, 1023)), kind="stable")
 
 
-def follow_camera_rays(scene, emitters, traits, sampler, seed, ray, active, max_depth, rr_depth, skip=None):
-    """Trace camera rays to their gather points.
+def follow_camera_rays(
+    scene, emitters, traits, sampler, seed, ray, active, max_depth, rr_depth, skip=None, along_curve=True
+):
+    """Trace camera rays to their gather points, which are returned along a Morton curve, or in the rays' order.
 
     ``ray``: a wavefront of camera rays, of which those not ``active`` give nothing; ``max_depth``, ``rr_depth`` as in
     Mitsuba's ``path`` (math.inf: no limit); ``skip``: with ``hide_emitters``, the integrator's method that looks past
@@ -241,13 +243,13 @@ def follow_camera_rays(scene, emitters, traits, sampler, seed, ray, active, max_
         ray.maxt = dr.full(mi.Float, dr.largest(mi.Float), len(onward))
         depth, active = depth + 1, dr.full(mi.Bool, True, len(onward))
         sampler = independent_sampler(derived_seed(seed, 3, depth), len(onward))
-    return CameraPaths(emission, valid, _collect(*found))
+    return CameraPaths(emission, valid, _collect(*found, along_curve))
 
 
-def _collect(mask, si, weight, depth) -> GatherPoints:
-    """Compact the lanes that hold a gather point and put them in Morton order."""
+def _collect(mask, si, weight, depth, along_curve: bool) -> GatherPoints:
+    """Compact the lanes that hold a gather point, and put them in Morton order if that is asked for."""
     lanes = dr.compress(mask)
-    if len(lanes):
+    if len(lanes) and along_curve:
         order = _morton_order(download(dr.gather(mi.Point3f, si.p, lanes)))
         lanes = dr.gather(mi.UInt32, lanes, upload(mi.UInt32, order))
     points = GatherPoints(*(dr.gather(type(x), x, lanes) for x in (si, lanes, weight, depth)))

@@ -20,6 +20,7 @@ from .cluster_cuts import PointGroups
 BLOCK = 8  # pixels along the side of a block [IAS section 4]
 # A group falls apart at a gap of more than this share of its extent, in as many rounds at most
 _GAP, _ROUNDS = 0.3, 3
+_SLACK = 1e-5  # of cosines in single precision
 
 
 @dataclass
@@ -92,18 +93,38 @@ def _split_at_gaps(group, position) -> np.ndarray:
     return np.unique(refined, return_inverse=True)[1]
 
 
-def find_sites(group: np.ndarray, pixel: np.ndarray, generator) -> Sites:
-    """The sites of points in the groups and pixels given, both (n,).
+def divide_points(pixel, width: int, position, normal, generator=None) -> Sites:
+    """Divide points into sites and groups; arguments as in :func:`find_groups`.
 
-    ``generator``: of NumPy; it shuffles the points of each site.
+    The points of one pixel and class are a site, which goes to the group of the first of them.  ``generator``: of
+    NumPy; if there is one, it shuffles the points of each site.
     """
+    key = pixel * 6 + normal_class(normal)
+    count = np.bincount(key)
+    kept = np.flatnonzero(count)
+    first = np.empty(len(count), np.int64)
+    first[key[::-1]] = np.arange(len(key))[::-1]
+    first = first[kept]
+    few = find_sites(find_groups(pixel[first], width, position[first], normal[first]), pixel[first])
+    count[kept] = few.point_site
+    site = count[key]
+    order = (
+        np.argsort(site, kind="stable") if generator is None else np.lexsort((generator.permutation(len(key)), site))
+    )
+    return Sites(
+        few.group, few.pixel, site, order, np.concatenate([[0], np.cumsum(np.bincount(site))]), few.group_first
+    )
+
+
+def find_sites(group: np.ndarray, pixel: np.ndarray) -> Sites:
+    """The sites of points in the groups and pixels given, both (n,)."""
     key, site, counts = np.unique(
         group.astype(np.int64) * (int(pixel.max()) + 1) + pixel, return_inverse=True, return_counts=True
     )
     of_site = key // (int(pixel.max()) + 1)
     group_first = np.searchsorted(of_site, np.arange(of_site[-1] + 2))
     return Sites(
-        of_site, key % (int(pixel.max()) + 1), site, np.lexsort((generator.permutation(len(pixel)), site)),
+        of_site, key % (int(pixel.max()) + 1), site, np.argsort(site, kind="stable"),
         np.concatenate([[0], np.cumsum(counts)]), group_first,
     )  # fmt: skip
 
@@ -114,12 +135,13 @@ def bound_groups(sites: Sites, position, normal, two_sided: np.ndarray) -> Point
     ``two_sided`` (n,): points that are lit from both sides.
     """
     first = sites.first[sites.group_first[:-1]]
-    position, normal = (np.asarray(values, np.float64)[sites.order] for values in (position, normal))
-    total = np.add.reduceat(normal, first)
+    position, normal = position[sites.order], normal[sites.order]
+    total = np.add.reduceat(normal, first, dtype=np.float64)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     axis = np.where(length > 0, total / np.where(length > 0, length, 1), normal[first])
     points = np.diff(np.append(first, len(position)))
     cosine = np.einsum("ij,ij->i", normal, np.repeat(axis, points, axis=0))
-    least = np.clip(np.minimum.reduceat(cosine, first) - 1e-6, -1, 1)
+    least = np.clip(np.minimum.reduceat(cosine, first) - _SLACK, -1, 1)
     least[np.logical_or.reduceat(two_sided[sites.order], first)] = -1
-    return PointGroups(np.minimum.reduceat(position, first), np.maximum.reduceat(position, first), axis, least)
+    low, high = (of.reduceat(position, first).astype(np.float64) for of in (np.minimum, np.maximum))
+    return PointGroups(low, high, axis, least)
