@@ -1,7 +1,8 @@
 """From camera rays to gather points: through mirrors, glass and masks to the first surface that a light can reach.
 
 Every camera ray ends in at most one gather point.  Where a surface has both a delta and a smooth lobe (plastic, masks)
-one of the two is followed, chosen by their reflectances, with the matching weight.
+one of the two is followed, chosen by their reflectances, with the matching weight; at the last surface that can be
+gathered both are.
 """
 
 from __future__ import annotations
@@ -119,10 +120,10 @@ def refuse_media(scene) -> None:
             )
 
 
-def _follow_delta(si, bsdf, flags, sample1, sample2, choice):
-    """Choose between the delta and the smooth lobes of a surface.
+def _follow_delta(si, bsdf, flags, both, sample1, sample2, choice):
+    """Choose between the delta and the smooth lobes of a surface, or take ``both``.
 
-    Returns (followed, direction, weight of the delta side, eta), (weight of the smooth side).
+    Returns (delta side taken, smooth side taken, direction, weight of the delta side, eta, weight of the smooth side).
     """
     context = mi.BSDFContext()
     context.type_mask = mi.BSDFFlags.Delta
@@ -136,8 +137,11 @@ def _follow_delta(si, bsdf, flags, sample1, sample2, choice):
     smooth = mi.has_flag(flags, mi.BSDFFlags.Smooth) & (opaque > 0)
     probability = dr.clip(delta_level / (delta_level + smooth_level), _LEAST_PROBABILITY, 1 - _LEAST_PROBABILITY)
     probability = dr.select(delta_level > 0, dr.select(smooth, probability, 1), 0)
-    followed = choice < probability
-    return followed, si.to_world(sample.wo), weight / probability, sample.eta, dr.rcp(1 - probability)
+    followed = dr.select(both, delta_level > 0, choice < probability)
+    delta_share, smooth_share = dr.select(both, 1, probability), dr.select(both, 1, 1 - probability)
+    return (
+        followed, both | ~followed, si.to_world(sample.wo), weight / delta_share, sample.eta, dr.rcp(smooth_share),
+    )  # fmt: skip
 
 
 def emitted_towards(emitters: Emitters, si, active=True):
@@ -171,11 +175,13 @@ def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughpu
 
     bsdf = si.bsdf(ray)
     flags = bsdf.flags()
-    goes_on, smooth_weight = mi.Bool(False), mi.Float(1)
+    goes_on, stays, smooth_weight = mi.Bool(False), mi.Bool(True), mi.Float(1)
     direction, following, eta = mi.Vector3f(0, 0, 1), mi.UnpolarizedSpectrum(0), mi.Float(1)
     if traits.delta:
-        goes_on, direction, following, eta, smooth_weight = _follow_delta(si, bsdf, flags, *random[:3])
-    gathered = hit & mi.has_flag(flags, mi.BSDFFlags.Smooth) & ~goes_on & (depth < max_depth)
+        # Where the next surface cannot be gathered any more, both sides are taken: neither costs a gather point more
+        both = depth + 1 == max_depth
+        goes_on, stays, direction, following, eta, smooth_weight = _follow_delta(si, bsdf, flags, both, *random[:3])
+    gathered = hit & mi.has_flag(flags, mi.BSDFFlags.Smooth) & stays & (depth < max_depth)
     weight = throughput * smooth_weight
     if traits.delta:
         following *= throughput
@@ -230,8 +236,9 @@ def follow_camera_rays(
             dr.eval(found)
         else:
             dr.scatter_add(emission, emitted, lane)
+            # Rays that went on beside a gather point find no other
             for target, value in zip(found, (*gathered, mi.UInt32(depth)), strict=True):
-                dr.scatter(target, value, lane)
+                dr.scatter(target, value, lane, gathered[0])
         if not traits.delta:
             break
         onward = dr.compress(going[0])
