@@ -74,7 +74,7 @@ class Problem:
         return compare(np.array(image, np.float64)[..., :3], known.image, known.standard_error)["relmse_trimmed"]
 
     def race(self, ours: str, methods: dict) -> dict:
-        """Render with {label: (plugin, its properties, samples)}: ``ours`` before every second of the others and at the end.
+        """Render with {label: (plugin, its properties, samples)}: ``ours`` now and then, and at the end.
 
         Returns {label: (median of the seconds, mean relMSE, mean rays per pixel)}.
         """
