@@ -23,6 +23,7 @@ LEAST_HALF = 4  # samples of a half in a pass: fewer say nothing about the varia
 _INCREMENT = 25  # samples, where little is missing [IAS section 5.8]
 # Nothing is called black before so many passes and samples without light [IAS section 5.9]
 _BLACK_PASSES, _BLACK_SAMPLES = 3, 250
+_BLACK_LEAST = 48  # however small a part of its pixel a site is
 _BSDF_LEAST = 2
 _LEAST_VARIANCE = 0.01  # of a pass, relative to the mean over sites, where passes are weighted by it
 # Shares of the uniform function after the first pass, and how the block's gives way to the pixel's [IAS fig. 2]
@@ -144,7 +145,8 @@ class SitePasses:
         few = np.minimum(np.maximum(missing, np.ceil(_INCREMENT * self.share / 2)), full)
         wanted = np.where(excess >= 2, full, np.maximum(few, LEAST_HALF))
         dark = self.seen == 0
-        black = (number + 1 >= _BLACK_PASSES) & (2 * self.samples >= _BLACK_SAMPLES * self.share)
+        enough = np.maximum(_BLACK_SAMPLES * self.share, _BLACK_LEAST)
+        black = (number + 1 >= _BLACK_PASSES) & (2 * self.samples >= enough)
         wanted = np.where(dark, np.where(black, 0, full), np.where(excess <= 1, 0, wanted))
         wanted = np.where(self.size > 0, wanted, 0).astype(np.int64)[::-1]
         left = np.floor(options.max_samples * self.share / 2 - self.samples).astype(np.int64)
