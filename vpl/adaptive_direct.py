@@ -143,7 +143,7 @@ class _BatchLight:
         """Cuts of all groups, which of them sum over all sources, and their share of BSDF samples."""
         options, count = self.options, self._bounds.count
         self._cuts = self._cut(np.arange(count), options.solid_angle)
-        group = np.repeat(np.arange(count), self._cuts.size)
+        group = self._cuts.group
         held = (self.nodes.last.astype(np.int64) - self.nodes.first)[self._cuts.node]
         # Sources of each group, and how many of them have an extent
         self._held, extended = (np.bincount(group, x, count) for x in (held, self.nodes.extended[self._cuts.node]))
@@ -164,11 +164,11 @@ class _BatchLight:
     def pilot(self, seed: int) -> float:
         """Mean radiance of the batch's points, roughly: one pass over some of the groups."""
         order = np.random.default_rng(seed).permutation(self._bounds.count)
-        sites = np.diff(self.sites.group_first)[order]
+        sites = self.sites.per_group[order]
         enough = (np.cumsum(sites) <= _PILOT_SITES) & (np.cumsum(sites * self._cuts.size[order]) <= _ENTRIES)
         chosen = np.sort(order[: max(1, int(enough.sum()))])
-        part, cuts = _select(self.sites, self._cuts, chosen)
-        passes = SitePasses(*self._task(part, cuts, chosen), 0.0, self.options)
+        part = self.sites.select(chosen)
+        passes = SitePasses(*self._task(part, self._cuts.select(chosen), chosen), 0.0, self.options)
         passes.max_passes = 1
         passes.run(self._two_sided, seed, lambda number: False)
         return float(np.average(passes.result()[0].mean(1), weights=part.points))
@@ -192,8 +192,7 @@ class _BatchLight:
                 until = start + (deadline - start) * spent / len(self._summed)
                 halted = partial(_halted, stopped, until)
                 part, result = self._light(groups, summed, level, derived_seed(seed, number), halted)
-                sites = np.concatenate([np.arange(*self.sites.group_first[[g, g + 1]]) for g in groups])
-                per_site[sites] = self._columns(part, result)
+                per_site[self.sites.of_groups(groups)] = self._columns(part, result)
                 number += 1
         return per_site[self.sites.point_site]
 
@@ -203,7 +202,7 @@ class _BatchLight:
             entries = self._held[groups]
         else:
             size = self._held if self._single else self._cuts.size
-            entries = size[groups] * np.diff(self.sites.group_first)[groups]
+            entries = size[groups] * self.sites.per_group[groups]
         entries, first = np.cumsum(entries), 0
         while first < len(groups):
             before = entries[first - 1] if first else 0
@@ -214,8 +213,8 @@ class _BatchLight:
     def _light(self, groups, summed: bool, level, seed, halted):
         """Light some groups: (their sites, what :meth:`SitePasses.result` says of them)."""
         single = summed or self._single
-        part, cuts = _select(self.sites, self._cuts, groups)
-        scenery, share, bsdf = self._task(part, self._cut(groups, 0.0) if single else cuts, groups)
+        part, cuts = self.sites.select(groups), self._cut(groups, 0.0) if single else self._cuts.select(groups)
+        scenery, share, bsdf = self._task(part, cuts, groups)
         if summed:
             # Where it was chosen by itself, no source has an extent
             method = SourceRounds(scenery, part, share, bsdf * (self.options.lights == "all"), level, self.options)
@@ -238,19 +237,3 @@ class _BatchLight:
 def _halted(stopped, until: float, number: int) -> bool:
     """Whether to stop before a pass; for want of time never before the first."""
     return stopped() or (number > 0 and perf_counter() > until)
-
-
-def _select(sites: Sites, cuts: GroupCuts, groups: np.ndarray) -> tuple[Sites, GroupCuts]:
-    """The sites and cuts of some groups, which are numbered anew."""
-
-    def ranges(first, chosen):
-        size = np.diff(first)[chosen]
-        ends = np.cumsum(size)
-        return np.repeat(first[:-1][chosen] - ends + size, size) + np.arange(size.sum()), np.concatenate([[0], ends])
-
-    chosen, group_first = ranges(sites.group_first, groups)
-    points, first = ranges(sites.first, chosen)
-    nodes, cut_first = ranges(cuts.first, groups)
-    group = np.repeat(np.arange(len(groups)), np.diff(group_first))
-    part = Sites(group, sites.pixel[chosen], sites.point_site, sites.order[points], first, group_first)
-    return part, GroupCuts(cuts.node[nodes], cut_first)

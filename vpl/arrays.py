@@ -48,6 +48,11 @@ def download(values):
     return np.stack(np.broadcast_arrays(*(download(channel) for channel in values)), axis=1)
 
 
+def ranges(first: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """The numbers first[i] .. first[i] + size[i] - 1 for one i after another, of NumPy arrays."""
+    return np.repeat(first - np.cumsum(size) + size, size) + np.arange(size.sum())
+
+
 def add_at(target, values, index):
     """Add values to some entries of an array, several to the same one if need be; to be evaluated by the caller.
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .arrays import ranges
 from .sources import Nodes
 
 # Sources without neighbours that fill more than this, in steradians, are hard to sample by area alone
@@ -52,6 +53,16 @@ class GroupCuts:
         """(g,) int64, clusters of each group."""
         return np.diff(self.first)
 
+    @property
+    def group(self) -> np.ndarray:
+        """The group of every entry of ``node``."""
+        return np.repeat(np.arange(len(self.size)), self.size)
+
+    def select(self, groups: np.ndarray) -> GroupCuts:
+        """The cuts of some groups."""
+        size = self.size[groups]
+        return GroupCuts(self.node[ranges(self.first[groups], size)], np.concatenate([[0], np.cumsum(size)]))
+
     def without_empty(self) -> GroupCuts:
         """The same with the first node for groups that have none."""
         empty = np.flatnonzero(self.size == 0)
@@ -62,7 +73,7 @@ class GroupCuts:
 
 def cut_clusters(nodes: Nodes, groups: PointGroups, solid_angle: float) -> GroupCuts:
     """The coarsest clusters that fill at most ``solid_angle`` steradians each, per group; 0 gives single sources."""
-    roots, pairs, first = _roots(nodes), [np.zeros((2, 0), np.int64)], 0
+    roots, pairs = _roots(nodes), [np.zeros((2, 0), np.int64)]
     # How far cuts go down is not known: few groups at a time where there are many nodes
     step = max(1, _PAIRS // max(1, min(nodes.count, _USUAL_CUT) if solid_angle > 0 else nodes.count))
     for first in range(0, groups.count, step):
@@ -84,8 +95,7 @@ def cut_clusters(nodes: Nodes, groups: PointGroups, solid_angle: float) -> Group
 
 def has_wide_source(nodes: Nodes, groups: PointGroups, cuts: GroupCuts) -> np.ndarray:
     """Whether a group's cut has a source at a finite place that fills a large solid angle, (g,) bool."""
-    group = np.repeat(np.arange(groups.count), cuts.size)
-    node = cuts.node.astype(np.int64)
+    group, node = cuts.group, cuts.node.astype(np.int64)
     nearest = np.clip(nodes.center[node], groups.low[group], groups.high[group]) - nodes.center[node]
     wide = np.square(nodes.radius[node]) > _squared_sine(_WIDE) * np.einsum("ij,ij->i", nearest, nearest)
     return np.bincount(group, wide & (nodes.radius[node] > 0), groups.count) > 0

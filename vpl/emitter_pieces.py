@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from .arrays import download, select_record, upload
-from .lights import AreaEmitters, finite_or_zero
+from .lights import AreaEmitters, finite_or_zero, registered_shapes
 
 PARALLELOGRAM, TRIANGLE, DISK, SPHERE, SHAPE = range(5)
 
@@ -248,8 +248,7 @@ def _joined(parts: list[_Pieces], name: str) -> np.ndarray:
 
 
 def _shapes_of(scene, area: AreaEmitters) -> list:
-    registry = download(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())) if scene.shapes() else []
-    by_index = dict(zip((int(index) for index in registry), scene.shapes(), strict=True))
+    by_index = dict(registered_shapes(scene))
     return [by_index[int(index)] for index in area.shape_index]
 
 

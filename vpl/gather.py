@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from .arrays import channel_mean, download, ones, upload
-from .lights import Emitters, finite_or_zero
+from .lights import Emitters, finite_or_zero, registered_shapes
 from .morton import interleave
 from .sampling import derived_seed, independent_sampler
 
@@ -87,13 +87,12 @@ class CameraPaths:
 def scene_traits(scene) -> SceneTraits:
     """Union of the flags of all BSDFs; scenes with instances are taken to have all of them."""
     flags, perturbed, open_shapes, instances = 0, [], {}, False
-    registry = download(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())) if scene.shapes() else []
-    for index, shape in zip(registry, scene.shapes(), strict=True):
+    for index, shape in registered_shapes(scene):
         bsdf = shape.bsdf()
         if any(name in str(bsdf) for name in ("BumpMap[", "NormalMap[")):
-            perturbed.append(int(index))
+            perturbed.append(index)
         if bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null):
-            open_shapes[int(index)] = shape
+            open_shapes[index] = shape
         flags |= int(bsdf.flags()) if bsdf is not None else ~0
         if shape.class_name() in ("Instance", "ShapeGroup"):
             flags, instances = ~0, True

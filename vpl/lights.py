@@ -201,11 +201,16 @@ def _textured_radiance(emitter, shape) -> np.ndarray:
     return np.broadcast_to(radiance.mean(0, dtype=np.float64), (3,)).astype(np.float32)
 
 
+def registered_shapes(scene) -> list:
+    """(Registry index, shape) of all shapes of a scene."""
+    registry = download(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())) if scene.shapes() else []
+    return [(int(index), shape) for index, shape in zip(registry, scene.shapes(), strict=True)]
+
+
 def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
     """Area emitters, the number of rows with values that are not finite, and emitters that only look like areas."""
     indices, radiances, textured, unusual = [], [], [], []
-    registry = download(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())) if scene.shapes() else []
-    glowing = [(i, shape) for i, shape in zip(registry, scene.shapes(), strict=True) if shape.is_emitter()]
+    glowing = [(index, shape) for index, shape in registered_shapes(scene) if shape.is_emitter()]
     # Mitsuba loads shapes in parallel, in an order that changes from run to run; the same seed must give the same image
     glowing.sort(key=lambda row: (row[1].id(), *map(float, (*row[1].bbox().min, *row[1].bbox().max))))
     for index, shape in glowing:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .arrays import ranges
 from .cluster_cuts import PointGroups
 
 BLOCK = 8  # pixels along the side of a block [IAS section 4]
@@ -44,6 +45,25 @@ class Sites:
     def points(self) -> np.ndarray:
         """(s,) int64, points of every site."""
         return np.diff(self.first)
+
+    @property
+    def per_group(self) -> np.ndarray:
+        """(g,) int64, sites of every group."""
+        return np.diff(self.group_first)
+
+    def of_groups(self, groups: np.ndarray) -> np.ndarray:
+        """The sites of some groups, group by group."""
+        return ranges(self.group_first[groups], self.per_group[groups])
+
+    def select(self, groups: np.ndarray) -> Sites:
+        """The sites of some groups, which are numbered anew; ``point_site`` stays that of the whole."""
+        chosen, size = self.of_groups(groups), self.per_group[groups]
+        points = self.points[chosen]
+        return Sites(
+            np.repeat(np.arange(len(groups)), size), self.pixel[chosen], self.point_site,
+            self.order[ranges(self.first[chosen], points)], np.concatenate([[0], np.cumsum(points)]),
+            np.concatenate([[0], np.cumsum(size)]),
+        )  # fmt: skip
 
 
 def normal_class(normal: np.ndarray) -> np.ndarray:

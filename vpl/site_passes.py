@@ -13,13 +13,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import download, upload
+from .arrays import download, ranges, upload
 from .cluster_probabilities import Mixture, sum_over_groups, update_importance, update_probabilities
 from .cluster_sampling import draw_samples
 from .sampling import derived_seed
 from .site_table import Lanes, Scenery, Statistics
 
-LEAST_HALF = 4  # samples of a half in a pass: fewer say nothing about the variance
+_LEAST_HALF = 4  # samples of a half in a pass: fewer say nothing about the variance
 _INCREMENT = 25  # samples, where little is missing [IAS section 5.8]
 # Nothing is called black before so many passes and samples without light [IAS section 5.9]
 _BLACK_PASSES, _BLACK_SAMPLES = 3, 250
@@ -103,8 +103,7 @@ class SitePasses:
     def _places(self, active: np.ndarray) -> np.ndarray:
         """Where the nodes of the cuts of some sites' groups are."""
         first, at = np.unique(self.cut[active], return_index=True)
-        size = self.size[active[at]]
-        return np.repeat(first - np.cumsum(size) + size, size) + np.arange(size.sum())
+        return ranges(first, self.size[active[at]])
 
     def _mixture(self, number: int) -> Mixture:
         """Shares of the three functions in a pass [IAS fig. 2]: first uniform, then mostly the block's, more and more
@@ -119,7 +118,7 @@ class SitePasses:
         options = self.options
         of_pixel = np.clip(options.samples_per_cluster * self.size, options.least_samples, options.most_samples)
         of_pixel = np.minimum(of_pixel, options.max_samples)
-        half = np.maximum(np.ceil(of_pixel * self.share / 2).astype(np.int64), LEAST_HALF)
+        half = np.maximum(np.ceil(of_pixel * self.share / 2).astype(np.int64), _LEAST_HALF)
         return np.where(self.size > 0, half, 0) * np.ones((2, 1), np.int64)
 
     def _estimates(self):
@@ -143,14 +142,14 @@ class SitePasses:
         excess = expected / np.maximum(allowed, np.finfo(np.float64).tiny)
         missing = np.ceil(np.minimum(excess - 1, 1) * samples[::-1])
         few = np.minimum(np.maximum(missing, np.ceil(_INCREMENT * self.share / 2)), full)
-        wanted = np.where(excess >= 2, full, np.maximum(few, LEAST_HALF))
+        wanted = np.where(excess >= 2, full, np.maximum(few, _LEAST_HALF))
         dark = self.seen == 0
         enough = np.maximum(_BLACK_SAMPLES * self.share, _BLACK_LEAST)
         black = (number + 1 >= _BLACK_PASSES) & (2 * self.samples >= enough)
         wanted = np.where(dark, np.where(black, 0, full), np.where(excess <= 1, 0, wanted))
         wanted = np.where(self.size > 0, wanted, 0).astype(np.int64)[::-1]
         left = np.floor(options.max_samples * self.share / 2 - self.samples).astype(np.int64)
-        return np.where(left >= LEAST_HALF, np.minimum(wanted, left), 0)
+        return np.where(left >= _LEAST_HALF, np.minimum(wanted, left), 0)
 
     def result(self):
         """Per site: radiance (s, 3), its estimated variance, passes, rays, and the share of samples that saw light."""

@@ -52,12 +52,11 @@ class SiteTable:
         """``member_row``: for every point along ``sites.order``, the row in the batch that stands for it."""
         size = cuts.size[sites.group]
         entry = np.concatenate([[0], np.cumsum(size)])
-        group = np.repeat(np.arange(len(cuts.size)), cuts.size)
-        sites_of = np.diff(sites.group_first)
+        group = cuts.group
         local = np.arange(len(cuts.node)) - cuts.first[group]
         columns = (
             size, cuts.first[sites.group], entry[:-1], sites.first[:-1], sites.points, member_row, cuts.node,
-            entry[sites.group_first[group]] + local, cuts.size[group], sites_of[group],
+            entry[sites.group_first[group]] + local, cuts.size[group], sites.per_group[group],
         )  # fmt: skip
         return cls(*(upload(mi.UInt32, column) for column in columns), int(entry[-1]))
 

@@ -94,7 +94,6 @@ class Sources:
             0 if self._regions is None else self._regions.count, len(self._others),
         )  # fmt: skip
         self._begin = np.concatenate([[0], np.cumsum(counts)])
-        self._counts = counts
         self._device = [
             DeviceLights(lights) if lights.count else None
             for lights in (emitters.points, emitters.spots, emitters.directional)

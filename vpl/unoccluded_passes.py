@@ -15,14 +15,15 @@ import numpy as np
 from .arrays import download, upload
 from .cluster_probabilities import Mixture, update_importance, update_probabilities
 from .sampling import derived_seed
-from .site_passes import LEAST_HALF, SitePasses
+from .site_passes import SitePasses
 from .site_table import Statistics
 
 _LEAST_PASSES = 4  # of each half: fewer say nothing about the variance between points
 
 
 class UnoccludedPasses(SitePasses):
-    """Passes over one point of every site after another.  ``options.least_samples``: emitter samples at each."""
+    """Passes over one point of every site after another.  ``options.least_samples`` and ``most_samples``:
+    emitter samples at each."""
 
     def __init__(self, scenery, share, bsdf_share, level, options):
         super().__init__(scenery, share, bsdf_share, level, options)
@@ -76,10 +77,6 @@ class UnoccludedPasses(SitePasses):
         self.levels[half] += found
         self.squares[half] += np.square(found)
         self.done[half] += taken > 0
-
-    def _full_pass(self) -> np.ndarray:
-        half = np.maximum(np.ceil(self.options.least_samples * self.share / 2).astype(np.int64), LEAST_HALF)
-        return np.where(self.size > 0, half, 0) * np.ones((2, 1), np.int64)
 
     def _estimates(self):
         """Radiance and variance of both halves; between the passes where these stand on different points."""
