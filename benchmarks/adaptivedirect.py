@@ -5,7 +5,8 @@
 table   direct light (``max_depth`` 2) of each scene at the same convergence rule: seconds, shadow rays per pixel and
         relMSE of ``adaptivedirect`` and ``unoccludeddirect``; and how long that one, ``lights="all"``, ``direct`` and
         ``path`` would take for the same relMSE.
-paper   the same with the method as the paper prints it: ``guide="sampled"``, ``combine="inverse_variance"``.
+paper   the same with the method as the paper prints it: ``guide="sampled"``, ``combine="inverse_variance"``,
+        ``faint_share=0``.
 lights  the hall with 100 to 100 000 lights: seconds to the same error.
 cold    first render in a fresh process with an empty kernel cache.
 
@@ -42,7 +43,7 @@ NAMES = (
     "living_room",
 )  # fmt: skip
 RAYS, REFERENCE_ERROR, REFERENCE_RENDERS = 64, 0.015, 4
-PAPER = {"guide": "sampled", "combine": "inverse_variance", "pass_limit": 20_000}
+PAPER = {"guide": "sampled", "combine": "inverse_variance", "pass_limit": 20_000, "faint_share": 0.0}
 
 
 class Problem:

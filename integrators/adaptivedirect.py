@@ -50,6 +50,11 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
        - |float|
        - Largest solid angle of a cluster as seen from a point, in steradians. (Default: 0.02)
 
+     * - faint_share
+       - |float|
+       - Clusters that would send less than this share of the light at a group of points, if nothing was between, may
+         fill up to 0.3 steradians. 0: none may, as in the paper. (Default: 0.005)
+
      * - max_passes
        - |int|
        - Most passes over a pixel. (Default: 15)
@@ -118,8 +123,8 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
     offered_aovs = FIELDS
     along_curve = False  # the pixels' points stay together
     own_properties = (
-        "lights", "cluster_angle", "max_passes", "samples_per_cluster", "min_samples", "pass_limit", "guide", "combine",
-        "shade_regions",
+        "lights", "cluster_angle", "faint_share", "max_passes", "samples_per_cluster", "min_samples", "pass_limit",
+        "guide", "combine", "shade_regions",
     )  # fmt: skip
 
     def __init__(self, props):
@@ -137,6 +142,7 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
         """The properties of this method alone."""
         self.lights = properties.choice(props, "lights", "auto", ("auto", "clusters", "all"))
         self.cluster_angle = properties.number(props, "cluster_angle", 0.02, 0)
+        self.faint_share = properties.number(props, "faint_share", 0.005, 0)
         self.max_passes = properties.integer(props, "max_passes", 15, 1)
         self.samples_per_cluster = properties.number(props, "samples_per_cluster", 1.5, 0)
         self.min_samples = properties.integer(props, "min_samples", 50, 1)
@@ -150,9 +156,9 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
         evaluated = self.guide == "evaluated"
         return DirectOptions(
             error=self.error, dark_floor=self.dark_floor, lights=self.lights, solid_angle=self.cluster_angle,
-            max_passes=self.max_passes, max_samples=self.max_samples, samples_per_cluster=self.samples_per_cluster,
-            least_samples=self.min_samples, most_samples=self.pass_limit, bsdf_share=self.bsdf_share,
-            evaluated=evaluated, prior=1.0 if evaluated else 0.0,
+            faint_share=self.faint_share, max_passes=self.max_passes, max_samples=self.max_samples,
+            samples_per_cluster=self.samples_per_cluster, least_samples=self.min_samples, most_samples=self.pass_limit,
+            bsdf_share=self.bsdf_share, evaluated=evaluated, prior=1.0 if evaluated else 0.0,
             inverse_variance=self.combine == "inverse_variance", shade_regions=self.shade_regions, time=self.time,
         )  # fmt: skip
 

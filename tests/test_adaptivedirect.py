@@ -135,6 +135,7 @@ BOTH_BAD = [
 ]  # fmt: skip
 ADAPTIVE_BAD = [
     ("lights", "some"), ("lights", 3), ("lights", "unoccluded"), ("cluster_angle", -0.1), ("cluster_angle", "x"),
+    ("faint_share", -0.1), ("faint_share", "some"),
     ("max_passes", 0), ("max_passes", 2.0), ("samples_per_cluster", -1.0), ("samples_per_cluster", True),
     ("min_samples", 0), ("min_samples", 0.5), ("guide", "evaluate"), ("guide", True), ("combine", "variance"),
     ("shade_regions", 1), ("shade_regions", "yes"),
@@ -173,9 +174,9 @@ def test_properties_of_other_plugins_are_refused(plugin, name, value):
 
 def test_properties_reach_the_sampler_under_their_own_names():
     given = {
-        "error": 0.25, "dark_floor": 0.5, "lights": "clusters", "cluster_angle": 0.125, "max_passes": 7,
-        "max_samples": 1234, "samples_per_cluster": 2.5, "min_samples": 77, "bsdf_share": 0.75, "guide": "sampled",
-        "combine": "inverse_variance", "shade_regions": False, "time": 9.0,
+        "error": 0.25, "dark_floor": 0.5, "lights": "clusters", "cluster_angle": 0.125, "faint_share": 0.25,
+        "max_passes": 7, "max_samples": 1234, "samples_per_cluster": 2.5, "min_samples": 77, "bsdf_share": 0.75,
+        "guide": "sampled", "combine": "inverse_variance", "shade_regions": False, "time": 9.0,
     }  # fmt: skip
     plugin = mi.load_dict({"type": "adaptivedirect", **given})
     options, text = vars(plugin.options()), str(plugin)

@@ -32,11 +32,11 @@ def around(rng, axis, cosine, count):
 # ---- Cuts
 
 
-def nodes_of(center, radius, axis, cone_cos, infinite_axis=(), infinite_cos=()):
+def nodes_of(center, radius, axis, cone_cos, infinite_axis=(), infinite_cos=(), intensity=1.0):
     """Nodes over sources at finite places and at infinity, as :class:`vpl.sources.Sources` numbers them."""
     count = len(radius)
     forest = build_cluster_forest(
-        np.reshape(center, (count, 3)), radius, np.reshape(axis, (count, 3)), cone_cos, np.ones(count)
+        np.reshape(center, (count, 3)), radius, np.reshape(axis, (count, 3)), cone_cos, np.full(count, intensity)
     )
     more = len(infinite_cos)
     size, nothing = len(forest.radius), np.zeros((more, 3))
@@ -135,12 +135,14 @@ def nearest_in_box(groups, group, p):
     return np.clip(p, groups.low[group], groups.high[group])[None]
 
 
-@given(seed=SEEDS, solid_angle=st.sampled_from([0.0, 1e-3, 0.02, 0.3, 3.0, 7.0]))
-@settings(max_examples=40, deadline=None)
-def test_cuts_hold_every_source_that_lights_the_group_exactly_once(seed, solid_angle):
+@given(
+    seed=SEEDS, solid_angle=st.sampled_from([0.0, 1e-3, 0.02, 0.3, 3.0, 7.0]), faint=st.sampled_from([0.0, 0.05, 1.0])
+)
+@settings(max_examples=80, deadline=None)
+def test_cuts_hold_every_source_that_lights_the_group_exactly_once(seed, solid_angle, faint):
     rng = np.random.default_rng(seed)
     nodes, groups = random_nodes(rng), random_groups(rng)
-    cuts = cut_clusters(nodes, groups, solid_angle)
+    cuts = cut_clusters(nodes, groups, solid_angle, faint)
     for group in range(groups.count):
         covered = times_covered(nodes, cut_of(cuts, group))
         assert covered.max(initial=0) <= 1
@@ -174,6 +176,24 @@ def test_cuts_of_far_groups_are_short_and_of_near_ones_long():
     sizes = [cut_clusters(nodes, group_of([0, 0, -z]), 0.02).size[0] for z in (1000, 20, 5, 2)]
     assert sizes[0] == 1
     assert sizes[0] < sizes[1] < sizes[2] < sizes[3] < count
+
+
+def test_faint_clusters_are_coarser_and_all_others_as_fine_as_ever():
+    rng = np.random.default_rng(4)
+    # Seen from the origin both clouds fill the same angle, but the second sends four times as much light
+    clouds = rng.uniform(-0.5, 0.5, (2, 200, 3)) + [[[0, 0, 5]], [[0, 5, 0]]]
+    nodes = nodes_of(
+        clouds.reshape(-1, 3), np.zeros(400), np.zeros((400, 3)), -np.ones(400), intensity=np.repeat([1.0, 4.0], 200)
+    )
+    group = group_of([0, 0, 0], axis=[0, 0.6, 0.8])
+    fine, coarse, mixed = (cut_of(cut_clusters(nodes, group, *how), 0) for how in ((0.005,), (0.3,), (0.005, 0.5)))
+
+    def along(axis, cut):
+        return cut[nodes.centroid[cut, axis] > 2.5].tolist()
+
+    assert len(along(2, fine)) > len(along(2, coarse)) == 1
+    assert along(2, mixed) == along(2, coarse)
+    assert along(1, mixed) == along(1, fine)
 
 
 @given(seed=SEEDS)

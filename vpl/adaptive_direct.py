@@ -37,7 +37,7 @@ _ENTRIES = 12_000_000
 # Sums trace twice as many rays in a second as passes do, have no noise, and two passes are needed at least
 _SUM_WORTH = 4
 # Sites of the pilot, which finds the mean radiance of the image
-_PILOT_SITES = 4096
+_PILOT_SITES = 1024
 FIELDS = ("noise", "passes", "shadow_rays", "regions", "visible")
 
 
@@ -49,6 +49,7 @@ class DirectOptions:
     dark_floor: float = 0.1
     lights: str = "auto"
     solid_angle: float = 0.02
+    faint_share: float = 0.005
     max_passes: int = 15
     max_samples: int = 20000
     samples_per_cluster: float = 1.5
@@ -157,7 +158,7 @@ class _BatchLight:
             self._bsdf *= has_wide_source(self.nodes, self._bounds, self._cuts)
 
     def _cut(self, groups, solid_angle: float) -> GroupCuts:
-        cuts = cut_clusters(self.nodes, self._bounds.select(groups), solid_angle)
+        cuts = cut_clusters(self.nodes, self._bounds.select(groups), solid_angle, self.options.faint_share)
         # Where light comes by way of mirrors, BSDF samples are taken even if nothing lights a group directly
         return cuts if self._beyond is None or self.nodes.count == 0 else cuts.without_empty()
 

@@ -4,6 +4,8 @@ A cluster is fine enough where its bounding sphere fills less than a given solid
 single sources always are.  Clusters that cannot light any point of the group are left out: those behind its surfaces,
 and those that face away from it.  One cut serves a whole group of neighbouring points (all those that share statistics)
 rather than each point, so that the statistics of a cluster mean the same thing at every point of the group.
+
+Departure from the paper: clusters that send little light may fill more.
 """
 
 from __future__ import annotations
@@ -17,6 +19,8 @@ from .sources import Nodes
 
 # Sources without neighbours that fill more than this, in steradians, are hard to sample by area alone
 _WIDE = 0.1
+# What a cluster fills at most, in steradians, however little light it sends
+_FAINT_ANGLE = 0.3
 # Pairs of a group and a node that are looked at together, some 300 bytes each; a cut has rarely more nodes than this
 _PAIRS, _USUAL_CUT = 1 << 20, 1024
 _SLACK = 1e-5  # angles below are rounded towards keeping a cluster
@@ -71,26 +75,53 @@ class GroupCuts:
         return GroupCuts(node, np.concatenate([[0], np.cumsum(size)]))
 
 
-def cut_clusters(nodes: Nodes, groups: PointGroups, solid_angle: float) -> GroupCuts:
-    """The coarsest clusters that fill at most ``solid_angle`` steradians each, per group; 0 gives single sources."""
+def cut_clusters(nodes: Nodes, groups: PointGroups, solid_angle: float, faint_share: float = 0.0) -> GroupCuts:
+    """The coarsest clusters that are fine enough, per group; a ``solid_angle`` of 0 gives single sources.
+
+    Clusters that fill at most ``solid_angle`` steradians are, and so are those up to 0.3 steradians that would send
+    less than ``faint_share`` of the group's light if nothing was between: their statistics hardly matter.
+    """
     roots, pairs = _roots(nodes), [np.zeros((2, 0), np.int64)]
     # How far cuts go down is not known: few groups at a time where there are many nodes
     step = max(1, _PAIRS // max(1, min(nodes.count, _USUAL_CUT) if solid_angle > 0 else nodes.count))
     for first in range(0, groups.count, step):
         chosen = np.arange(first, min(first + step, groups.count))
         group, node = np.repeat(chosen, len(roots)), np.tile(roots, len(chosen))
-        while len(group):
-            lit = _may_light(nodes, node, groups, group)
-            group, node = group[lit], node[lit]
-            single = nodes.escape[node] == node + 1
-            nearest = np.clip(nodes.center[node], groups.low[group], groups.high[group]) - nodes.center[node]
-            # 2 pi (1 - cos asin(r / d)) < solid_angle
-            small = np.square(nodes.radius[node]) < _squared_sine(solid_angle) * np.einsum("ij,ij->i", nearest, nearest)
-            done = single | small
-            pairs.append(np.stack([group[done], node[done]]))
-            group, left = np.tile(group[~done], 2), node[~done] + 1
-            node = np.concatenate([left, nodes.escape[left].astype(np.int64)])
+        if faint_share > 0 and 0 < solid_angle < _FAINT_ANGLE:
+            group, node = _descend(nodes, groups, group, node, _FAINT_ANGLE)
+            light = _unoccluded_light(nodes, node, groups, group)
+            faint = light < faint_share * np.bincount(group, light, groups.count)[group]
+            pairs.append(np.stack([group[faint], node[faint]]))
+            group, node = group[~faint], node[~faint]
+        pairs.append(_descend(nodes, groups, group, node, solid_angle))
     return _by_group(np.concatenate(pairs, axis=1), nodes.count, groups.count)
+
+
+def _descend(nodes: Nodes, groups: PointGroups, group, node, solid_angle: float):
+    """(2, k) groups and nodes: the coarsest clusters from those given on that fill less than ``solid_angle`` and may
+    light their group."""
+    found = [np.zeros((2, 0), np.int64)]
+    while len(group):
+        lit = _may_light(nodes, node, groups, group)
+        group, node = group[lit], node[lit]
+        single = nodes.escape[node] == node + 1
+        nearest = np.clip(nodes.center[node], groups.low[group], groups.high[group]) - nodes.center[node]
+        # 2 pi (1 - cos asin(r / d)) < solid_angle
+        small = np.square(nodes.radius[node]) < _squared_sine(solid_angle) * np.einsum("ij,ij->i", nearest, nearest)
+        done = single | small
+        found.append(np.stack([group[done], node[done]]))
+        group, left = np.tile(group[~done], 2), node[~done] + 1
+        node = np.concatenate([left, nodes.escape[left].astype(np.int64)])
+    return np.concatenate(found, axis=1)
+
+
+def _unoccluded_light(nodes: Nodes, node, groups: PointGroups, group) -> np.ndarray:
+    """Irradiance, if nothing was between, at the middle of a group that faces a cluster, roughly."""
+    extent = np.linalg.norm(groups.high - groups.low, axis=1)[group] / 2
+    offset = nodes.centroid[node] - ((groups.low + groups.high) / 2)[group]
+    nearest = np.maximum(nodes.radius[node], extent)
+    distance2 = np.maximum(np.einsum("ij,ij->i", offset, offset), np.square(nearest))
+    return nodes.intensity[node] / np.where(nodes.infinite[node] | (distance2 == 0), 1, distance2)
 
 
 def has_wide_source(nodes: Nodes, groups: PointGroups, cuts: GroupCuts) -> np.ndarray:

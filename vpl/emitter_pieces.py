@@ -15,6 +15,7 @@ import numpy as np
 
 from .arrays import download, select_record, upload
 from .lights import AreaEmitters, finite_or_zero, registered_shapes
+from .parameters import matrix_of, parameters_of
 
 PARALLELOGRAM, TRIANGLE, DISK, SPHERE, SHAPE = range(5)
 
@@ -271,7 +272,7 @@ def _pieces_of(shape, textured: bool) -> _Pieces:
         return _triangles(shape, textured)
     matrix = np.eye(4)
     if name in ("Rectangle", "Disk", "Sphere"):
-        matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
+        matrix = matrix_of(parameters_of(shape, below=False)["to_world"])
     linear, origin = matrix[:3, :3], matrix[:3, 3]
     if name == "Rectangle":
         normal = np.linalg.inv(linear).T[:, 2] * (-1 if shape.has_flipped_normals() else 1)
@@ -293,7 +294,7 @@ def _one(kind, corner, first, second, normal) -> _Pieces:
 
 
 def _triangles(mesh, textured: bool) -> _Pieces:
-    parameters = mi.traverse(mesh)
+    parameters = parameters_of(mesh, below=False)
     faces = download(parameters["faces"]).reshape(-1, 3)
     vertices = download(parameters["vertex_positions"]).astype(np.float64).reshape(-1, 3)
     corner, second, third = (vertices[faces[:, k]] for k in range(3))

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from .arrays import download, rgb_to_spectrum, upload
+from .parameters import matrix_of, numbers, parameters_of
 
 # Kinds of virtual light. "point" and "spot" radiate from a point that the scene really has and are never clamped;
 # "oriented" lights stand for a piece of surface. "directional" and "environment" lights lie at infinity; the latter
@@ -171,22 +172,17 @@ def finite_or_zero(spectrum):
 
 def _constant_rgb(parameters, name):
     """A spectrum parameter as RGB if it is the same everywhere, else None."""
-    value = parameters.get(f"{name}.value") if f"{name}.value" in parameters else None
+    value = parameters.get(f"{name}.value")
     if value is None:
         return None
-    flat = np.array(value, np.float32).reshape(-1)
-    return np.repeat(flat, 3) if flat.size == 1 else flat[:3]
-
-
-def _scalar(value) -> float:
-    return float(np.array(value, np.float64).reshape(-1)[0])
+    components = numbers(value)
+    return components * 3 if len(components) == 1 else components[:3]
 
 
 def _frame_of(to_world):
     """Origin and z axis of an emitter's frame, as float64 vectors."""
-    matrix = np.array(to_world.matrix, np.float64).reshape(4, 4)
-    axis = matrix[:3, 2]
-    return matrix[:3, 3], axis / np.linalg.norm(axis)
+    matrix = matrix_of(to_world)
+    return matrix[:3, 3], matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
 
 
 def _textured_radiance(emitter, shape) -> np.ndarray:
@@ -218,7 +214,12 @@ def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
         if emitter.class_name() != "AreaLight":
             unusual.append((emitter.class_name(), emitter))
             continue
-        radiance = _constant_rgb(mi.traverse(emitter), "radiance")
+        radiance = _constant_rgb(parameters_of(emitter), "radiance")
+        if radiance is None and "MeshAttribute[" in str(emitter):
+            raise ValueError(
+                f'shape "{shape.id()}" ({shape.class_name()}): the emitted radiance is a mesh attribute, which is '
+                "not supported; a constant or an image is"
+            )
         if radiance is None:
             textured.append((len(indices), emitter))
             radiance = _textured_radiance(emitter, shape)
@@ -235,6 +236,12 @@ def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
     return AreaEmitters(shape_index, radiance, area, textured), int(bad.sum()), unusual
 
 
+def _sorted_rows(rows: list, columns: int) -> np.ndarray:
+    """Rows of numbers in an order that depends on nothing else; see :func:`_read_areas`."""
+    array = np.array(rows, np.float64).reshape(-1, columns)
+    return array[np.lexsort(array.T[::-1])]
+
+
 def read_emitters(scene) -> Emitters:
     """Read all emitters of ``scene``.  Lights with values that are not finite are dropped, counted and reported."""
     points, spots, suns, others = [], [], [], []
@@ -243,26 +250,21 @@ def read_emitters(scene) -> Emitters:
         name = emitter.class_name()
         if emitter.is_environment() or name == "AreaLight":
             continue
-        parameters = mi.traverse(emitter)
+        parameters = parameters_of(emitter)
         intensity = _constant_rgb(parameters, "irradiance" if name == "DirectionalEmitter" else "intensity")
         if name == "PointLight" and intensity is not None:
-            points.append((np.array(parameters["position"], np.float64).reshape(3), (0, 0, 1), intensity))
+            points.append([*numbers(parameters["position"]), *intensity])
         elif name == "SpotLight" and intensity is not None and "texture.value" in parameters:
-            origin, axis = _frame_of(parameters["to_world"])
-            cutoff, beam = _scalar(parameters["cutoff_angle"]), _scalar(parameters["beam_width"])
-            spots.append((origin, axis, intensity, np.deg2rad([cutoff, beam])))
+            cone = np.deg2rad([*numbers(parameters["cutoff_angle"]), *numbers(parameters["beam_width"])])
+            spots.append([*np.concatenate(_frame_of(parameters["to_world"])), *intensity, *cone])
         elif name == "DirectionalEmitter" and intensity is not None:
-            suns.append((_frame_of(parameters["to_world"])[1], intensity))
+            suns.append([*_frame_of(parameters["to_world"])[1], *intensity])
         elif not any(emitter is known for _, known in others_on_shapes):
             others.append((name, emitter))
-
-    def columns(rows, index):
-        rows.sort(key=lambda row: [float(x) for column in row for x in column])  # see _read_areas
-        return [row[index] for row in rows]
-
-    omni = VirtualLights.of("point", columns(points, 0), columns(points, 1), columns(points, 2))
-    spot = VirtualLights.of("spot", columns(spots, 0), columns(spots, 1), columns(spots, 2), 0, columns(spots, 3))
-    sun = VirtualLights.of("directional", None, columns(suns, 0), columns(suns, 1))
+    points, spots, suns = (_sorted_rows(rows, n) for rows, n in ((points, 6), (spots, 11), (suns, 6)))
+    omni = VirtualLights.of("point", points[:, :3], np.tile([0, 0, 1], (len(points), 1)), points[:, 3:])
+    spot = VirtualLights.of("spot", spots[:, :3], spots[:, 3:6], spots[:, 6:9], 0, spots[:, 9:])
+    sun = VirtualLights.of("directional", None, suns[:, :3], suns[:, 3:])
     kept = []
     for lights in (omni, spot, sun):
         lights, bad = lights.without_bad()

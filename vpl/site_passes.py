@@ -25,6 +25,7 @@ _INCREMENT = 25  # samples, where little is missing [IAS section 5.8]
 _BLACK_PASSES, _BLACK_SAMPLES = 3, 250
 _BLACK_LEAST = 48  # however small a part of its pixel a site is
 _BSDF_LEAST = 2
+_NEIGHBOURS = 256  # sites in a row that are sampled in the order of their samples
 _LEAST_VARIANCE = 0.01  # of a pass, relative to the mean over sites, where passes are weighted by it
 # Shares of the uniform function after the first pass, and how the block's gives way to the pixel's [IAS fig. 2]
 _UNIFORM_SHARE, _BLOCK_DECAY = 0.1, 0.7
@@ -82,6 +83,9 @@ class SitePasses:
         the combination unbiased; in the paper they are the inverse of the variance that each pass estimates (eq. 7, 8).
         """
         half, site = np.nonzero(wanted)
+        # Lanes run in step with the next ones, which should be near and have as many samples
+        order = np.lexsort((wanted[half, site], site // _NEIGHBOURS))
+        half, site = half[order], site[order]
         samples = wanted[half, site]
         bsdf = np.where(self.bsdf_share > 0, np.maximum(np.ceil(wanted * self.bsdf_share), _BSDF_LEAST), 0)[half, site]
         drawn = draw_samples(self.scenery, Lanes(*(upload(mi.UInt32, x) for x in (site, half, samples, bsdf))), seed)
