@@ -83,8 +83,10 @@ class Problem:
 
         Returns {label: (median of the seconds, mean relMSE, mean rays per pixel)}.
         """
-        for kind, more, _ in methods.values():
-            mi.render(self.scene, integrator=plugin(kind, **{k: v for k, v in more.items() if k != "error"}), spp=2)
+        for kind, more, samples in methods.values():
+            # The kernels of Mitsuba's integrators contain the number of samples
+            few = samples if kind in ("direct", "path") else 2
+            mi.render(self.scene, integrator=plugin(kind, **{k: v for k, v in more.items() if k != "error"}), spp=few)
         found = {label: [] for label in methods}
         others = [label for label in methods if label != ours]
         turns = [x for k, other in enumerate(others) for x in ((ours, other) if k % 2 == 0 else (other,))]

@@ -65,6 +65,7 @@ def camera_rays(scene, seed: int, samples: int = 1):
     sensor = scene.sensors()[0]
     width, height = sensor.film().crop_size()
     sampler = sensor.sampler().clone()
+    sampler.set_sample_count(samples)
     sampler.seed(seed, int(width * height * samples))
     index = dr.arange(mi.UInt32, int(width * height * samples)) // samples
     pixel = mi.Point2f(mi.Float(index % int(width)), mi.Float(index // int(width)))

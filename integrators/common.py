@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import drjit as dr
 import mitsuba as mi
 
-from vpl.adaptive_direct import DirectOptions, light_directly
+from vpl.adaptive_direct import DirectOptions, PixelGrid, light_directly
 from vpl.arrays import download
 from vpl.direct import ExtendedEmitters, direct_light
 from vpl.evaluation import mean_radiance
@@ -32,7 +32,8 @@ class Shading:
 
     ``direct``: radiance per point that is known already (direct light of extended emitters); ``mean``: an estimate of
     the mean radiance over all gather points of the render and over channels; ``ray``: UInt32, the camera ray of each
-    point; ``samples``: camera rays of a pixel, which follow each other; ``stopped``: whether to give up early.
+    point; ``weight``: what its radiance counts in that ray; ``grid``: how camera rays lie in the image; ``stopped``:
+    whether to give up early.
     """
 
     scene: object
@@ -43,7 +44,8 @@ class Shading:
     mean: float
     seed: int
     ray: object
-    samples: int
+    weight: object
+    grid: PixelGrid
     stopped: Callable[[], bool]
 
 
@@ -126,7 +128,7 @@ class ManyLightIntegrator(GatheringIntegrator):
             "dropped": lights.dropped + emitters.dropped,
         }
         if lights.groups:
-            prepared.jobs = self._jobs(scene, start.traits, lights, prepared, start.seed, grid.samples)
+            prepared.jobs = self._jobs(scene, start.traits, lights, prepared, start.seed, grid)
         return prepared
 
     def _nee(self, scene, start: Start, grid):
@@ -163,7 +165,7 @@ class ManyLightIntegrator(GatheringIntegrator):
         found = {label: whole_sum(totals.get(name)) for name, label in names.items()}
         return radiance, totals, found | {"lights": {}, "light_paths": 0, "emitter_rays": 0} | prepared.counts
 
-    def _jobs(self, scene, traits, lights: LightSet, prepared: Prepared, seed: int, samples: int) -> list[Shading]:
+    def _jobs(self, scene, traits, lights: LightSet, prepared: Prepared, seed: int, grid: PixelGrid) -> list[Shading]:
         """One job per batch of gather points, each knowing the mean radiance over all of them."""
         points, jobs, mean = prepared.paths.points, [], 0.0
         batches = make_batches(points, probe_materials(points, traits))
@@ -172,7 +174,8 @@ class ManyLightIntegrator(GatheringIntegrator):
             direct = dr.gather(type(prepared.direct), prepared.direct, batch.index)
             stream = derived_seed(seed, 31, number)
             ray = dr.gather(mi.UInt32, points.ray, batch.index)
-            jobs.append(Shading(scene, traits, lights, batch, direct, 0.0, stream, ray, samples, self.should_stop))
+            weight = dr.gather(type(points.weight), points.weight, batch.index)
+            jobs.append(Shading(scene, traits, lights, batch, direct, 0.0, stream, ray, weight, grid, self.should_stop))
             if self.needs_trees:
                 level = mean_radiance(scene, traits, lights, batch, derived_seed(seed, 32, number))
                 mean += (level + float(download(direct).mean(dtype="float64"))) * batch.count / points.count

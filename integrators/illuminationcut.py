@@ -10,7 +10,8 @@ import numpy as np
 
 from vpl.approximate_image import approximate_radiance
 from vpl.arrays import add_at, download, upload
-from vpl.cuts import limited_cuts, upload_thresholds
+from vpl.cut_limits import least_thresholds
+from vpl.cuts import upload_thresholds
 from vpl.pair_lists import evaluate_lists, list_pairs
 from vpl.pair_visibility import decide_visibility
 from vpl.pairs import BoundCounter, Pairs, find_pairs, in_batches
@@ -169,23 +170,10 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         allowed = self.error * np.maximum(bright[leaves], self.dark_floor * job.mean)
         if self.max_cut:
             # A leaf takes after the last point that is tried before it
-            least = self._least_thresholds(job, clusters, np.repeat(allowed, tree.count[leaves]), counter)
+            at_points = np.repeat(allowed, tree.count[leaves])
+            least = least_thresholds(job.lights, clusters, at_points, self.max_cut, _TRIED_STRIDE, counter)
             allowed = np.maximum(allowed, least[tree.first[leaves] // _TRIED_STRIDE])
         return upload_thresholds(tree.gather_up(allowed, leaves, np.minimum))
-
-    def _least_thresholds(self, job: Shading, clusters: PointClusters, allowed: np.ndarray, counter: BoundCounter):
-        """Thresholds below which cuts are about larger than ``max_cut``, around every _TRIED_STRIDE-th point.
-
-        Cuts grow about as fast as thresholds fall at most, so one that is not full leaves that much room below.
-        """
-        rows = np.arange(0, clusters.count, _TRIED_STRIDE)
-        # What is 0 could not be raised by any factor
-        tried = np.maximum(allowed[rows], np.finfo(np.float32).tiny)
-        index = upload(mi.UInt32, rows)
-        part = clusters.batch.select(index)
-        raised, sizes, visits = limited_cuts(job.lights, part, upload_thresholds(tried), self.max_cut)
-        counter.add_at_points(index, visits)
-        return download(raised).astype(np.float64) * np.minimum(sizes.total() / self.max_cut, 1)
 
     def _pairs(self, job: Shading, clusters: PointClusters, threshold, counter: BoundCounter):
         """Phase II: yield (group of lights, illumination-aware pairs), about _PAIRS_HELD of them at a time."""
@@ -200,11 +188,11 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
     def _choose_shown(self, job: Shading, clusters: PointClusters) -> Shown:
         """All points, or with ``share_samples`` those that stand for others of their pixel."""
         rows = of = dr.arange(mi.UInt32, clusters.count)
-        if not self.share_samples or job.samples == 1:
+        if not self.share_samples or job.grid.samples == 1:
             dr.eval(rows)
             return Shown(clusters.batch, rows, of)
-        pixel = download(job.ray)[clusters.tree.order] // job.samples
-        chosen, stands_for = share_samples(clusters.tree, pixel, job.samples, np.random.default_rng(job.seed + 1))
+        pixel = download(job.ray)[clusters.tree.order] // job.grid.samples
+        chosen, stands_for = share_samples(clusters.tree, pixel, job.grid.samples, np.random.default_rng(job.seed + 1))
         rows = upload(mi.UInt32, chosen)
         return Shown(clusters.batch.select(rows), rows, upload(mi.UInt32, stands_for))
 

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from vpl.arrays import download, upload
+from vpl.arrays import upload
 from vpl.cuts import evaluate_cuts, limited_cuts
+from vpl.radiance_estimate import estimate_radiance
 
 from . import properties
 from .common import ManyLightIntegrator, Shaded, Shading
 from .gathering import Clock
 from .manual import manual_page
 
-# A point's radiance is estimated from coarse cuts at every eighth point, averaged over sixteen neighbours on the
-# Morton curve; bounds of these cuts are accepted up to this fraction of the image's mean.
-_ESTIMATE_STRIDE, _ESTIMATE_BLOCK, _ESTIMATE_ERROR = 8, 16, 0.05
+# A point's radiance is estimated from coarse cuts at every eighth point, averaged over sixteen neighbours on the curve
+_ESTIMATE_STRIDE = 8
 
 
 @manual_page
@@ -83,9 +82,11 @@ class LightcutsIntegrator(ManyLightIntegrator):
     def shade(self, job: Shading) -> Shaded:
         """Choose a cut for every point of a batch and evaluate it."""
         clock = Clock()
-        estimate, spent = self._estimate(job)
+        spent = estimate_radiance(
+            job.scene, job.traits, job.lights, job.batch, job.direct, job.mean, self.max_cut, _ESTIMATE_STRIDE
+        )
         clock.lap("estimate")
-        wanted = upload(mi.Float, self.error * np.maximum(estimate, self.dark_floor * job.mean))
+        wanted = upload(mi.Float, self.error * np.maximum(spent.radiance, self.dark_floor * job.mean))
         threshold, sizes, searched = limited_cuts(job.lights, job.batch, wanted, self.max_cut)
         clock.lap("cut")
         radiance, rays, collected = evaluate_cuts(job.scene, job.traits, job.lights, job.batch, threshold, sizes)
@@ -93,35 +94,9 @@ class LightcutsIntegrator(ManyLightIntegrator):
         bounds = searched + collected + spent.upper_bounds
         return Shaded(radiance, rays + spent.shadow_rays, bounds, sum(sizes.count), clock.seconds)
 
-    def _estimate(self, job: Shading):
-        """Mean over channels of the radiance around every point, (n,) float64, and what finding it cost per point."""
-        count = job.batch.count
-        rows = np.arange(0, count, _ESTIMATE_STRIDE)
-        index = upload(mi.UInt32, rows)
-        part = job.batch.select(index)
-        threshold = dr.full(mi.Float, _ESTIMATE_ERROR * job.mean, len(rows))
-        threshold, sizes, searched = limited_cuts(job.lights, part, threshold, self.max_cut)
-        # Second representatives: the thresholds must not depend on the lights that the final cuts are made of
-        radiance, rays, collected = evaluate_cuts(
-            job.scene, job.traits, job.lights, part, threshold, sizes, second=True
-        )
-        reflected = np.repeat(download(radiance).mean(1, dtype=np.float64), _ESTIMATE_STRIDE)[:count]
-        estimate = block_mean(reflected + download(job.direct).mean(1, dtype=np.float64), _ESTIMATE_BLOCK)
-        spent = Shaded(None, *(dr.zeros(mi.UInt32, count) for _ in range(3)))
-        dr.scatter(spent.shadow_rays, rays, index)
-        dr.scatter(spent.upper_bounds, collected + searched, index)
-        return estimate, spent
-
     def describe(self):
         """All properties and their values."""
         return super().describe() | {"error": self.error, "dark_floor": self.dark_floor, "max_cut": self.max_cut}
-
-
-def block_mean(values: np.ndarray, block: int) -> np.ndarray:
-    """Replace values by the mean over their block of consecutive ones; the last block may be shorter."""
-    start = np.arange(0, len(values), block)
-    length = np.diff(np.append(start, len(values)))
-    return np.repeat(np.add.reduceat(values, start) / length, length)
 
 
 mi.register_integrator("lightcuts", LightcutsIntegrator)

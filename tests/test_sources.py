@@ -7,9 +7,9 @@ import pytest
 
 from vpl.arrays import download, upload
 from vpl.emitter_pieces import EmitterPieces
-from vpl.environment_regions import EnvironmentRegions, find_interval
+from vpl.environment_regions import EnvironmentRegions
 from vpl.lights import read_emitters
-from vpl.sampling import independent_sampler
+from vpl.sampling import find_interval, independent_sampler
 from vpl.sources import Sources
 
 COUNT = 100_000

@@ -15,7 +15,7 @@ import numpy as np
 from .arrays import channel_mean, download, upload
 from .environment_strata import cones, stratify
 from .lights import finite_or_zero
-from .sampling import independent_sampler
+from .sampling import find_interval, independent_sampler
 
 _EVALUATIONS = 2  # along each of both axes of a cell, at least
 _STRATA_WIDTH = 256  # columns of the grid that regions are made of
@@ -97,25 +97,6 @@ class EnvironmentRegions:
         column = dr.minimum(mi.UInt32(azimuth), self._width - 1)
         cell = row * self._width + column
         return dr.gather(mi.UInt32, self._labels, cell, active), dr.gather(mi.Float, self._density, cell, active)
-
-
-@dr.syntax
-def find_interval(cumulative, first, last, sample):
-    """The interval of ``cumulative[first] ... cumulative[last]`` that a uniform number falls into, first .. last - 1.
-
-    ``cumulative``: sums in double precision, not falling; an interval is found with its share of the whole rise, and
-    one that does not rise never, unless all do not.
-    """
-    precise = type(cumulative)
-    start = dr.gather(precise, cumulative, first)
-    target = start + precise(sample) * (dr.gather(precise, cumulative, last) - start)
-    low, high = mi.UInt32(first), mi.UInt32(last)
-    while high > low + 1:
-        middle = (low + high) >> 1
-        below = dr.gather(precise, cumulative, middle) <= target
-        low = dr.select(below, middle, low)
-        high = dr.select(below, high, middle)
-    return low
 
 
 def _table_width(environment) -> int:

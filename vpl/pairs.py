@@ -89,10 +89,10 @@ def _lights_spread_more(kind: str, points, lights):
     return lights.radius > points.radius + _DIRECTIONS * distance * spread
 
 
-def _judge(clusters: PointClusters, group: LightGroup, pairs: Pairs, accept: Callable, smallest_distance):
+def _judge(clusters: PointClusters, group: LightGroup, pairs: Pairs, accept, points_first, smallest_distance):
     """One kernel: the verdict on every pair, and the node that the second of its children is ([IC] Algorithm 1).
 
-    ``accept``: function of (point node, light node, bound, index of the point node) to a mask.
+    ``accept``, ``points_first``: functions of (point node, light node, bound, index of the point node) to a mask.
     """
     points, lights = clusters.gather(pairs.points), group.tree.gather(pairs.lights)
     bound = contribution_bound(group.kind, points.receiver, lights, smallest_distance)
@@ -100,6 +100,8 @@ def _judge(clusters: PointClusters, group: LightGroup, pairs: Pairs, accept: Cal
     accepted = (single & lowest) | accept(points, lights, bound, pairs.points)
     # Algorithm 1, line 10: the larger node is split, if it has children
     of_lights = ~single & (lowest | _lights_spread_more(group.kind, points, lights))
+    if points_first is not None:
+        of_lights &= lowest | ~points_first(points, lights, bound, pairs.points)
     verdict = dr.select(accepted, _ACCEPTED, dr.select(of_lights, mi.UInt32(_SPLIT_LIGHTS), _SPLIT_POINTS))
     verdict = dr.select(bound > 0, verdict, 0)
     second = dr.select(of_lights, group.tree.escape(pairs.lights + 1, verdict == _SPLIT_LIGHTS), points.child + 1)
@@ -169,10 +171,14 @@ def in_batches(found, least: int):
         yield Pairs.join(held)
 
 
-def find_pairs(clusters: PointClusters, lights: LightSet, group: LightGroup, accept: Callable, counter: BoundCounter):
+def find_pairs(
+    clusters: PointClusters, lights: LightSet, group: LightGroup, accept: Callable, counter: BoundCounter,
+    points_first: Callable | None = None,
+):  # fmt: skip
     """Yield, some at a time, pairs that together hold once every point and light from which anything may arrive.
 
-    ``accept``: see ``_judge``; pairs of two leaves are always accepted.  ``counter``: told of every bound.
+    ``accept``: see ``_judge``; pairs of two leaves are always accepted.  ``points_first``: which pairs are refined by
+    splitting points whatever their sizes (None: none).  ``counter``: told of every bound.
     """
     clamp = dr.opaque(mi.Float, lights.smallest_distance)
     root = dr.opaque(mi.UInt32, 0, 1)
@@ -182,7 +188,7 @@ def find_pairs(clusters: PointClusters, lights: LightSet, group: LightGroup, acc
         if pairs.count > _FRONTIER:
             waiting.append(pairs.slice(_FRONTIER, pairs.count))
             pairs = pairs.slice(0, _FRONTIER)
-        verdict, second = _judge(clusters, group, pairs, accept, clamp)
+        verdict, second = _judge(clusters, group, pairs, accept, points_first, clamp)
         counter.add(pairs.points)
         accepted, split = dr.compress(verdict == _ACCEPTED), dr.compress(verdict > _ACCEPTED)
         if len(split):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -36,17 +38,15 @@ class PointNode:
 
 
 class PointClusters:
-    """A batch of gather points along its point tree, with the bounds of every node on the device [IC section 3].
+    """A batch of gather points along a tree over them, with the bounds of every node on the device [IC section 3].
 
-    ``order``: row of the original batch that each point of ``batch`` is.
+    ``build``: makes the tree of positions and normals, (n, 3) each; by default one over all points by place, normal and
+    material.  ``order``: row of the original batch that each point of ``batch`` is.
     """
 
-    def __init__(self, batch: Batch):
-        leaf_size = _GLOSSY_LEAF if batch.proxy.glossy else _LAMBERTIAN_LEAF
-        material = batch.surfaces.material()
-        material = None if material is None else download(material)
+    def __init__(self, batch: Batch, build: Callable | None = None):
         position, normal = download(batch.position), _directions(batch.normal)
-        self.tree: PointTree = build_point_tree(position, normal, leaf_size, material)
+        self.tree: PointTree = (build or partial(_tree_by_place, batch))(position, normal)
         self.order = upload(mi.UInt32, self.tree.order)
         self.batch = batch.select(self.order)
         self._records = upload(mi.Float, _records(self.tree, position, normal, download(batch.proxy.base)))
@@ -63,6 +63,11 @@ class PointClusters:
         """Number of gather points."""
         return self.batch.count
 
+    def ranges(self, index):
+        """(First point along the tree, number of points) of nodes."""
+        d = dr.gather(mi.Vector4f, self._records, index * 4 + 3)
+        return dr.reinterpret_array(mi.UInt32, d.y), dr.reinterpret_array(mi.UInt32, d.z)
+
     def gather(self, index) -> PointNode:
         """Fetch one node per lane."""
         a, b, c, d = (dr.gather(mi.Vector4f, self._records, index * 4 + k) for k in range(4))
@@ -78,6 +83,12 @@ class PointClusters:
             proxy.no_cosine = dr.gather(mi.Bool, self._no_cosine, index)
         first, count, child = (dr.reinterpret_array(mi.UInt32, value) for value in (d.y, d.z, d.w))
         return PointNode(receiver, first, count, child)
+
+
+def _tree_by_place(batch: Batch, position: np.ndarray, normal: np.ndarray) -> PointTree:
+    material = batch.surfaces.material()
+    material = None if material is None else download(material)
+    return build_point_tree(position, normal, _GLOSSY_LEAF if batch.proxy.glossy else _LAMBERTIAN_LEAF, material)
 
 
 def _directions(vectors) -> np.ndarray:

@@ -180,10 +180,13 @@ def build_point_tree(position, normal, leaf_size: int = 1, material=None) -> Poi
     if (np.abs(length - 1) > 1e-3).any():
         row = int(np.argmax(np.abs(length - 1)))
         raise ValueError(f"normal must be of unit length, but row {row} is {normal[row].tolist()}")
-    codes = point_codes(position, normal, material)
+    return tree_over_codes(point_codes(position, normal, material), leaf_size)
+
+
+def tree_over_codes(codes: np.ndarray, leaf_size: int) -> PointTree:
+    """The tree over points with the given codes, (n,) uint64: ranges split at the highest bit that differs in them."""
     order = np.argsort(codes, kind="stable")
     codes = codes[order]
-
     first, count = np.zeros(1, np.int64), np.array([len(codes)])
     parents, nodes = np.zeros(1, np.int64), np.arange(1)
     levels, found = [0], []

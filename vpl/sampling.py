@@ -26,3 +26,22 @@ def stratified(sampler, count: int, first: int, total: int):
     lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
     sample = (mi.Float(lane) + sampler.next_1d()) / dr.opaque(mi.Float, float(total))
     return dr.minimum(sample, dr.one_minus_epsilon(mi.Float))
+
+
+@dr.syntax
+def find_interval(cumulative, first, last, sample):
+    """The interval of ``cumulative[first] ... cumulative[last]`` that a uniform number falls into, first .. last - 1.
+
+    ``cumulative``: sums in double precision, not falling; an interval is found with its share of the whole rise, and
+    one that does not rise never, unless all do not.
+    """
+    precise = type(cumulative)
+    start = dr.gather(precise, cumulative, first)
+    target = start + precise(sample) * (dr.gather(precise, cumulative, last) - start)
+    low, high = mi.UInt32(first), mi.UInt32(last)
+    while high > low + 1:
+        middle = (low + high) >> 1
+        below = dr.gather(precise, cumulative, middle) <= target
+        low = dr.select(below, middle, low)
+        high = dr.select(below, high, middle)
+    return low

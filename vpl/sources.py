@@ -18,8 +18,9 @@ from .arrays import rgb_to_spectrum, select_record, upload
 from .cluster_forest import build_cluster_forest
 from .emission import bounding_sphere, other_power
 from .emitter_pieces import EmitterPieces
-from .environment_regions import EnvironmentRegions, find_interval
+from .environment_regions import EnvironmentRegions
 from .lights import Emitters, VirtualLights, finite_or_zero
+from .sampling import find_interval
 from .shading import DeviceLights, geometry
 
 

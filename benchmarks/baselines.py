@@ -1,0 +1,200 @@
+"""``mdlightcuts`` against ``lightcuts`` on every sample, and against the sum of all lights.
+
+    ./run -- python benchmarks/baselines.py [--scenes NAME ...] [--parts curve samples growth]
+
+curve    the error of both against the sum of all lights, at falling ``error``, with 1 and 9 samples a pixel.
+samples  16 samples a pixel: ``lightcuts`` at 1% on every sample, and ``mdlightcuts`` at the ``error`` that gives the
+         same RMSE of pixels, found by trying.
+growth   ``mdlightcuts`` at one ``error`` with 1, 4, 16 and 64 samples a pixel.
+
+Errors are those of whole pixels, against the sum of all lights at all samples of a random subset of them. Same lights,
+same gather points, warm, 256 wide; times are medians of three interleaved runs of what a method does after lights,
+their trees and gather points are there, which all methods share ("shared").
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+mi.set_variant("llvm_ad_rgb")
+
+import integrators  # noqa: E402, F401
+from benchmarks import scenes  # noqa: E402
+from vpl.arrays import download, upload  # noqa: E402
+from vpl.evaluation import sum_all_lights  # noqa: E402
+
+DEPTH, VPLS, RUNS = 6, 200_000, 3
+# Points at which all lights are summed
+_EXACT_POINTS = 3600
+# How often, and how closely, the error that gives a wanted RMSE is tried for
+_TRIES, _NEAR = 5, 0.03
+
+
+@dataclass
+class Found:
+    """One run: seconds of ``shade``; of pixels, relative to the image's mean: RMSE and mean absolute error; shadow rays
+    and clusters or pairs per pixel."""
+
+    seconds: float
+    rmse: float
+    absolute: float
+    rays: float
+    cut: float
+    stages: dict
+
+
+class Problem:
+    """Lights and gather points of a scene, and the exact light of some of its pixels."""
+
+    def __init__(self, name: str, samples: int, width: int):
+        self.settings = {"max_depth": DEPTH, "vpl_count": VPLS}
+        self.scene, self.samples = scenes.load(name, width), samples
+        self.pixels = width * scenes.height(name, width)
+        rays = scenes.camera_rays(self.scene, 0, samples)
+        plugin = self.plugin("lightcuts")
+        self.prepared, self.shared = scenes.timed(lambda: plugin.prepare(self.scene, *rays))
+        pixels = np.random.default_rng(0).permutation(self.pixels)[: _EXACT_POINTS // samples]
+        self._place = np.full(self.pixels, -1)
+        self._place[pixels] = np.arange(len(pixels))
+        self._chosen = [self._rows_of(job) for job in self.prepared.jobs]
+        self._exact = sum(
+            self._of_pixels(job, rows, download(sum_all_lights(job.scene, job.traits, job.lights, part)[0]))
+            for job, rows, part in self._chosen
+        )
+        direct = sum(self._of_pixels(job, rows, download(job.direct)[rows]) for job, rows, _ in self._chosen)
+        self.mean = float((self._exact + direct).mean())
+
+    def plugin(self, kind: str, **more):
+        """A plugin with the settings that all methods share."""
+        return mi.load_dict({"type": kind, **self.settings, **more})
+
+    def _rows_of(self, job):
+        rows = np.flatnonzero(self._place[download(job.ray) // self.samples] >= 0)
+        return job, rows, job.batch.select(upload(mi.UInt32, rows))
+
+    def _of_pixels(self, job, rows, radiance) -> np.ndarray:
+        """Sum what some points add to the pixels that are compared, (pixels, 3)."""
+        place = self._place[download(job.ray)[rows] // self.samples]
+        total = np.zeros((self._place.max() + 1, 3))
+        np.add.at(total, place, radiance.astype(np.float64) * download(job.weight)[rows] / self.samples)
+        return total
+
+    def shade(self, plugin) -> Found:
+        """Shade all points with a plugin and compare the chosen pixels."""
+        shaded, seconds = scenes.timed(lambda: [plugin.shade(job) for job in self.prepared.jobs])
+        values, rays, cut, stages = 0, 0.0, 0.0, {}
+        for (job, rows, _), part in zip(self._chosen, shaded, strict=True):
+            values += self._of_pixels(job, rows, download(part.radiance)[rows])
+            rays += float(download(part.shadow_rays).sum(dtype=np.float64)) / self.pixels
+            cut += float(download(part.cut_size).sum(dtype=np.float64)) / self.pixels
+            for stage, spent in part.seconds.items():
+                stages[stage] = stages.get(stage, 0.0) + spent
+        difference = values - self._exact
+        rmse, absolute = np.sqrt((difference**2).mean()), np.abs(difference).mean()
+        return Found(seconds, rmse / self.mean, absolute / self.mean, rays, cut, stages)
+
+    def error_for(self, rmse: float, error: float) -> float:
+        """The ``error`` at which ``mdlightcuts`` has a given RMSE, to some percent; ``error``: a first guess."""
+        for _ in range(_TRIES):
+            reached = self.shade(self.plugin("mdlightcuts", error=error)).rmse
+            if abs(reached / rmse - 1) < _NEAR:
+                break
+            # The RMSE grows as about the 0.6th power of the error
+            error *= float(np.clip((rmse / reached) ** (1 / 0.6), 0.2, 5))
+        return error
+
+
+def _median(runs: list[Found]) -> Found:
+    return sorted(runs, key=lambda one: one.seconds)[len(runs) // 2]
+
+
+def curves(names, options) -> None:
+    """Part "curve"."""
+    print(
+        f"\n## error against the sum of all lights (width {options.width}, {VPLS} VPLs, max_depth {DEPTH}, no max_cut)"
+    )
+    print("scene | samples | method | error: RMSE, mean absolute error, rays/px, s")
+    for name in names:
+        for samples in (1, 9):
+            problem = Problem(name, samples, options.width)
+            for method in ("lightcuts", "mdlightcuts"):
+                shown = []
+                for error in (0.04, 0.02, 0.01, 0.005):
+                    found = problem.shade(problem.plugin(method, error=error, max_cut=0))
+                    shown.append(
+                        f"{100 * error:g}%: {found.rmse:.4f}, {100 * found.absolute:.2f}%, {found.rays:.0f}, "
+                        f"{found.seconds:.2f}"
+                    )
+                print(f"{name} | {samples} | {method} | {' | '.join(shown)}", flush=True)
+
+
+def many_samples(names, options) -> None:
+    """Part "samples"."""
+    samples = options.samples
+    print(f"\n## {samples} samples a pixel, equal RMSE of pixels (width {options.width}, {VPLS} VPLs, warm)")
+    print(
+        "scene | shared s | method | error | render s | rays/px | clusters or pairs/px | RMSE | mean absolute | speedup"
+    )
+    speedups = []
+    for name in names:
+        problem = Problem(name, samples, options.width)
+        target = problem.shade(problem.plugin("lightcuts")).rmse
+        errors = {"lightcuts": 0.01, "mdlightcuts": problem.error_for(target, 0.01)}
+        methods = {label: problem.plugin(label, error=error) for label, error in errors.items()}
+        runs: dict = {label: [] for label in methods}
+        for _ in range(RUNS):
+            for label, plugin in methods.items():
+                runs[label].append(problem.shade(plugin))
+        middle = {label: _median(found) for label, found in runs.items()}
+        for label, found in middle.items():
+            speedup = middle["lightcuts"].seconds / found.seconds
+            print(
+                f"{name} | {problem.shared:.2f} | {label} | {100 * errors[label]:.2g}% | {found.seconds:.2f} | "
+                f"{found.rays:.0f} | {found.cut:.0f} | {found.rmse:.4f} | {100 * found.absolute:.2f}% | {speedup:.1f}",
+                flush=True,
+            )
+        speedups.append(speedup)
+        print("  stages:", ", ".join(f"{stage} {spent:.2f}" for stage, spent in found.stages.items()), flush=True)
+    print(f"geometric mean of the speedups: {scenes.geometric_mean(speedups):.2f}")
+
+
+def growth(names, options) -> None:
+    """Part "growth"."""
+    print(f"\n## mdlightcuts at 1% with more samples a pixel (width {options.width}, {VPLS} VPLs, warm)")
+    print("scene | 1 sample: s, rays/px | 4: times as long, rays/px | 16 | 64")
+    for name in names:
+        base, shown = 0.0, []
+        for samples in (1, 4, 16, 64):
+            problem = Problem(name, samples, options.width)
+            plugin = problem.plugin("mdlightcuts")
+            problem.shade(plugin)
+            found = _median([problem.shade(plugin) for _ in range(RUNS)])
+            base = base or found.seconds
+            time = f"{found.seconds:.2f}" if samples == 1 else f"{found.seconds / base:.1f}"
+            shown.append(f"{time}, {found.rays:.0f}")
+        print(f"{name} | {' | '.join(shown)}", flush=True)
+
+
+def main() -> None:
+    """Parse the command line and run the parts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(scenes.NAMES), choices=scenes.NAMES)
+    parser.add_argument("--parts", nargs="+", default=["curve", "samples", "growth"])
+    parser.add_argument("--width", type=int, default=256, help="pixels (default: 256)")
+    parser.add_argument("--samples", type=int, default=16, help="samples a pixel of part samples (default: 16)")
+    options = parser.parse_args()
+    names = scenes.available(options.scenes)
+    parts = {"curve": curves, "samples": many_samples, "growth": growth}
+    for part in options.parts:
+        parts[part](names, options)
+
+
+if __name__ == "__main__":
+    main()

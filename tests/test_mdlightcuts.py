@@ -1,0 +1,188 @@
+"""The integrator ``mdlightcuts``: gather trees, and cuts through the product of trees against ``vpl``."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from vpl.gather_tree import build_gather_tree
+
+from .conftest import area_light, closed_box, render, sensor, wall
+from .test_integrators import ODD_SCENES
+from .test_lightcuts import many_kinds
+from .test_pairs import glossy_room
+
+NAME = "mdlightcuts"
+
+
+def rendered(scene, spp=1, seed=0, **more):
+    """An image and the statistics of its render."""
+    plugin = mi.load_dict({"type": NAME, **more})
+    return render(scene, plugin, spp, seed), plugin.statistics
+
+
+def relative_error(image, expected):
+    return np.abs(image - expected).sum() / expected.sum()
+
+
+# ---- Gather trees
+
+
+def nodes_that_hold(tree, pixel):
+    """For every pixel, the nodes whose points are exactly those of the pixel."""
+    along = pixel[tree.order]
+    end = tree.first.astype(np.int64) + tree.count
+    whole = (along[tree.first] == along[end - 1]) & (tree.count == np.bincount(pixel)[along[tree.first]])
+    return np.bincount(along[tree.first][whole], minlength=pixel.max() + 1)
+
+
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 300), width=st.integers(1, 9), flat=st.booleans())
+@settings(max_examples=40, deadline=None)
+def test_every_pixel_has_a_branch_of_its_own_with_one_point_in_every_leaf(seed, count, width, flat):
+    rng = np.random.default_rng(seed)
+    pixel = rng.integers(0, 40, count)
+    position = rng.normal(size=(count, 3)).astype(np.float32) * (0 if flat else 10.0 ** rng.uniform(-6, 6))
+    normal = rng.normal(size=(count, 3)).astype(np.float32)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    tree = build_gather_tree(pixel, width, position, normal)
+    assert np.array_equal(np.sort(tree.order), np.arange(count))
+    assert (tree.count[tree.child == 0] == 1).all()
+    inner = np.flatnonzero(tree.child)
+    assert np.array_equal(tree.count[inner], tree.count[tree.child[inner]] + tree.count[tree.child[inner] + 1])
+    assert (nodes_that_hold(tree, pixel)[np.unique(pixel)] == 1).all()
+
+
+def test_points_of_one_wall_are_divided_from_those_of_another():
+    rng = np.random.default_rng(1)
+    facing = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], 32, axis=0)
+    position = rng.uniform(-1, 1, (64, 3)) * (1 - facing)
+    mixed = rng.permutation(64)
+    tree = build_gather_tree(np.zeros(64, int), 1, position[mixed], facing[mixed])
+    walls = facing[mixed][tree.order]
+    for child in (tree.child[0], tree.child[0] + 1):
+        inside = walls[tree.first[child] : tree.first[child] + tree.count[child]]
+        assert len(inside) == 32 and (inside == inside[0]).all()
+
+
+# ---- Against the sum of all lights
+
+
+@pytest.mark.parametrize(("direct", "spp"), [("nee", 1), ("vpl", 1), ("vpl", 4)])
+def test_error_zero_is_the_sum_of_all_lights(direct, spp):
+    scene = glossy_room()
+    given = {"vpl_count": 200, "max_depth": 5, "direct": direct, "direct_count": 64}
+    cut, _ = rendered(scene, spp, error=0.0, max_cut=0, **given)
+    assert np.allclose(cut, render(scene, "vpl", spp, **given), rtol=1e-4, atol=1e-5 * cut.mean())
+
+
+@pytest.mark.parametrize("spp", [1, 9])
+def test_the_error_of_the_image_follows_the_bound(spp):
+    scene = glossy_room()
+    given = {"vpl_count": 5000, "max_depth": 5, "direct": "vpl", "direct_count": 256}
+    expected = render(scene, "vpl", spp, **given)
+    found = [rendered(scene, spp, error=error, **given) for error in (0.01, 0.1, 0.5)]
+    errors = [relative_error(image, expected) for image, _ in found]
+    assert errors[0] < 0.03 and errors[0] < 0.7 * errors[1] and errors[1] < 0.9 * errors[2]
+    sizes = [statistics["cut_size"] for _, statistics in found]
+    assert sizes == sorted(sizes, reverse=True)
+
+
+def tinted_mirrors():
+    """A box seen by way of three mirrors of different colours, and directly: points of a pixel differ in weight."""
+    scene = closed_box({"lamp": area_light()}, size=24)
+    scene["sensor"]["fov"] = 60
+    for k, tint in enumerate(([0.9, 0.2, 0.1], [0.1, 0.8, 0.3], [0.2, 0.3, 0.9])):
+        mirror = {"type": "conductor", "material": "none", "specular_reflectance": {"type": "rgb", "value": tint}}
+        scene[f"mirror{k}"] = {"type": "sphere", "center": [0.3 * k - 0.3, -0.2, -0.2], "radius": 0.12, "bsdf": mirror}
+    return scene
+
+
+@pytest.mark.parametrize("make", [tinted_mirrors, glossy_room, many_kinds])
+def test_the_mean_over_seeds_is_that_of_all_lights(make):
+    """With the same seeds both methods see the same lights: what is left is the noise of the representatives."""
+    scene = make()
+    scene = mi.load_dict(scene) if isinstance(scene, dict) else scene
+    given = {"vpl_count": 400, "max_depth": 4, "direct": "vpl", "direct_count": 64}
+    seeds, tiles = 24, 4
+    excess = []
+    for seed in range(seeds):
+        # So coarse a cut that representatives of points as well as lights matter everywhere
+        found, every = rendered(scene, 16, seed, error=0.3, **given)[0], render(scene, "vpl", 16, seed, **given)
+        size = found.shape[0] // tiles
+        blocks = (found - every)[: size * tiles, : size * tiles].reshape(tiles, size, tiles, size, 3)
+        excess.append(np.append(blocks.mean((1, 3)).reshape(-1), (found - every).mean((0, 1))))
+    excess = np.array(excess)
+    noisy = excess.std(0) > 1e-6 * np.abs(every).mean()
+    assert noisy[-3:].all()
+    p_values = stats.ttest_1samp(excess[:, noisy], 0).pvalue
+    assert p_values.min() > 1 - (1 - 0.01) ** (1 / noisy.sum())
+
+
+def test_a_pixel_with_many_samples_takes_hardly_more_pairs_than_with_one():
+    scene = mi.load_dict(closed_box({"lamp": area_light()}, size=32))
+    given = {"vpl_count": 20000, "max_depth": 5, "error": 0.02}
+    one, many = (rendered(scene, spp, **given)[1] for spp in (1, 16))
+    assert many["cut_size"] < 2 * one["cut_size"]
+    assert many["gather_points"] == 16 * one["gather_points"]
+
+
+def test_max_cut_bounds_pairs_about():
+    scene = glossy_room()
+    given = {"vpl_count": 20000, "max_depth": 5, "error": 0.002, "direct": "vpl"}
+    limited, free = (rendered(scene, 4, max_cut=most, **given)[1] for most in (100, 0))
+    pixels = limited["gather_points"] / 4
+    assert limited["cut_size"] < 200 * pixels < free["cut_size"]
+
+
+# ---- What every plugin has to bear
+
+
+@pytest.mark.parametrize("name", ODD_SCENES)
+def test_odd_scenes(name):
+    image, _ = rendered(mi.load_dict(ODD_SCENES[name]()), 2, vpl_count=200, max_depth=4)
+    assert np.isfinite(image).all()
+
+
+def test_the_same_seed_gives_the_same_image_and_another_one_another():
+    scene = mi.load_dict(closed_box({"lamp": area_light()}, size=16))
+    given = {"vpl_count": 500, "max_depth": 4, "error": 0.1}
+    first, again, other = (rendered(scene, 4, seed, **given)[0] for seed in (3, 3, 4))
+    assert np.allclose(first, again, rtol=1e-5)
+    assert relative_error(other, first) > 1e-3
+
+
+def test_passes_of_few_samples_and_wrappers_work():
+    scene = mi.load_dict(closed_box({"lamp": area_light()}, size=16))
+    plugin = {"type": NAME, "vpl_count": 300, "max_depth": 4, "error": 0.1}
+    whole = render(scene, mi.load_dict(plugin), 8, 0)
+    parts = render(scene, mi.load_dict(plugin | {"samples_per_pass": 2}), 8, 0)
+    assert relative_error(parts, whole) < 0.2
+    named = mi.load_dict({"type": "aov", "aovs": "depth:depth", "image": plugin | {"aovs": "cut_size"}})
+    channels = np.array(mi.render(scene, integrator=named, spp=2, seed=0))
+    assert channels.shape[2] > 4 and np.isfinite(channels).all()
+
+
+def test_a_lens_is_sampled_like_everything_else():
+    scene = {
+        "type": "scene",
+        "sensor": sensor(24, type="thinlens", aperture_radius=0.2, focus_distance=3.0),
+        "floor": wall([0, 0, -1], [0, 1, 0], 0, 4.0),
+        "near": wall([0, 0, 1], [0, 1, 0], 0, 0.3, (0.8, 0.2, 0.1)),
+        "bulb": {"type": "point", "position": [0.5, 0.5, 2], "intensity": 1.0},
+    }
+    scene = mi.load_dict(scene)
+    given = {"vpl_count": 300, "max_depth": 3}
+    image, _ = rendered(scene, 16, error=0.001, **given)
+    assert relative_error(image, render(scene, "vpl", 16, **given)) < 0.02
+
+
+BAD = [("error", -0.1), ("error", "x"), ("dark_floor", -1.0), ("max_cut", -1), ("max_cut", 2.5), ("vpl_count", 0)]
+
+
+@pytest.mark.parametrize(("name", "value"), BAD, ids=[f"{name}={value}" for name, value in BAD])
+def test_bad_properties_are_named_with_their_value(name, value):
+    with pytest.raises((ValueError, RuntimeError)) as error:
+        mi.load_dict({"type": NAME, name: value})
+    assert f'property "{name}" must be' in str(error.value) and f"got {value!r}" in str(error.value)

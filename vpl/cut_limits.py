@@ -1,0 +1,29 @@
+"""How a largest cut is held where pairs of clusters are refined, which know no cut of a single point."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from .arrays import download, upload
+from .cuts import limited_cuts, upload_thresholds
+from .light_set import LightSet
+from .pairs import BoundCounter
+from .point_clusters import PointClusters
+
+
+def least_thresholds(
+    lights: LightSet, clusters: PointClusters, allowed: np.ndarray, max_cut: int, stride: int, counter: BoundCounter
+) -> np.ndarray:
+    """Thresholds below which cuts are about larger than ``max_cut``, tried at every ``stride``-th point of the tree.
+
+    ``allowed`` (n,): largest bound that each point along the tree would accept.  Cuts grow about as fast as thresholds
+    fall at most, so one that is not full leaves that much room below.  Returns one float64 per point that was tried.
+    """
+    rows = np.arange(0, clusters.count, stride)
+    # What is 0 could not be raised by any factor
+    tried = np.maximum(allowed[rows], np.finfo(np.float32).tiny)
+    index = upload(mi.UInt32, rows)
+    raised, sizes, visits = limited_cuts(lights, clusters.batch.select(index), upload_thresholds(tried), max_cut)
+    counter.add_at_points(index, visits)
+    return download(raised).astype(np.float64) * np.minimum(sizes.total() / max_cut, 1)

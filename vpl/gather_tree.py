@@ -1,0 +1,45 @@
+"""Gather trees: for every pixel a binary tree over its gather points (NumPy only) [MDLC].
+
+All of them are branches of one :class:`vpl.point_tree.PointTree`, whose upper levels hold blocks of pixels: what is
+known of all pixels of a block, such as that a cluster of lights lies behind them, is found out once.
+
+Within a pixel points are divided by normal first, then by position within the box of the pixel's own points; the
+pixels lie along a Morton curve through the image.
+
+[MDLC] Walter et al. 2006, Multidimensional lightcuts.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .morton import interleave
+from .point_tree import PointTree, tree_over_codes
+
+_NORMAL_CELLS, _NORMAL_BITS, _POSITION_BITS = 7, 3, 10
+
+
+def gather_codes(pixel: np.ndarray, width: int, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Codes of points, (n,) uint64: the pixel above where the normal points to above where the point is.
+
+    ``pixel`` (n,): row after row of an image ``width`` wide; ``position``, ``normal``: (n, 3), world units.
+    """
+    pixels, owner = np.unique(pixel, return_inverse=True)
+    along = interleave(np.stack([pixels % width, pixels // width, np.zeros_like(pixels)], axis=1))
+    place = np.argsort(np.argsort(along)).astype(np.uint64)[owner]
+    order = np.argsort(owner, kind="stable")
+    first = np.searchsorted(owner[order], np.arange(len(pixels)))
+    inside = position[order].astype(np.float64)
+    low = np.minimum.reduceat(inside, first)
+    extent = (np.maximum.reduceat(inside, first) - low).max(1)
+    scale = (2**_POSITION_BITS - 1) / np.where(extent > 0, extent, 1)
+    cells = (position - low[owner]) * scale[owner][:, None]
+    by_normal = np.clip((normal + 1) * (0.5 * _NORMAL_CELLS), 0, _NORMAL_CELLS - 1)
+    code = place << np.uint64(3 * (_NORMAL_BITS + _POSITION_BITS))
+    code |= interleave(by_normal) << np.uint64(3 * _POSITION_BITS)
+    return code | interleave(cells)
+
+
+def build_gather_tree(pixel: np.ndarray, width: int, position: np.ndarray, normal: np.ndarray) -> PointTree:
+    """The tree over points with one point in every leaf; arguments as in :func:`gather_codes`, with n > 0."""
+    return tree_over_codes(gather_codes(pixel, width, position, normal), 1)

@@ -1,0 +1,122 @@
+"""Cuts through the product of a pixel's gather tree and the light trees [MDLC].
+
+A pixel's radiance is the sum, over all pairs of one of its gather points and a light, of what the light sends to the
+point, weighted by the point's share of the pixel.  A pair of a gather node and a light node stands for all pairs below;
+it is refined while its bound, times the share of its gather node, is above ``error`` times the radiance of the pixel.
+One point and one light represent it, each drawn by its strength, so that the cut is unbiased.
+
+Departures from the paper: thresholds are known before refinement begins, from estimates of the pixels' radiance,
+instead of following from the running total of a heap, so that all pixels refine at once (:mod:`vpl.pairs`); and gather
+nodes above a pixel take part.  Pairs with blocks of pixels are never accepted, but what no pixel of a block can see is
+left out once for all of them, and a cluster of lights that is too coarse for every pixel of a block is divided once.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .arrays import add_at, upload
+from .cuts import upload_thresholds
+from .evaluation import evaluate_pairs
+from .gather import SceneTraits
+from .light_set import LightGroup, LightSet
+from .pairs import Pairs
+from .point_clusters import PointClusters
+from .sampling import derived_seed, find_interval, independent_sampler
+
+
+class PixelCuts:
+    """Light of some pixels, found pair by pair, and what it took.
+
+    ``clusters``: points along their gather trees; ``pixel`` (n,): of every point along the tree; ``weight`` (n, 3): the
+    factor on its radiance in its camera ray; ``samples``: camera rays of a pixel.
+    """
+
+    def __init__(self, clusters: PointClusters, pixel: np.ndarray, weight: np.ndarray, samples: int, seed: int):
+        self.clusters, self._seed, self._kernels = clusters, seed, 0
+        tree = clusters.tree
+        end = tree.first.astype(np.int64) + tree.count
+        self._of_pixel = pixel[tree.first] == pixel[end - 1]
+        level = weight.mean(1, dtype=np.float64)
+        cumulative = np.concatenate([[0.0], np.cumsum(level)])
+        self._share = (cumulative[end] - cumulative[tree.first]) / samples
+        precise = dr.float64_array_t(mi.Float)
+        self._cumulative = upload(precise, cumulative)
+        channels = np.concatenate([np.zeros((1, 3)), np.cumsum(weight, axis=0, dtype=np.float64)])
+        self._channels = [upload(precise, channel) for channel in channels.T[: dr.size_v(mi.UnpolarizedSpectrum)]]
+        self._parent, self._leaf = upload(mi.UInt32, tree.parent), upload(mi.UInt32, tree.leaf)
+        self._light = dr.zeros(mi.UnpolarizedSpectrum, tree.size)
+        self.pairs, self.rays = dr.zeros(mi.Float, tree.size), dr.zeros(mi.UInt32, clusters.count)
+        dr.eval(self._light, self.pairs, self.rays)
+
+    def rule(self, allowed: np.ndarray):
+        """(accept, points first) for :func:`vpl.pairs.find_pairs`.
+
+        ``allowed`` (n,): what a pair may add to the radiance of a pixel at most, for every point along the tree.
+        """
+        tree = self.clusters.tree
+        least = tree.gather_up(allowed[tree.first[tree.leaves]], tree.leaves, np.minimum)
+        # Bounds hold for one point of unit weight. Blocks of pixels are marked by a sign: they accept nothing
+        with np.errstate(divide="ignore"):
+            bound = np.where(self._of_pixel, least / self._share, -least)
+        threshold = upload_thresholds(bound)
+
+        def accept(points, lights, bound, index):
+            """Whether a pair is fine enough."""
+            return bound <= dr.gather(mi.Float, threshold, index)
+
+        def points_first(points, lights, bound, index):
+            """Whether the lights of a pair are fine enough for every pixel of a block."""
+            return bound <= -dr.gather(mi.Float, threshold, index)
+
+        return accept, points_first
+
+    def evaluate(self, scene, traits: SceneTraits, lights: LightSet, group: LightGroup, pairs: Pairs) -> None:
+        """Add the light of accepted pairs: one point and one light stand for each."""
+        self._kernels += 1
+        point, factor = self._representative(pairs)
+        light, scale = group.representatives(pairs.lights)
+        surface = self.clusters.batch.surfaces_at(point)
+        value, traced = evaluate_pairs(scene, traits, lights, group, surface, light, scale)
+        add_at(self._light, value * factor, pairs.points)
+        add_at(self.pairs, dr.ones(mi.Float, pairs.count), pairs.points)
+        add_at(self.rays, dr.select(traced, mi.UInt32(1), 0), point)
+        dr.eval(self._light, self.pairs, self.rays)
+
+    def _representative(self, pairs: Pairs):
+        """A point of every pair's gather node, drawn by weight, and the factor on its radiance.
+
+        Where weights have colours, the factor makes up for those of the point that was drawn.
+        """
+        first, count = self.clusters.ranges(pairs.points)
+        last = first + count
+        sample = independent_sampler(derived_seed(self._seed, self._kernels), pairs.count).next_1d()
+        point = find_interval(self._cumulative, first, last, sample)
+
+        def ratio(cumulative):
+            low, high, begin, end = (
+                dr.gather(type(cumulative), cumulative, index) for index in (point, point + 1, first, last)
+            )
+            return dr.select(end > begin, (high - low) / (end - begin), 0)
+
+        drawn = ratio(self._cumulative)
+        factor = [mi.Float(dr.select(drawn > 0, ratio(channel) / drawn, 0)) for channel in self._channels]
+        return point, mi.UnpolarizedSpectrum(*factor)
+
+    def per_point(self):
+        """(Radiance, pairs): for every point along the tree, from all nodes that hold it; pairs are shared out."""
+        share = dr.rcp(mi.Float(upload(mi.UInt32, self.clusters.tree.count)))
+        return self._sum_from_root(self._light), self._sum_from_root(self.pairs * share)
+
+    @dr.syntax
+    def _sum_from_root(self, values):
+        dr.eval(values)
+        node = mi.UInt32(self._leaf)
+        total = dr.gather(type(values), values, node)
+        while dr.hint(node > 0, exclude=[self, values]):
+            node = dr.gather(mi.UInt32, self._parent, node)
+            total += dr.gather(type(values), values, node)
+        dr.eval(total)
+        return total
