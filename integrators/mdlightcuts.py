@@ -23,8 +23,8 @@ from .manual import manual_page
 
 # Pairs that are shaded and traced at a time
 _PAIRS_PER_KERNEL = 1 << 22
-# Coarse cuts of every eighth point tell how bright pixels are, or of one point a pixel where that is less
-_ESTIMATE_STRIDE = 8
+# A coarse cut of one point for so many pixels tells how bright they are
+_ESTIMATE_PIXELS = 8
 # One pixel in so many tells how large the cuts around it are
 _TRIED_PIXELS = 32
 
@@ -95,7 +95,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
         clock = Clock()
         estimate = estimate_radiance(
             job.scene, job.traits, job.lights, job.batch, job.direct, job.mean, self.max_cut,
-            max(_ESTIMATE_STRIDE, job.grid.samples),
+            _ESTIMATE_PIXELS * job.grid.samples,
         )  # fmt: skip
         clock.lap("estimate")
         pixel = download(job.ray).astype(np.int64) // job.grid.samples

@@ -24,14 +24,15 @@ def gather_codes(pixel: np.ndarray, width: int, position: np.ndarray, normal: np
 
     ``pixel`` (n,): row after row of an image ``width`` wide; ``position``, ``normal``: (n, 3), world units.
     """
-    pixels, owner = np.unique(pixel, return_inverse=True)
+    count = np.bincount(pixel)
+    pixels = np.flatnonzero(count)
+    owner = (np.cumsum(count > 0) - 1)[pixel]
     along = interleave(np.stack([pixels % width, pixels // width, np.zeros_like(pixels)], axis=1))
     place = np.argsort(np.argsort(along)).astype(np.uint64)[owner]
-    order = np.argsort(owner, kind="stable")
-    first = np.searchsorted(owner[order], np.arange(len(pixels)))
-    inside = position[order].astype(np.float64)
+    first = np.concatenate([[0], np.cumsum(count[pixels])[:-1]])
+    inside = position[np.argsort(owner, kind="stable")]
     low = np.minimum.reduceat(inside, first)
-    extent = (np.maximum.reduceat(inside, first) - low).max(1)
+    extent = (np.maximum.reduceat(inside, first) - low).max(1).astype(np.float64)
     scale = (2**_POSITION_BITS - 1) / np.where(extent > 0, extent, 1)
     cells = (position - low[owner]) * scale[owner][:, None]
     by_normal = np.clip((normal + 1) * (0.5 * _NORMAL_CELLS), 0, _NORMAL_CELLS - 1)

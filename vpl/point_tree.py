@@ -64,24 +64,25 @@ class PointTree:
     @cached_property
     def leaves(self) -> np.ndarray:
         """Leaves along the curve, so that their ranges follow each other: (l,) int64."""
-        leaves = np.flatnonzero(self.child == 0)
-        return leaves[np.argsort(self.first[leaves])]
+        begins = np.concatenate([[True], self.leaf[1:] != self.leaf[:-1]])
+        return self.leaf[begins].astype(np.int64)
 
     def reduce(self, values: np.ndarray, function: np.ufunc) -> np.ndarray:
         """Combine a value of the points, (n, ...) in the caller's order, for every node, (m, ...).
 
         ``function``: np.minimum, np.maximum, np.add, np.logical_or ...
         """
-        leaves = self.leaves
-        return self.gather_up(function.reduceat(values[self.order], self.first[leaves], axis=0), leaves, function)
+        leaves, values = self.leaves, values[self.order]
+        if len(leaves) < len(values):
+            values = function.reduceat(values, self.first[leaves], axis=0)
+        return self.gather_up(values, leaves, function)
 
     def gather_up(self, at_leaves: np.ndarray, leaves: np.ndarray, function: np.ufunc) -> np.ndarray:
         """Combine values of ``leaves`` for every node: a node's is ``function`` of its children's."""
         result = np.zeros((self.size, *at_leaves.shape[1:]), at_leaves.dtype)
         result[leaves] = at_leaves
-        for nodes in self._inner_from_below():
-            child = self.child[nodes]
-            result[nodes] = function(result[child], result[child + 1])
+        for nodes, first, second in self._inner_from_below():
+            result[nodes] = function(result[first], result[second])
         return result
 
     def push_down(self, values: np.ndarray) -> np.ndarray:
@@ -108,20 +109,22 @@ class PointTree:
         leaves = self.leaves
         angles = np.zeros(self.size)
         angles[leaves] = np.arccos(np.clip(np.minimum.reduceat(cosine, self.first[leaves]), -1, 1))
-        for nodes in self._inner_from_below():
+        for nodes, *children in self._inner_from_below():
             reach = []
-            for child in (self.child[nodes], self.child[nodes] + 1):
+            for child in children:
                 between = np.arccos(np.clip(np.einsum("ij,ij->i", axes[nodes], axes[child]), -1, 1))
                 reach.append(between + angles[child])
             angles[nodes] = np.minimum(np.maximum(*reach), np.pi)
         return axes, np.maximum(np.cos(angles) - _COSINE_ROUNDING, -1)
 
     def _inner_from_below(self):
-        """Inner nodes level by level, the deepest level first."""
-        for first, last in zip(self.levels[-2::-1], self.levels[:0:-1], strict=True):
-            nodes = first + np.flatnonzero(self.child[first:last])
-            if len(nodes):
-                yield nodes
+        """(Inner nodes, their first children, their second ones) level by level, the deepest level first.
+
+        The children of a level's nodes are the next level, siblings next to each other, so slices pick them.
+        """
+        for k in range(len(self.levels) - 3, -1, -1):
+            first, last, end = self.levels[k : k + 3]
+            yield first + np.flatnonzero(self.child[first:last]), slice(last, end, 2), slice(last + 1, end, 2)
 
 
 def _cells(position: np.ndarray) -> np.ndarray:
