@@ -54,6 +54,11 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
        - About how many pairs a pixel may be lit by; where the bound asks for more, it is raised. 0 is no limit.
          (Default: 1000)
 
+     * - leaf_points
+       - |int|
+       - Neighbouring samples of a pixel, on surfaces without gloss, that are never told apart: for every cluster of
+         lights one of them, drawn at random, stands for all. 1 refines to single samples. (Default: 4)
+
      {common parameters}
 
     Walter et al. 2006, "Multidimensional lightcuts" [MDLC]. Like :ref:`lightcuts <integrator-lightcuts>`, but what is
@@ -89,6 +94,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
         self.error = properties.number(props, "error", 0.01, 0)
         self.dark_floor = properties.number(props, "dark_floor", 0.5, 0)
         self.max_cut = properties.integer(props, "max_cut", 1000, 0)
+        self.leaf_points = properties.integer(props, "leaf_points", 4, 1)
 
     def shade(self, job: Shading) -> Shaded:
         """Gather trees, thresholds, and the cut of every pixel, for one batch."""
@@ -99,9 +105,11 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
         )  # fmt: skip
         clock.lap("estimate")
         pixel = download(job.ray).astype(np.int64) // job.grid.samples
-        clusters = PointClusters(job.batch, partial(build_gather_tree, pixel, job.grid.width))
+        leaf_size = 1 if job.batch.proxy.glossy else self.leaf_points
+        clusters = PointClusters(job.batch, partial(build_gather_tree, pixel, job.grid.width, leaf_size))
         order = clusters.tree.order
-        cuts = PixelCuts(clusters, pixel[order], download(job.weight)[order], job.grid.samples, job.seed)
+        weight = dr.gather(type(job.weight), job.weight, clusters.order)
+        cuts = PixelCuts(clusters, pixel[order], weight, job.grid.samples, job.seed)
         clock.lap("gather_tree")
         counter = BoundCounter(clusters, "upper_bounds" in self.aovs)
         allowed = self._allowed(job, estimate, pixel)[order]

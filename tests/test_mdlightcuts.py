@@ -1,5 +1,8 @@
 """The integrator ``mdlightcuts``: gather trees, and cuts through the product of trees against ``vpl``."""
 
+from functools import partial
+
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -7,12 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from vpl.arrays import download, upload
 from vpl.gather_tree import build_gather_tree
+from vpl.pairs import Pairs
+from vpl.pixel_cuts import PixelCuts
+from vpl.point_clusters import PointClusters
 
 from .conftest import area_light, closed_box, render, sensor, wall
 from .test_integrators import ODD_SCENES
 from .test_lightcuts import many_kinds
-from .test_pairs import glossy_room
+from .test_pairs import batch_of, glossy_room
 
 NAME = "mdlightcuts"
 
@@ -38,17 +45,24 @@ def nodes_that_hold(tree, pixel):
     return np.bincount(along[tree.first][whole], minlength=pixel.max() + 1)
 
 
-@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 300), width=st.integers(1, 9), flat=st.booleans())
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(1, 300),
+    width=st.integers(1, 9),
+    flat=st.booleans(),
+    most=st.sampled_from([1, 3, 50]),
+)
 @settings(max_examples=40, deadline=None)
-def test_every_pixel_has_a_branch_of_its_own_with_one_point_in_every_leaf(seed, count, width, flat):
+def test_every_pixel_has_a_branch_of_its_own(seed, count, width, flat, most):
     rng = np.random.default_rng(seed)
     pixel = rng.integers(0, 40, count)
     position = rng.normal(size=(count, 3)).astype(np.float32) * (0 if flat else 10.0 ** rng.uniform(-6, 6))
     normal = rng.normal(size=(count, 3)).astype(np.float32)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    tree = build_gather_tree(pixel, width, position, normal)
+    tree = build_gather_tree(pixel, width, most, position, normal)
     assert np.array_equal(np.sort(tree.order), np.arange(count))
-    assert (tree.count[tree.child == 0] == 1).all()
+    assert (tree.count[tree.child == 0] <= most).all()
+    assert (np.diff(pixel[tree.order])[np.diff(tree.leaf.astype(int)) == 0] == 0).all()
     inner = np.flatnonzero(tree.child)
     assert np.array_equal(tree.count[inner], tree.count[tree.child[inner]] + tree.count[tree.child[inner] + 1])
     assert (nodes_that_hold(tree, pixel)[np.unique(pixel)] == 1).all()
@@ -59,7 +73,7 @@ def test_points_of_one_wall_are_divided_from_those_of_another():
     facing = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], 32, axis=0)
     position = rng.uniform(-1, 1, (64, 3)) * (1 - facing)
     mixed = rng.permutation(64)
-    tree = build_gather_tree(np.zeros(64, int), 1, position[mixed], facing[mixed])
+    tree = build_gather_tree(np.zeros(64, int), 1, 1, position[mixed], facing[mixed])
     walls = facing[mixed][tree.order]
     for child in (tree.child[0], tree.child[0] + 1):
         inside = walls[tree.first[child] : tree.first[child] + tree.count[child]]
@@ -73,7 +87,7 @@ def test_points_of_one_wall_are_divided_from_those_of_another():
 def test_error_zero_is_the_sum_of_all_lights(direct, spp):
     scene = glossy_room()
     given = {"vpl_count": 200, "max_depth": 5, "direct": direct, "direct_count": 64}
-    cut, _ = rendered(scene, spp, error=0.0, max_cut=0, **given)
+    cut, _ = rendered(scene, spp, error=0.0, max_cut=0, leaf_points=1, **given)
     assert np.allclose(cut, render(scene, "vpl", spp, **given), rtol=1e-4, atol=1e-5 * cut.mean())
 
 
@@ -120,6 +134,33 @@ def test_the_mean_over_seeds_is_that_of_all_lights(make):
     assert p_values.min() > 1 - (1 - 0.01) ** (1 / noisy.sum())
 
 
+@pytest.mark.parametrize("black", [False, True])
+def test_representatives_stand_for_points_of_all_weights_and_colours(black):
+    rng = np.random.default_rng(5)
+    count, draws = 12, 1 << 16
+    weight = rng.uniform(0, 1, (count, 3)).astype(np.float32) ** 3
+    weight[3] = 0
+    if black:
+        weight[:, 1] = 0
+    radiance = rng.uniform(0, 5, (count, 3))
+    pixel = np.repeat([0, 1], 6)
+    normal = np.tile(np.float32([0, 0, 1]), (count, 1))
+    position = rng.random((count, 3)).astype(np.float32)
+    clusters = PointClusters(batch_of(position, normal), partial(build_gather_tree, pixel, 2, 1))
+    tree = clusters.tree
+    along = mi.Color3f(*(upload(mi.Float, column) for column in weight[tree.order].T))
+    cuts = PixelCuts(clusters, pixel[tree.order], along, 6, 0)
+    for node in range(tree.size):
+        inside = tree.order[tree.first[node] : tree.first[node] + tree.count[node]]
+        chosen = dr.opaque(mi.UInt32, node, draws)
+        point, factor = cuts._representative(Pairs(chosen, chosen))
+        found = (download(factor).reshape(-1, 3) * radiance[tree.order[download(point)]] * np.ones((draws, 1))).mean(0)
+        total = weight[inside].sum(0)
+        mean = (weight[inside] * radiance[inside]).sum(0) / np.where(total > 0, total, 1)
+        assert np.allclose(found, mean, rtol=0.03, atol=1e-6)
+        assert np.isclose(cuts._share[node], weight[inside].mean(1).sum() / 6, rtol=1e-5)
+
+
 def test_a_pixel_with_many_samples_takes_hardly_more_pairs_than_with_one():
     scene = mi.load_dict(closed_box({"lamp": area_light()}, size=32))
     given = {"vpl_count": 20000, "max_depth": 5, "error": 0.02}
@@ -132,8 +173,9 @@ def test_max_cut_bounds_pairs_about():
     scene = glossy_room()
     given = {"vpl_count": 20000, "max_depth": 5, "error": 0.002, "direct": "vpl"}
     limited, free = (rendered(scene, 4, max_cut=most, **given)[1] for most in (100, 0))
+    # Pixels that see matt and glossy surfaces have two cuts
     pixels = limited["gather_points"] / 4
-    assert limited["cut_size"] < 200 * pixels < free["cut_size"]
+    assert limited["cut_size"] < 250 * pixels < free["cut_size"] / 2
 
 
 # ---- What every plugin has to bear

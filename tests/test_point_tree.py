@@ -4,11 +4,15 @@ import re
 from dataclasses import replace
 from itertools import product
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vpl.arrays import download, upload
+from vpl.node_bounds import NodeBounds
 from vpl.point_tree import build_point_tree, point_codes
 
 
@@ -102,19 +106,33 @@ def check_sums(tree):
     assert (values == copy).all()
 
 
+def cones(tree, directions):
+    """Axes and cosines of all nodes, found on the device."""
+    columns = (upload(mi.Float, column) for column in directions[tree.order].T)
+    return tuple(download(found) for found in NodeBounds(tree).cones(mi.Vector3f(*columns)))
+
+
+def check_reductions(tree):
+    values = np.random.default_rng(tree.size).normal(size=(len(tree.order), 3)).astype(np.float32)
+    columns = mi.Vector3f(*(upload(mi.Float, column) for column in values[tree.order].T))
+    for join, function in ((dr.minimum, np.minimum), (dr.maximum, np.maximum)):
+        assert (download(NodeBounds(tree).reduce(columns, join)) == tree.reduce(values, function)).all()
+
+
 def check_cones(tree, directions, axes, cosine):
-    assert axes.dtype == cosine.dtype == np.float64
-    np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1, atol=1e-12)
+    assert axes.dtype == cosine.dtype == np.float32
+    axes, cosine = axes.astype(np.float64), cosine.astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1, atol=1e-6)
     assert (np.abs(cosine) <= 1).all()
     within, directions = holds(tree), directions.astype(np.float64)
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    for vectors, kind in product((unit, directions), (np.float64, np.float32)):
-        nearest = np.where(within, axes.astype(kind).astype(np.float64) @ vectors.T, 1).min(axis=1)
+    for vectors in (unit, directions):
+        nearest = np.where(within, axes @ vectors.T, 1).min(axis=1)
         # No tolerance on this side, but that a cosine of -1 stands for the whole sphere.
-        assert (cosine.astype(kind) <= np.maximum(nearest, -1)).all()
+        assert (cosine <= np.maximum(nearest, -1)).all()
     mean = within @ unit / tree.count[:, None]
     length = np.linalg.norm(mean, axis=1)
-    assert (np.einsum("ij,ij->i", mean, axes) >= length * (1 - 1e-8))[length > 0.01].all()
+    assert (np.einsum("ij,ij->i", mean, axes) >= length * (1 - 1e-6))[length > 0.01].all()
     # On the other side, cones are as wide as their vectors or the cones of their children need.
     leaf = tree.child == 0
     nearest = np.where(within, axes @ unit.T, 1).min(axis=1)
@@ -131,7 +149,8 @@ def build_checked(position, normal, leaf_size=8):
     tree = build_point_tree(position, normal, leaf_size)
     check_structure(tree, position, normal, leaf_size)
     check_sums(tree)
-    check_cones(tree, normal, *tree.cones(normal))
+    check_reductions(tree)
+    check_cones(tree, normal, *cones(tree, normal))
     return tree
 
 
@@ -175,7 +194,7 @@ def test_sizes_around_the_smallest_and_the_leaf(count, leaf_size):
 def test_the_checker_notices_corruption(column):
     position, normal = random_points(np.random.default_rng(0), 100)
     tree = build_point_tree(position, normal)
-    axes, cosine = tree.cones(normal)
+    axes, cosine = cones(tree, normal)
     values = cosine if column == "cosine" else getattr(tree, column)
     step = 1e-6 if column == "cosine" else 1
     for entry, change in product((len(values) // 2, len(values) - 1), (step, -1000 * step)):
@@ -214,7 +233,7 @@ def test_points_are_parted_by_their_normals_wherever_they_are(spread):
 def test_cones_of_identical_normals_keep_their_axis(seed):
     rng = np.random.default_rng(seed)
     position, normal = rng.random((100, 3)).astype(np.float32), np.repeat(random_unit(rng, 1), 100, axis=0)
-    axes, cosine = build_checked(position, normal, 1).cones(normal)
+    axes, cosine = cones(build_checked(position, normal, 1), normal)
     np.testing.assert_allclose(axes, np.float64(normal[0]) + 0 * axes, atol=2e-7)
     assert (cosine > 1 - 1e-6).all()
 
@@ -225,7 +244,7 @@ def test_cones_of_normals_that_cancel_are_finite_and_hold_them(star):
     for axis, leaf_size in product(range(3), (1, 4, 100)):
         normal = np.insert(np.tile(star, (10, 1)), axis, 0, axis=1).astype(np.float32)
         tree = build_checked(np.zeros_like(normal), normal, leaf_size)
-        assert tree.cones(normal)[1][0] < 0.01
+        assert cones(tree, normal)[1][0] < 0.01
 
 
 @pytest.mark.parametrize("seed", range(5))

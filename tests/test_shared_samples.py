@@ -32,7 +32,7 @@ def test_shared_samples_have_the_mean_of_all_of_them():
 def test_the_light_of_a_point_is_that_of_one_of_its_pixel():
     """Here four neighbouring rays are taken for samples of one pixel."""
     for job in prepared(glossy_room(), vpl_count=100, max_depth=3)[1]:
-        job, settings = replace(job, samples=4), {"type": NAME, "error": 0.0, "max_cut": 0}
+        job, settings = replace(job, grid=replace(job.grid, samples=4)), {"type": NAME, "error": 0.0, "max_cut": 0}
         own, shown = (
             download(mi.load_dict({**settings, "share_samples": share}).shade(job).radiance) for share in (False, True)
         )

@@ -17,6 +17,7 @@ from .morton import interleave
 from .point_tree import PointTree, tree_over_codes
 
 _NORMAL_CELLS, _NORMAL_BITS, _POSITION_BITS = 7, 3, 10
+_PIXEL_SHIFT = 3 * (_NORMAL_BITS + _POSITION_BITS)
 
 
 def gather_codes(pixel: np.ndarray, width: int, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -32,15 +33,17 @@ def gather_codes(pixel: np.ndarray, width: int, position: np.ndarray, normal: np
     first = np.concatenate([[0], np.cumsum(count[pixels])[:-1]])
     inside = position[np.argsort(owner, kind="stable")]
     low = np.minimum.reduceat(inside, first)
-    extent = (np.maximum.reduceat(inside, first) - low).max(1).astype(np.float64)
-    scale = (2**_POSITION_BITS - 1) / np.where(extent > 0, extent, 1)
-    cells = (position - low[owner]) * scale[owner][:, None]
+    extent = (np.maximum.reduceat(inside, first) - low).max(1)
+    cells = (position - low[owner]) / np.where(extent > 0, extent, 1)[owner, None] * (2**_POSITION_BITS - 1)
     by_normal = np.clip((normal + 1) * (0.5 * _NORMAL_CELLS), 0, _NORMAL_CELLS - 1)
-    code = place << np.uint64(3 * (_NORMAL_BITS + _POSITION_BITS))
+    code = place << np.uint64(_PIXEL_SHIFT)
     code |= interleave(by_normal) << np.uint64(3 * _POSITION_BITS)
     return code | interleave(cells)
 
 
-def build_gather_tree(pixel: np.ndarray, width: int, position: np.ndarray, normal: np.ndarray) -> PointTree:
-    """The tree over points with one point in every leaf; arguments as in :func:`gather_codes`, with n > 0."""
-    return tree_over_codes(gather_codes(pixel, width, position, normal), 1)
+def build_gather_tree(
+    pixel: np.ndarray, width: int, leaf_size: int, position: np.ndarray, normal: np.ndarray
+) -> PointTree:
+    """The tree over points, n > 0, with at most ``leaf_size`` points of one pixel in a leaf; other arguments as in
+    :func:`gather_codes`."""
+    return tree_over_codes(gather_codes(pixel, width, position, normal), leaf_size, _PIXEL_SHIFT)

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import add_at, upload
+from .arrays import add_at, channel_mean, download, upload
 from .cuts import upload_thresholds
 from .evaluation import evaluate_pairs
 from .gather import SceneTraits
@@ -30,22 +30,18 @@ from .sampling import derived_seed, find_interval, independent_sampler
 class PixelCuts:
     """Light of some pixels, found pair by pair, and what it took.
 
-    ``clusters``: points along their gather trees; ``pixel`` (n,): of every point along the tree; ``weight`` (n, 3): the
-    factor on its radiance in its camera ray; ``samples``: camera rays of a pixel.
+    ``clusters``: points along their gather trees; ``pixel``, (n,) of NumPy: of every point along the tree; ``weight``:
+    the factor on its radiance in its camera ray; ``samples``: camera rays of a pixel.
     """
 
-    def __init__(self, clusters: PointClusters, pixel: np.ndarray, weight: np.ndarray, samples: int, seed: int):
+    def __init__(self, clusters: PointClusters, pixel: np.ndarray, weight, samples: int, seed: int):
         self.clusters, self._seed, self._kernels = clusters, seed, 0
         tree = clusters.tree
         end = tree.first.astype(np.int64) + tree.count
         self._of_pixel = pixel[tree.first] == pixel[end - 1]
-        level = weight.mean(1, dtype=np.float64)
-        cumulative = np.concatenate([[0.0], np.cumsum(level)])
+        self._cumulative, *self._channels = (_cumulative(x) for x in (channel_mean(weight), *weight))
+        cumulative = download(self._cumulative)
         self._share = (cumulative[end] - cumulative[tree.first]) / samples
-        precise = dr.float64_array_t(mi.Float)
-        self._cumulative = upload(precise, cumulative)
-        channels = np.concatenate([np.zeros((1, 3)), np.cumsum(weight, axis=0, dtype=np.float64)])
-        self._channels = [upload(precise, channel) for channel in channels.T[: dr.size_v(mi.UnpolarizedSpectrum)]]
         self._parent, self._leaf = upload(mi.UInt32, tree.parent), upload(mi.UInt32, tree.leaf)
         self._light = dr.zeros(mi.UnpolarizedSpectrum, tree.size)
         self.pairs, self.rays = dr.zeros(mi.Float, tree.size), dr.zeros(mi.UInt32, clusters.count)
@@ -120,3 +116,13 @@ class PixelCuts:
             total += dr.gather(type(values), values, node)
         dr.eval(total)
         return total
+
+
+def _cumulative(values):
+    """Sums of all values before each, and of all, in double precision."""
+    precise = dr.float64_array_t(mi.Float)
+    count = dr.width(values)
+    sums = dr.zeros(precise, count + 1)
+    dr.scatter(sums, dr.cumsum(precise(values)), dr.arange(mi.UInt32, count) + 1)
+    dr.eval(sums)
+    return sums

@@ -12,12 +12,11 @@ import numpy as np
 
 from .arrays import download, upload
 from .bounds import Receiver
+from .node_bounds import NodeBounds
 from .point_tree import PointTree, build_point_tree
 from .proxies import MaterialProxy
 from .surfaces import Batch
 
-# Floats per node: box, cone of normals, largest base, range of points, first child; and of lobes: cone, peak, exponent
-_RECORD, _LOBE_RECORD = 16, 8
 # Most points of a leaf: a few make a smaller tree at 1 to 3% more shadow rays, but lobes need points of their own
 _LAMBERTIAN_LEAF, _GLOSSY_LEAF = 4, 1
 
@@ -45,17 +44,18 @@ class PointClusters:
     """
 
     def __init__(self, batch: Batch, build: Callable | None = None):
-        position, normal = download(batch.position), _directions(batch.normal)
-        self.tree: PointTree = (build or partial(_tree_by_place, batch))(position, normal)
+        normal = _directions(batch.normal)
+        self.tree: PointTree = (build or partial(_tree_by_place, batch))(download(batch.position), download(normal))
         self.order = upload(mi.UInt32, self.tree.order)
         self.batch = batch.select(self.order)
-        self._records = upload(mi.Float, _records(self.tree, position, normal, download(batch.proxy.base)))
-        proxy = batch.proxy
-        self._lobes = upload(mi.Float, _lobe_records(self.tree, proxy)) if proxy.glossy else None
+        bounds, proxy = NodeBounds(self.tree), self.batch.proxy
+        normal = dr.gather(mi.Vector3f, normal, self.order)
+        self._records = _records(self.tree, bounds, self.batch.position, normal, proxy.base)
+        self._lobes = _lobe_records(self.tree, bounds, proxy) if proxy.glossy else None
         self._no_cosine = None
         if proxy.without_cosines:
-            some = self.tree.reduce(download(proxy.no_cosine), np.logical_or)
-            self._no_cosine = upload(mi.UInt32, some) == 1
+            some = bounds.reduce(dr.select(proxy.no_cosine, mi.UInt32(1), 0), dr.maximum)
+            self._no_cosine = some == 1
             dr.eval(self._no_cosine)
 
     @property
@@ -91,30 +91,33 @@ def _tree_by_place(batch: Batch, position: np.ndarray, normal: np.ndarray) -> Po
     return build_point_tree(position, normal, _GLOSSY_LEAF if batch.proxy.glossy else _LAMBERTIAN_LEAF, material)
 
 
-def _directions(vectors) -> np.ndarray:
-    """Unit vectors, (n, 3) float32; those of broken meshes that are not become +z, so that they have a place."""
-    values = download(vectors)
-    length = np.einsum("ij,ij->i", values, values)
-    values[~(np.abs(length - 1) < 1e-3)] = (0, 0, 1)
-    return values
+def _directions(vectors):
+    """Unit vectors; those of broken meshes that are not become +z, so that they have a place."""
+    vectors = mi.Vector3f(vectors)
+    return dr.select(dr.abs(dr.squared_norm(vectors) - 1) < 1e-3, vectors, mi.Vector3f(0, 0, 1))
 
 
-def _records(tree: PointTree, position: np.ndarray, normal: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """(m, _RECORD) float32."""
-    records = np.zeros((tree.size, _RECORD), np.float32)
-    # One pass for all bounds: the largest of -x is the least of x
-    largest = tree.reduce(np.hstack([-position, position, base]), np.maximum)
-    records[:, 0:3], records[:, 3:6], records[:, 10:13] = -largest[:, 0:3], largest[:, 3:6], largest[:, 6:9]
-    records[:, 6:9], records[:, 9] = tree.cones(normal)
-    for column, values in ((13, tree.first), (14, tree.count), (15, tree.child)):
-        records[:, column] = values.view(np.float32)
-    return records
+def _records(tree: PointTree, bounds: NodeBounds, position, normal, base):
+    """Per node: box, cone of normals, largest base, range of points, first child: 16 floats.  Values along the tree."""
+    largest = bounds.reduce(mi.Vector3f(position), dr.maximum)
+    least = bounds.reduce(mi.Vector3f(position), dr.minimum)
+    axis, cosine = bounds.cones(normal)
+    base = bounds.reduce(mi.Vector3f(base), dr.maximum)
+    links = (dr.reinterpret_array(mi.Float, upload(mi.UInt32, x)) for x in (tree.first, tree.count, tree.child))
+    return _interleaved(tree.size, [*least, *largest, *axis, cosine, *base, *links])
 
 
-def _lobe_records(tree: PointTree, proxy: MaterialProxy) -> np.ndarray:
-    """(m, _LOBE_RECORD) float32."""
-    records = np.zeros((tree.size, _LOBE_RECORD), np.float32)
-    records[:, 0:3], records[:, 3] = tree.cones(_directions(proxy.axis))
-    records[:, 4:7] = tree.reduce(download(proxy.peak), np.maximum)
-    records[:, 7] = tree.reduce(download(proxy.exponent), np.minimum)
+def _lobe_records(tree: PointTree, bounds: NodeBounds, proxy: MaterialProxy):
+    """Per node: cone of the lobes' axes, largest peak, smallest exponent: 8 floats."""
+    axis, cosine = bounds.cones(_directions(proxy.axis))
+    peak = bounds.reduce(mi.Vector3f(proxy.peak), dr.maximum)
+    return _interleaved(tree.size, [*axis, cosine, *peak, bounds.reduce(proxy.exponent, dr.minimum)])
+
+
+def _interleaved(count: int, columns: list):
+    """One array of records from an array for each of their fields."""
+    records = dr.empty(mi.Float, count * len(columns))
+    for k, column in enumerate(columns):
+        dr.scatter(records, column, dr.arange(mi.UInt32, count) * len(columns) + k)
+    dr.eval(records)
     return records

@@ -31,8 +31,6 @@ from .morton import interleave
 _NORMAL_CELLS, _NORMAL_BITS, _POSITION_BITS, _MATERIAL_BITS = 7, 3, 16, 6
 # Points from which the extent of their middle is found
 _SAMPLE = 1 << 16
-# A cosine is lowered by this much before it is stored in single precision, so that no cone loses a vector to rounding
-_COSINE_ROUNDING = 2.0**-21
 
 
 @dataclass(frozen=True)
@@ -91,31 +89,6 @@ class PointTree:
         for first, last in zip(self.levels[1:-1], self.levels[2:], strict=True):
             result[first:last] += result[self.parent[first:last]]
         return result
-
-    def cones(self, directions: np.ndarray):
-        """Cones that hold the unit vectors of the points, (n, 3): axes (m, 3) and cosines of half-angles (m,), float64.
-
-        An inner node's axis is the mean direction, its half-angle the least that holds the cones of both children.
-        """
-        directions = directions.astype(np.float64)
-        # Unit in double precision too: near 1 the angle of a cosine magnifies what single precision left over
-        directions /= np.sqrt(np.einsum("ij,ij->i", directions, directions))[:, None]
-        axes = self.reduce(directions, np.add)
-        length = np.sqrt(np.einsum("ij,ij->i", axes, axes))
-        balanced = length < 1e-6 * self.count
-        axes /= np.where(balanced, 1, length)[:, None]
-        axes[balanced] = (0, 0, 1)
-        cosine = np.einsum("ij,ij->i", directions[self.order], axes[self.leaf])
-        leaves = self.leaves
-        angles = np.zeros(self.size)
-        angles[leaves] = np.arccos(np.clip(np.minimum.reduceat(cosine, self.first[leaves]), -1, 1))
-        for nodes, *children in self._inner_from_below():
-            reach = []
-            for child in children:
-                between = np.arccos(np.clip(np.einsum("ij,ij->i", axes[nodes], axes[child]), -1, 1))
-                reach.append(between + angles[child])
-            angles[nodes] = np.minimum(np.maximum(*reach), np.pi)
-        return axes, np.maximum(np.cos(angles) - _COSINE_ROUNDING, -1)
 
     def _inner_from_below(self):
         """(Inner nodes, their first children, their second ones) level by level, the deepest level first.
@@ -186,15 +159,18 @@ def build_point_tree(position, normal, leaf_size: int = 1, material=None) -> Poi
     return tree_over_codes(point_codes(position, normal, material), leaf_size)
 
 
-def tree_over_codes(codes: np.ndarray, leaf_size: int) -> PointTree:
-    """The tree over points with the given codes, (n,) uint64: ranges split at the highest bit that differs in them."""
+def tree_over_codes(codes: np.ndarray, leaf_size: int, leaf_bits: int = 63) -> PointTree:
+    """The tree over points with the given codes, (n,) uint64: ranges split at the highest bit that differs in them.
+
+    A leaf holds up to ``leaf_size`` points whose codes differ in their lowest ``leaf_bits`` bits only.
+    """
     order = np.argsort(codes, kind="stable")
     codes = codes[order]
     first, count = np.zeros(1, np.int64), np.array([len(codes)])
     parents, nodes = np.zeros(1, np.int64), np.arange(1)
     levels, found = [0], []
     while len(nodes):
-        inner = count > leaf_size
+        inner = (count > leaf_size) | ((codes[first] ^ codes[first + count - 1]) >> np.uint64(leaf_bits) != 0)
         child = np.where(inner, levels[-1] + len(nodes) + 2 * (np.cumsum(inner) - inner), 0)
         found.append((first, count, child, parents))
         levels.append(levels[-1] + len(nodes))
