@@ -42,6 +42,7 @@ NAMES = (
     "kitchen_lamps", "kitchen_windows", "forest_lights", "concourse", "everything8003", "bistro_interior", "staircase2",
     "living_room",
 )  # fmt: skip
+AGAINST = ("unoccluded", "all", "direct", "path")
 RAYS, REFERENCE_ERROR, REFERENCE_RENDERS = 64, 0.015, 4
 PAPER = {"guide": "sampled", "combine": "inverse_variance", "pass_limit": 20_000, "faint_share": 0.0}
 
@@ -116,33 +117,30 @@ def table(names, options) -> None:
         "scene | adaptive: s, rays/px, relMSE | unoccluded: s, rays/px, relMSE | faster | fewer rays | at equal relMSE:"
         " unoccluded | all | direct | path"
     )
-    ratios = {label: [] for label in ("faster", "fewer", "unoccluded", "all", "direct", "path")}
+    methods = {
+        "adaptive": ("adaptivedirect", {"error": options.error}, RAYS),
+        "unoccluded": ("unoccludeddirect", {"error": options.error}, RAYS),
+        "all": ("adaptivedirect", {"error": options.error, "lights": "all", "time": 15.0}, RAYS),
+        "direct": ("direct", {"emitter_samples": 1, "bsdf_samples": 1}, options.spp),
+        "path": ("path", {"max_depth": 2}, options.spp),
+    }
+    chosen = {label: method for label, method in methods.items() if label in ("adaptive", *options.against)}
+    ratios = {label: [] for label in ("faster", "fewer", *AGAINST)}
     for name in names:
-        problem = Problem(name, options.width)
-        rule = {"error": options.error}
-        found = problem.race(
-            "adaptive",
-            {
-                "adaptive": ("adaptivedirect", rule, RAYS),
-                "unoccluded": ("unoccludeddirect", rule, RAYS),
-                "all": ("adaptivedirect", rule | {"lights": "all", "time": 15.0}, RAYS),
-                "direct": ("direct", {"emitter_samples": 1, "bsdf_samples": 1}, options.spp),
-                "path": ("path", {"max_depth": 2}, options.spp),
-            },
-        )
+        found = Problem(name, options.width).race("adaptive", chosen)
         seconds, error, rays = found["adaptive"]
-        slower = {label: found[label][0] * found[label][1] / (seconds * error) for label in found}
-        base = found["unoccluded"]
-        slower |= {"faster": base[0] / seconds, "fewer": base[2] / rays}
-        for label in ratios:
+        slower = {label: one[0] * one[1] / (seconds * error) for label, one in found.items()}
+        if "unoccluded" in found:
+            slower |= {"faster": found["unoccluded"][0] / seconds, "fewer": found["unoccluded"][2] / rays}
+        for label in ratios.keys() & slower.keys():
             ratios[label].append(slower[label])
-        print(
-            f"{name} | {seconds:.2f}, {rays:.0f}, {error:.5f} | {base[0]:.2f}, {base[2]:.0f}, {base[1]:.5f} | "
-            f"{slower['faster']:.1f} | {slower['fewer']:.1f} | {slower['unoccluded']:.1f} | {slower['all']:.1f} | "
-            f"{slower['direct']:.1f} | {slower['path']:.1f}",
-            flush=True,
-        )
-    means = {label: f"{scenes.geometric_mean(values):.1f}" for label, values in ratios.items()}
+        columns = [
+            f"{found[label][0]:.2f}, {found[label][2]:.0f}, {found[label][1]:.5f}" if label in found else "-"
+            for label in ("adaptive", "unoccluded")
+        ]
+        columns += [f"{slower[label]:.1f}" if label in slower else "-" for label in ratios]
+        print(f"{name} | {' | '.join(columns)}", flush=True)
+    means = {label: f"{scenes.geometric_mean(values):.1f}" for label, values in ratios.items() if values}
     print("geometric means:", ", ".join(f"{label} {value}" for label, value in means.items()))
 
 
@@ -245,6 +243,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(NAMES), choices=NAMES)
     parser.add_argument("--parts", nargs="+", default=["table", "paper", "lights", "cold"])
+    parser.add_argument("--against", nargs="+", default=list(AGAINST), choices=AGAINST, help="columns of part table")
     parser.add_argument("--error", type=float, default=0.03, help="the rule of parts table and paper (default: 0.03)")
     parser.add_argument("--width", type=int, default=128, help="pixels (default: 128)")
     parser.add_argument("--spp", type=int, default=256, help="samples a pixel of direct and path (default: 256)")

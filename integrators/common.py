@@ -54,7 +54,8 @@ class Shaded:
     """What a method answers: radiance due to the lights, and counters, per point of the batch.
 
     ``shadow_rays``, ``upper_bounds``, ``cut_size``: UInt32, or Float where several points share one; ``seconds``: time
-    by stage; ``phase_one``: radiance that a first phase assumed, where the method has one.
+    by stage; ``phase_one``: radiance that a first phase assumed, where the method has one; ``dropped``: values left out
+    because they were not finite.
     """
 
     radiance: object
@@ -63,6 +64,7 @@ class Shaded:
     cut_size: object
     seconds: dict = field(default_factory=dict)
     phase_one: object = None
+    dropped: int = 0
 
 
 @dataclass
@@ -161,6 +163,7 @@ class ManyLightIntegrator(GatheringIntegrator):
                 total = totals.setdefault(name, dr.zeros(type(values), start.paths.points.count))
                 dr.scatter(total, values, job.batch.index)
             start.clock.split(part.seconds)
+            prepared.counts["dropped"] += part.dropped
         names = {"shadow_rays": "shadow_rays", "upper_bounds": "bound_computations", "cut_size": "cut_size"}
         found = {label: whole_sum(totals.get(name)) for name, label in names.items()}
         return radiance, totals, found | {"lights": {}, "light_paths": 0, "emitter_rays": 0} | prepared.counts

@@ -146,7 +146,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
             size = np.array(film.crop_size(), np.int64) + border
             if sampler.wavefront_size() == samples * int(np.prod(size)):
                 return PixelGrid(int(size[0]), samples)
-        return PixelGrid(8, 1)
+        return PixelGrid(8, 1, known=samples == 1)
 
     def _assemble(self, start: Start, radiance, channels: dict, found: dict):
         """Bring what gather points found to their camera rays: (radiance, requested channels); fills ``statistics``."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -151,7 +151,9 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         shaded.upper_bounds = counter.per_point()
         shaded.phase_one = upload(mi.Float, bright[clusters.tree.leaf])
         shaded.seconds = clock.seconds
-        return _in_batch_order(clusters, shaded)
+        names = ("radiance", *self.offered_aovs)
+        found = clusters.in_batch_order([getattr(shaded, name) for name in names])
+        return replace(shaded, **dict(zip(names, found, strict=True)))
 
     def _approximate(self, job: Shading, clusters: PointClusters, counter: BoundCounter):
         """Phase I: approximate radiance at every leaf, (m,) float64, and the shadow rays it took, per point."""
@@ -218,17 +220,6 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         """All properties and their values."""
         names = ("visibility", "error", "dark_floor", "max_cut", "phase_one_error", "share_samples")
         return super().describe() | {name: getattr(self, name) for name in names}
-
-
-def _in_batch_order(clusters: PointClusters, shaded: Shaded) -> Shaded:
-    """Put what is known along the tree back into the order of the batch."""
-    for name in ("radiance", *IlluminationCutIntegrator.offered_aovs):
-        values = getattr(shaded, name)
-        target = dr.empty(type(values), clusters.count)
-        dr.scatter(target, values, clusters.order)
-        dr.eval(target)
-        setattr(shaded, name, target)
-    return shaded
 
 
 mi.register_integrator("illuminationcut", IlluminationCutIntegrator)

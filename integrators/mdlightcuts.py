@@ -21,7 +21,7 @@ from .common import ManyLightIntegrator, Shaded, Shading
 from .gathering import Clock
 from .manual import manual_page
 
-# Pairs that are shaded and traced at a time
+# Pairs that are shaded and traced at a time, at least
 _PAIRS_PER_KERNEL = 1 << 22
 # A coarse cut of one point for so many pixels tells how bright they are
 _ESTIMATE_PIXELS = 8
@@ -42,7 +42,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
      * - error
        - |float|
        - Largest bound of what a pair of clusters contributes to its pixel, as a fraction of the pixel's radiance: 0.01
-         is 1%. 0 refines to single points and lights. (Default: 0.01)
+         is 1%. 0, with ``max_cut`` 0 and ``leaf_points`` 1, takes every light at every point. (Default: 0.01)
 
      * - dark_floor
        - |float|
@@ -57,7 +57,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
      * - leaf_points
        - |int|
        - Neighbouring samples of a pixel, on surfaces without gloss, that are never told apart: for every cluster of
-         lights one of them, drawn at random, stands for all. 1 refines to single samples. (Default: 4)
+         lights one of them, drawn at random, stands for all, whatever ``error`` says. 1: there are none. (Default: 4)
 
      {common parameters}
 
@@ -68,12 +68,16 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
 
     {what is estimated}
 
+    The samples of a pixel share their light: with a box filter the image is that of all samples in expectation; wider
+    filters blur it inside of a pixel, and second moments over samples mean nothing. Pixels are told apart only for the
+    sensors of the scene; with another one every camera ray counts as a pixel, which is as slow as ``lightcuts``.
+
     **Departures from the paper.** Thresholds come from an estimate made before instead of from a running total, and the
     upper levels of both trees are descended for blocks of pixels at once; see :mod:`vpl.pixel_cuts`. A representative
     counts with its own colour, light or point, so that cuts are unbiased where colours differ. Gather trees: see
     :mod:`vpl.gather_tree`. ``dark_floor`` is ours. ``max_cut`` is held only about, by raising the bound where the light
     cut of a point at every 32nd pixel is larger. Lambertian points and all others are in trees of their own, so a pixel
-    that sees both has two cuts.
+    that sees both has two cuts, each held to what its own points give to the pixel.
 
     .. tabs::
         .. code-tab:: xml
@@ -99,12 +103,15 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
     def shade(self, job: Shading) -> Shaded:
         """Gather trees, thresholds, and the cut of every pixel, for one batch."""
         clock = Clock()
+        if not job.grid.known:
+            mi.Log(mi.LogLevel.Warn, "The sensor is not one of the scene's: every camera ray counts as a pixel.")
+        pixel = download(job.ray).astype(np.int64) // job.grid.samples
+        per_pixel = job.batch.count / np.count_nonzero(np.bincount(pixel))
         estimate = estimate_radiance(
             job.scene, job.traits, job.lights, job.batch, job.direct, job.mean, self.max_cut,
-            _ESTIMATE_PIXELS * job.grid.samples,
+            round(_ESTIMATE_PIXELS * per_pixel),
         )  # fmt: skip
         clock.lap("estimate")
-        pixel = download(job.ray).astype(np.int64) // job.grid.samples
         leaf_size = 1 if job.batch.proxy.glossy else self.leaf_points
         clusters = PointClusters(job.batch, partial(build_gather_tree, pixel, job.grid.width, leaf_size))
         order = clusters.tree.order
@@ -113,46 +120,45 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
         clock.lap("gather_tree")
         counter = BoundCounter(clusters, "upper_bounds" in self.aovs)
         allowed = self._allowed(job, estimate, pixel)[order]
-        accept, points_first = cuts.rule(self._limited(job, clusters, allowed, counter))
+        rule = cuts.rule(self._limited(job, clusters, allowed, round(_TRIED_PIXELS * per_pixel), counter))
         clock.lap("threshold")
+        for group, pairs in self._pairs(job, clusters, rule, counter):
+            clock.lap("pairs")
+            if job.stopped():
+                break
+            cuts.evaluate(job.scene, job.traits, job.lights, group, pairs)
+            clock.lap("evaluate")
+        radiance, pairs = cuts.per_point()
+        radiance, rays, bounds, pairs = clusters.in_batch_order([radiance, cuts.rays, counter.per_point(), pairs])
+        clock.lap("sum")
+        rays, bounds = rays + estimate.shadow_rays, bounds + mi.Float(estimate.upper_bounds)
+        return Shaded(radiance, rays, bounds, pairs, clock.seconds, dropped=cuts.dropped)
+
+    def _pairs(self, job: Shading, clusters: PointClusters, rule, counter: BoundCounter):
+        """Yield (group of lights, pairs), at least _PAIRS_PER_KERNEL of them at a time but for the last."""
+        accept, points_first = rule
         for group in job.lights.groups:
             found = find_pairs(clusters, job.lights, group, accept, counter, points_first)
             for pairs in in_batches(found, _PAIRS_PER_KERNEL):
-                clock.lap("pairs")
-                if job.stopped():
-                    break
-                cuts.evaluate(job.scene, job.traits, job.lights, group, pairs)
-                clock.lap("evaluate")
-        shaded = self._in_batch_order(clusters, cuts, counter, estimate)
-        clock.lap("sum")
-        shaded.seconds = clock.seconds
-        return shaded
+                yield group, pairs
 
     def _allowed(self, job: Shading, estimate: Estimate, pixel: np.ndarray) -> np.ndarray:
         """What a pair may add to the radiance of its pixel at most, for every point, (n,) float64."""
-        _, place = np.unique(pixel, return_inverse=True)
         weighted = estimate.radiance * download(job.weight).mean(1, dtype=np.float64)
-        radiance = np.bincount(place, weighted) / np.bincount(place)
-        return self.error * np.maximum(radiance, self.dark_floor * job.mean)[place]
+        radiance = np.bincount(pixel, weighted)[pixel] / job.grid.samples
+        return self.error * np.maximum(radiance, self.dark_floor * job.mean)
 
-    def _limited(self, job: Shading, clusters: PointClusters, allowed: np.ndarray, counter: BoundCounter):
+    def _limited(self, job: Shading, clusters: PointClusters, allowed: np.ndarray, stride: int, counter: BoundCounter):
         """The same along the tree, raised where a cut would be larger than ``max_cut``."""
         if self.max_cut == 0:
             return allowed
-        stride = _TRIED_PIXELS * job.grid.samples
         least = least_thresholds(job.lights, clusters, allowed, self.max_cut, stride, counter)
         return np.maximum(allowed, least[np.arange(len(allowed)) // stride])
 
-    def _in_batch_order(self, clusters: PointClusters, cuts: PixelCuts, counter: BoundCounter, estimate: Estimate):
-        radiance, pairs = cuts.per_point()
-        found = []
-        for values in (radiance, cuts.rays, counter.per_point(), pairs):
-            target = dr.empty(type(values), clusters.count)
-            dr.scatter(target, values, clusters.order)
-            found.append(target)
-        dr.eval(found)
-        radiance, rays, bounds, pairs = found
-        return Shaded(radiance, rays + estimate.shadow_rays, bounds + mi.Float(estimate.upper_bounds), pairs)
+    def describe(self):
+        """All properties and their values."""
+        names = ("error", "dark_floor", "max_cut", "leaf_points")
+        return super().describe() | {name: getattr(self, name) for name in names}
 
 
 mi.register_integrator("mdlightcuts", MultidimensionalLightcutsIntegrator)

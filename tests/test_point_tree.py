@@ -141,7 +141,8 @@ def check_cones(tree, directions, axes, cosine):
     for side, child in enumerate((tree.child, (tree.child + 1) % tree.size)):
         between = np.arccos(np.clip(np.einsum("ij,ij->i", axes, axes[child]), -1, 1))
         reach[side] = np.minimum(between + np.arccos(cosine[child]), np.pi)
-    assert (cosine >= np.cos(reach.max(axis=0)) - 1e-6)[~leaf].all()
+    # The angle between axes in single precision is off by up to 4e-4 where it is small
+    assert (cosine >= np.cos(reach.max(axis=0)) - 1e-3)[~leaf].all()
 
 
 def build_checked(position, normal, leaf_size=8):

@@ -65,10 +65,14 @@ class DirectOptions:
 
 @dataclass
 class PixelGrid:
-    """How camera rays lie in the image: ``samples`` of a pixel follow each other, ``width`` pixels make a row."""
+    """How camera rays lie in the image: ``samples`` of a pixel follow each other, ``width`` pixels make a row.
+
+    ``known``: whether that is so, or every ray counts as a pixel because nothing better is known.
+    """
 
     width: int
     samples: int
+    known: bool = True
 
 
 @dataclass

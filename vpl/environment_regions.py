@@ -15,6 +15,7 @@ import numpy as np
 from .arrays import channel_mean, download, upload
 from .environment_strata import cones, stratify
 from .lights import finite_or_zero
+from .parameters import parameters_of
 from .sampling import find_interval, independent_sampler
 
 _EVALUATIONS = 2  # along each of both axes of a cell, at least
@@ -109,7 +110,7 @@ def _table_width(environment) -> int:
 
 def _image_width(environment) -> int:
     """Columns of the image of an environment, 0 where it has none."""
-    parameters = mi.traverse(environment)
+    parameters = parameters_of(environment)
     # The first column is there twice
     return max(1, parameters["data"].shape[1] - 1) if "data" in parameters else 0
 

@@ -14,14 +14,15 @@ from __future__ import annotations
 import numpy as np
 
 from .morton import interleave
-from .point_tree import PointTree, tree_over_codes
+from .point_tree import PointTree, require_finite, tree_over_codes
 
-_NORMAL_CELLS, _NORMAL_BITS, _POSITION_BITS = 7, 3, 10
-_PIXEL_SHIFT = 3 * (_NORMAL_BITS + _POSITION_BITS)
+_NORMAL_CELLS, _NORMAL_BITS = 7, 3
+_MOST_POSITION_BITS, _CODE_BITS = 10, 63
 
 
-def gather_codes(pixel: np.ndarray, width: int, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Codes of points, (n,) uint64: the pixel above where the normal points to above where the point is.
+def gather_codes(pixel: np.ndarray, width: int, position: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, int]:
+    """Codes of points, (n,) uint64: the pixel above where the normal points to above where the point is; and how many
+    bits lie below the pixel's.
 
     ``pixel`` (n,): row after row of an image ``width`` wide; ``position``, ``normal``: (n, 3), world units.
     """
@@ -30,15 +31,18 @@ def gather_codes(pixel: np.ndarray, width: int, position: np.ndarray, normal: np
     owner = (np.cumsum(count > 0) - 1)[pixel]
     along = interleave(np.stack([pixels % width, pixels // width, np.zeros_like(pixels)], axis=1))
     place = np.argsort(np.argsort(along)).astype(np.uint64)[owner]
+    # The more pixels, the fewer bits are left for what is inside of one
+    position_bits = min(_MOST_POSITION_BITS, (_CODE_BITS - len(pixels).bit_length()) // 3 - _NORMAL_BITS)
+    shift = 3 * (_NORMAL_BITS + position_bits)
     first = np.concatenate([[0], np.cumsum(count[pixels])[:-1]])
     inside = position[np.argsort(owner, kind="stable")]
     low = np.minimum.reduceat(inside, first)
     extent = (np.maximum.reduceat(inside, first) - low).max(1)
-    cells = (position - low[owner]) / np.where(extent > 0, extent, 1)[owner, None] * (2**_POSITION_BITS - 1)
+    cells = (position - low[owner]) / np.where(extent > 0, extent, 1)[owner, None] * (2**position_bits - 1)
     by_normal = np.clip((normal + 1) * (0.5 * _NORMAL_CELLS), 0, _NORMAL_CELLS - 1)
-    code = place << np.uint64(_PIXEL_SHIFT)
-    code |= interleave(by_normal) << np.uint64(3 * _POSITION_BITS)
-    return code | interleave(cells)
+    code = place << np.uint64(shift)
+    code |= interleave(by_normal) << np.uint64(3 * position_bits)
+    return code | interleave(cells), shift
 
 
 def build_gather_tree(
@@ -46,4 +50,6 @@ def build_gather_tree(
 ) -> PointTree:
     """The tree over points, n > 0, with at most ``leaf_size`` points of one pixel in a leaf; other arguments as in
     :func:`gather_codes`."""
-    return tree_over_codes(gather_codes(pixel, width, position, normal), leaf_size, _PIXEL_SHIFT)
+    require_finite(position=position, normal=normal)
+    codes, shift = gather_codes(pixel, width, position, normal)
+    return tree_over_codes(codes, leaf_size, shift)

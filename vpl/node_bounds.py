@@ -67,7 +67,10 @@ class NodeBounds:
             child = dr.gather(mi.UInt32, self._child, node)
             inner = child > 0
             children = [dr.gather(kind, values, child + k, inner) for k in (0, 1)]
-            dr.scatter(values, join(*children, *((node, child) if placed else ())), node, inner)
+            joined = join(*children, *((node, child) if placed else ()))
+            # Before it is written to: an array that is still to be read is copied first, as a whole
+            dr.eval(joined)
+            dr.scatter(values, joined, node, inner)
             dr.eval(values)
         return values
 

@@ -6,6 +6,7 @@ Where a scene has a hundred thousand emitters, that takes ten times as long as l
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 
 import drjit as dr
@@ -13,10 +14,34 @@ import mitsuba as mi
 import numpy as np
 
 
-def parameters_of(node, below: bool = True) -> dict:
-    """{name: value} of an object and, if wanted, of all objects below it, named as ``mitsuba.traverse`` does."""
-    found = {}
-    _reader()(node, "", found, below)
+class Parameters(Mapping):
+    """Parameters by name, fetched when they are asked for."""
+
+    def __init__(self):
+        self._found: dict = {}
+
+    def __contains__(self, name) -> bool:
+        return name in self._found
+
+    def __iter__(self):
+        return iter(self._found)
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def __getitem__(self, name: str):
+        value, cpptype, node = self._found[name]
+        return value if cpptype is None else mi.get_property(value, cpptype, node)
+
+    def add(self, name: str, value, cpptype, node) -> None:
+        """What Mitsuba says of a parameter."""
+        self._found[name] = value, cpptype, node
+
+
+def parameters_of(node, below: bool = True) -> Parameters:
+    """Those of an object and, if wanted, of all objects below it, with the objects' own names before theirs."""
+    found = Parameters()
+    _reader()(node, "", found, {node} if below else None)
     return found
 
 
@@ -40,19 +65,17 @@ def _reader():
     class Reader(mi.TraversalCallback):
         """Adds the parameters of a node to ``found`` when it is made."""
 
-        def __init__(self, node, prefix: str, found: dict, below: bool):
+        def __init__(self, node, prefix: str, found: Parameters, visited: set | None):
             super().__init__()
-            self.node, self.prefix, self.found, self.below = node, prefix, found, below
+            self.node, self.prefix, self.found, self.visited = node, prefix, found, visited
             node.traverse(self)
 
         def put(self, name, value, flags, cpptype=None):
             """Called by Mitsuba for every parameter."""
-            if isinstance(value, mi.Object):
-                if self.below:
-                    Reader(value, f"{self.prefix}{name}.", self.found, True)
-            else:
-                self.found[self.prefix + name] = (
-                    value if cpptype is None else mi.get_property(value, cpptype, self.node)
-                )
+            if not isinstance(value, mi.Object):
+                self.found.add(self.prefix + name, value, cpptype, self.node)
+            elif self.visited is not None and value not in self.visited:
+                self.visited.add(value)
+                Reader(value, f"{self.prefix}{name}.", self.found, self.visited)
 
     return Reader

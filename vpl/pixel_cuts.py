@@ -28,7 +28,8 @@ from .sampling import derived_seed, find_interval, independent_sampler
 
 
 class PixelCuts:
-    """Light of some pixels, found pair by pair, and what it took.
+    """Light of some pixels, found pair by pair, and what it took: ``pairs``, ``rays``, and how many values were
+    ``dropped`` because they were not finite.
 
     ``clusters``: points along their gather trees; ``pixel``, (n,) of NumPy: of every point along the tree; ``weight``:
     the factor on its radiance in its camera ray; ``samples``: camera rays of a pixel.
@@ -40,10 +41,12 @@ class PixelCuts:
         end = tree.first.astype(np.int64) + tree.count
         self._of_pixel = pixel[tree.first] == pixel[end - 1]
         self._cumulative, *self._channels = (_cumulative(x) for x in (channel_mean(weight), *weight))
-        cumulative = download(self._cumulative)
-        self._share = (cumulative[end] - cumulative[tree.first]) / samples
+        # Of the channel with most weight: where weights have colours, a pair may add more than the mean suggests
+        channels = np.stack([download(channel) for channel in self._channels])
+        self._share = (channels[:, end] - channels[:, tree.first]).max(0) / samples
         self._parent, self._leaf = upload(mi.UInt32, tree.parent), upload(mi.UInt32, tree.leaf)
         self._light = dr.zeros(mi.UnpolarizedSpectrum, tree.size)
+        self.dropped = 0
         self.pairs, self.rays = dr.zeros(mi.Float, tree.size), dr.zeros(mi.UInt32, clusters.count)
         dr.eval(self._light, self.pairs, self.rays)
 
@@ -55,9 +58,8 @@ class PixelCuts:
         tree = self.clusters.tree
         least = tree.gather_up(allowed[tree.first[tree.leaves]], tree.leaves, np.minimum)
         # Bounds hold for one point of unit weight. Blocks of pixels are marked by a sign: they accept nothing
-        with np.errstate(divide="ignore"):
-            bound = np.where(self._of_pixel, least / self._share, -least)
-        threshold = upload_thresholds(bound)
+        share = np.maximum(self._share, np.finfo(np.float64).tiny)
+        threshold = upload_thresholds(np.where(self._of_pixel, least / share, -least))
 
         def accept(points, lights, bound, index):
             """Whether a pair is fine enough."""
@@ -76,10 +78,15 @@ class PixelCuts:
         light, scale = group.representatives(pairs.lights)
         surface = self.clusters.batch.surfaces_at(point)
         value, traced = evaluate_pairs(scene, traits, lights, group, surface, light, scale)
-        add_at(self._light, value * factor, pairs.points)
+        value = mi.UnpolarizedSpectrum(value * factor)
+        bad = ~dr.all(dr.isfinite(value))
+        add_at(self._light, dr.select(bad, 0, value), pairs.points)
         add_at(self.pairs, dr.ones(mi.Float, pairs.count), pairs.points)
         add_at(self.rays, dr.select(traced, mi.UInt32(1), 0), point)
-        dr.eval(self._light, self.pairs, self.rays)
+        bad = dr.select(bad, mi.UInt32(1), 0)
+        dr.eval(self._light, self.pairs, self.rays, bad)
+        # One such value would spoil all samples of its pixel
+        self.dropped += int(dr.sum(bad)[0])
 
     def _representative(self, pairs: Pairs):
         """A point of every pair's gather node, drawn by weight, and the factor on its radiance.

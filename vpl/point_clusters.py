@@ -63,6 +63,15 @@ class PointClusters:
         """Number of gather points."""
         return self.batch.count
 
+    def in_batch_order(self, arrays: list) -> list:
+        """Put arrays of values along the tree back into the order of the batch, evaluated."""
+        found = []
+        for values in arrays:
+            found.append(dr.empty(type(values), self.count))
+            dr.scatter(found[-1], values, self.order)
+        dr.eval(found)
+        return found
+
     def ranges(self, index):
         """(First point along the tree, number of points) of nodes."""
         d = dr.gather(mi.Vector4f, self._records, index * 4 + 3)

@@ -149,14 +149,20 @@ def build_point_tree(position, normal, leaf_size: int = 1, material=None) -> Poi
     for name, values in (("position", position), ("normal", normal)):
         if values.ndim != 2 or values.shape[1] != 3 or len(values) != len(position) or len(values) == 0:
             raise ValueError(f"{name} must have the shape (n, 3) with one n > 0 for both, got {values.shape}")
-        if not np.isfinite(values).all():
-            row = int(np.argmin(np.isfinite(values).all(axis=1)))
-            raise ValueError(f"{name} must be finite, but row {row} is {values[row].tolist()}")
+    require_finite(position=position, normal=normal)
     length = np.einsum("ij,ij->i", normal, normal)
     if (np.abs(length - 1) > 1e-3).any():
         row = int(np.argmax(np.abs(length - 1)))
         raise ValueError(f"normal must be of unit length, but row {row} is {normal[row].tolist()}")
     return tree_over_codes(point_codes(position, normal, material), leaf_size)
+
+
+def require_finite(**arrays: np.ndarray) -> None:
+    """Raise a ValueError that names the array, (n, k), and its first row that is not finite."""
+    for name, values in arrays.items():
+        if not np.isfinite(values).all():
+            row = int(np.argmin(np.isfinite(values).all(axis=1)))
+            raise ValueError(f"{name} must be finite, but row {row} is {values[row].tolist()}")
 
 
 def tree_over_codes(codes: np.ndarray, leaf_size: int, leaf_bits: int = 63) -> PointTree:

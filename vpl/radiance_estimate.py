@@ -44,7 +44,7 @@ def estimate_radiance(
     rows = np.arange(0, count, stride)
     index = upload(mi.UInt32, rows)
     part = batch.select(index)
-    threshold = dr.full(mi.Float, _ESTIMATE_ERROR * mean, len(rows))
+    threshold = dr.opaque(mi.Float, _ESTIMATE_ERROR * mean, len(rows))
     threshold, sizes, searched = limited_cuts(lights, part, threshold, max_cut)
     # Second representatives: the thresholds must not depend on the lights that the final cuts are made of
     radiance, rays, collected = evaluate_cuts(scene, traits, lights, part, threshold, sizes, second=True)

@@ -39,7 +39,7 @@ def find_interval(cumulative, first, last, sample):
     start = dr.gather(precise, cumulative, first)
     target = start + precise(sample) * (dr.gather(precise, cumulative, last) - start)
     low, high = mi.UInt32(first), mi.UInt32(last)
-    while high > low + 1:
+    while dr.hint(high > low + 1, exclude=[cumulative]):
         middle = (low + high) >> 1
         below = dr.gather(precise, cumulative, middle) <= target
         low = dr.select(below, middle, low)
