@@ -10,7 +10,7 @@ import numpy as np
 
 from vpl.approximate_image import approximate_radiance
 from vpl.arrays import add_at, download, upload
-from vpl.cut_limits import least_thresholds
+from vpl.cut_limits import raise_thresholds
 from vpl.cuts import upload_thresholds
 from vpl.pair_lists import evaluate_lists, list_pairs
 from vpl.pair_visibility import decide_visibility
@@ -170,11 +170,9 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         """Largest bound that a pair may have, per point node: error × least radiance of its points ([IC] eq. 4)."""
         tree, leaves = clusters.tree, clusters.tree.leaves
         allowed = self.error * np.maximum(bright[leaves], self.dark_floor * job.mean)
-        if self.max_cut:
-            # A leaf takes after the last point that is tried before it
-            at_points = np.repeat(allowed, tree.count[leaves])
-            least = least_thresholds(job.lights, clusters, at_points, self.max_cut, _TRIED_STRIDE, counter)
-            allowed = np.maximum(allowed, least[tree.first[leaves] // _TRIED_STRIDE])
+        at_points = np.repeat(allowed, tree.count[leaves])
+        allowed = raise_thresholds(job.lights, clusters, at_points, self.max_cut, _TRIED_STRIDE, counter)
+        allowed = allowed[tree.first[leaves]]
         return upload_thresholds(tree.gather_up(allowed, leaves, np.minimum))
 
     def _pairs(self, job: Shading, clusters: PointClusters, threshold, counter: BoundCounter):

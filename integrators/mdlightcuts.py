@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.arrays import download
-from vpl.cut_limits import least_thresholds
+from vpl.cut_limits import raise_thresholds
 from vpl.gather_tree import build_gather_tree
 from vpl.pairs import BoundCounter, find_pairs, in_batches
 from vpl.pixel_cuts import PixelCuts
@@ -120,7 +120,8 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
         clock.lap("gather_tree")
         counter = BoundCounter(clusters, "upper_bounds" in self.aovs)
         allowed = self._allowed(job, estimate, pixel)[order]
-        rule = cuts.rule(self._limited(job, clusters, allowed, round(_TRIED_PIXELS * per_pixel), counter))
+        stride = round(_TRIED_PIXELS * per_pixel)
+        rule = cuts.rule(raise_thresholds(job.lights, clusters, allowed, self.max_cut, stride, counter))
         clock.lap("threshold")
         for group, pairs in self._pairs(job, clusters, rule, counter):
             clock.lap("pairs")
@@ -147,13 +148,6 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
         weighted = estimate.radiance * download(job.weight).mean(1, dtype=np.float64)
         radiance = np.bincount(pixel, weighted)[pixel] / job.grid.samples
         return self.error * np.maximum(radiance, self.dark_floor * job.mean)
-
-    def _limited(self, job: Shading, clusters: PointClusters, allowed: np.ndarray, stride: int, counter: BoundCounter):
-        """The same along the tree, raised where a cut would be larger than ``max_cut``."""
-        if self.max_cut == 0:
-            return allowed
-        least = least_thresholds(job.lights, clusters, allowed, self.max_cut, stride, counter)
-        return np.maximum(allowed, least[np.arange(len(allowed)) // stride])
 
     def describe(self):
         """All properties and their values."""

@@ -12,18 +12,22 @@ from .pairs import BoundCounter
 from .point_clusters import PointClusters
 
 
-def least_thresholds(
+def raise_thresholds(
     lights: LightSet, clusters: PointClusters, allowed: np.ndarray, max_cut: int, stride: int, counter: BoundCounter
 ) -> np.ndarray:
-    """Thresholds below which cuts are about larger than ``max_cut``, tried at every ``stride``-th point of the tree.
+    """Largest bounds that points accept, raised where cuts would be about larger than ``max_cut`` (0: nowhere).
 
-    ``allowed`` (n,): largest bound that each point along the tree would accept.  Cuts grow about as fast as thresholds
-    fall at most, so one that is not full leaves that much room below.  Returns one float64 per point that was tried.
+    ``allowed``, (n,) float64: what each point along the tree would accept.  Cuts are tried at every ``stride``-th
+    point; those up to the next one take after it.  Cuts grow about as fast as thresholds fall at most, so one that is
+    not full leaves that much room below.  Returns the same for all points.
     """
+    if max_cut == 0:
+        return allowed
     rows = np.arange(0, clusters.count, stride)
     # What is 0 could not be raised by any factor
     tried = np.maximum(allowed[rows], np.finfo(np.float32).tiny)
     index = upload(mi.UInt32, rows)
     raised, sizes, visits = limited_cuts(lights, clusters.batch.select(index), upload_thresholds(tried), max_cut)
     counter.add_at_points(index, visits)
-    return download(raised).astype(np.float64) * np.minimum(sizes.total() / max_cut, 1)
+    least = download(raised).astype(np.float64) * np.minimum(sizes.total() / max_cut, 1)
+    return np.maximum(allowed, np.repeat(least, stride)[: clusters.count])

@@ -27,7 +27,8 @@ class NodeBounds:
 
     def reduce(self, values, join: Callable):
         """``join``: combines two arrays lane by lane, such as ``dr.maximum``."""
-        return self._towards_root(_over_points(values, self._first, self._count, join), join)
+        at_leaves = _over_points(values, self._first, self._count, join)
+        return self._towards_root(at_leaves, lambda first, second, node, child: join(first, second))
 
     def cones(self, directions):
         """Cones that hold unit vectors: (axes, cosines of half-angles), single precision.
@@ -53,11 +54,11 @@ class NodeBounds:
             ]
             return dr.minimum(dr.maximum(*reach), dr.pi)
 
-        angles = self._towards_root(angle, enclose, placed=True)
+        angles = self._towards_root(angle, enclose)
         return mi.Vector3f(axes), mi.Float(dr.maximum(dr.cos(angles) - _COSINE_ROUNDING, -1))
 
-    def _towards_root(self, at_leaves, join: Callable, placed: bool = False):
-        """``placed``: whether ``join`` also wants to know the nodes and their first children."""
+    def _towards_root(self, at_leaves, join: Callable):
+        """``join``: function of (values of the first children, of the second ones, nodes, their first children)."""
         kind = type(at_leaves)
         values = dr.zeros(kind, self._size)
         dr.scatter(values, at_leaves, self._leaves)
@@ -67,7 +68,7 @@ class NodeBounds:
             child = dr.gather(mi.UInt32, self._child, node)
             inner = child > 0
             children = [dr.gather(kind, values, child + k, inner) for k in (0, 1)]
-            joined = join(*children, *((node, child) if placed else ()))
+            joined = join(*children, node, child)
             # Before it is written to: an array that is still to be read is copied first, as a whole
             dr.eval(joined)
             dr.scatter(values, joined, node, inner)
