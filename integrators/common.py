@@ -31,9 +31,9 @@ class Shading:
     """What a method is asked to shade: one batch of gather points.
 
     ``direct``: radiance per point that is known already (direct light of extended emitters); ``mean``: an estimate of
-    the mean radiance over all gather points of the render and over channels; ``ray``: UInt32, the camera ray of each
-    point; ``weight``: what its radiance counts in that ray; ``grid``: how camera rays lie in the image; ``stopped``:
-    whether to give up early.
+    the mean radiance over all gather points of the render and over channels; ``share``: the fraction of them that is in
+    this batch; ``ray``: UInt32, the camera ray of each point; ``weight``: what its radiance counts in that ray;
+    ``grid``: how camera rays lie in the image; ``stopped``: whether to give up early.
     """
 
     scene: object
@@ -42,6 +42,7 @@ class Shading:
     batch: Batch
     direct: object
     mean: float
+    share: float
     seed: int
     ray: object
     weight: object
@@ -178,10 +179,13 @@ class ManyLightIntegrator(GatheringIntegrator):
             stream = derived_seed(seed, 31, number)
             ray = dr.gather(mi.UInt32, points.ray, batch.index)
             weight = dr.gather(type(points.weight), points.weight, batch.index)
-            jobs.append(Shading(scene, traits, lights, batch, direct, 0.0, stream, ray, weight, grid, self.should_stop))
+            share = batch.count / points.count
+            jobs.append(
+                Shading(scene, traits, lights, batch, direct, 0.0, share, stream, ray, weight, grid, self.should_stop)
+            )
             if self.needs_trees:
                 level = mean_radiance(scene, traits, lights, batch, derived_seed(seed, 32, number))
-                mean += (level + float(download(direct).mean(dtype="float64"))) * batch.count / points.count
+                mean += (level + float(download(direct).mean(dtype="float64"))) * share
         for job in jobs:
             job.mean = mean
         prepared.clock.lap("pilot")

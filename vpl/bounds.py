@@ -14,8 +14,9 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from .arrays import channel_mean, upload
+from .arrays import channel_mean, download, upload
 from .light_tree import LightTree
 from .lights import AT_INFINITY
 from .proxies import MaterialProxy
@@ -76,6 +77,10 @@ class DeviceTree:
         self._second = upload(mi.UInt32, second_representative)
         self.count = len(tree.records)
         self._records = upload(mi.Float, tree.records)
+
+    def records(self) -> np.ndarray:
+        """The records again, of NumPy: see :class:`vpl.light_tree.LightTree`."""
+        return download(self._records).reshape(self.count, -1)
 
     def gather(self, index, active=True) -> Node:
         """Fetch one node per lane; see :mod:`vpl.light_tree` for the layout of the record."""

@@ -55,14 +55,17 @@ def _visibility(scene, traits: SceneTraits, group: LightGroup, surface: Surface,
 
 
 @dr.syntax
-def _sum_lights(scene, traits, lights, group, batch, first: int, last: int):
-    """Sum over the lights first .. last - 1 of a group, for all points in step: (radiance, shadow rays per point)."""
-    end = dr.opaque(mi.UInt32, last)
-    j = dr.opaque(mi.UInt32, first, batch.count)
-    surface = batch.surfaces
-    radiance, rays = dr.zeros(mi.UnpolarizedSpectrum, batch.count), dr.zeros(mi.UInt32, batch.count)
-    while dr.hint(j < end, exclude=[traits, lights, group, surface]):
-        value, traced = evaluate_pairs(scene, traits, lights, group, surface, group.lights.gather(j), 1)
+def sum_lights(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface: Surface, first, last, pick):
+    """Sum over the numbers first .. last - 1 of every surface, in step: (radiance, shadow rays per surface).
+
+    ``surface``: evaluated; ``pick``: function of a number to (a light of the group, the factor on its intensity).
+    """
+    count = dr.width(first)
+    j, end = mi.UInt32(first), mi.UInt32(last)
+    radiance, rays = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UInt32, count)
+    while dr.hint(j < end, exclude=[traits, lights, group, surface, pick]):
+        light, scale = pick(j)
+        value, traced = evaluate_pairs(scene, traits, lights, group, surface, light, scale)
         radiance += value
         rays += dr.select(traced, 1, 0)
         j += 1
@@ -82,7 +85,8 @@ def sum_all_lights(scene, traits: SceneTraits, lights: LightSet, batch: Batch, s
             if stopped():
                 break
             last = min(first + _LIGHTS_PER_KERNEL, group.count)
-            radiance, traced = _sum_lights(scene, traits, lights, group, batch, first, last)
+            begin, end = dr.opaque(mi.UInt32, first, batch.count), dr.opaque(mi.UInt32, last)
+            radiance, traced = sum_lights(scene, traits, lights, group, batch.surfaces, begin, end, group.pick)
             total += precise(radiance)
             rays += traced
             dr.eval(total, rays)

@@ -49,6 +49,10 @@ class LightGroup:
     def count(self) -> int:
         return self.lights.count
 
+    def pick(self, index):
+        """Lights by their index, each standing for itself: (light, factor on its intensity)."""
+        return self.lights.gather(index), 1
+
     def representatives(self, nodes, second=False):
         """The light that stands for each node (or its second one), and the factor from its intensity to the cluster's.
 

@@ -92,6 +92,18 @@ def build_light_tree(position, direction, flux, rng, window=16, angular_weight=1
     return _assemble(order, rounds, position, direction, flux, rng)
 
 
+def cluster_sizes(records: np.ndarray, angular_weight: float = 1 / 16) -> np.ndarray:
+    """Cluster size [LC, section 5] of every node of a tree, (m,) float64, from its records, (m, 16).
+
+    In units of the squared diagonal of all lights, or of angles where lights have no places.
+    """
+    diagonal2 = np.square(records[:, BOX_MAX].astype(np.float64) - records[:, BOX_MIN]).sum(1)
+    angular = np.square(1 - records[:, CONE_COS].astype(np.float64))
+    if diagonal2[0] > 0:
+        angular = angular_weight * angular + diagonal2 / diagonal2[0]
+    return records[:, INTENSITY] * angular
+
+
 def _validate(position, direction, flux):
     """Return the inputs as float32 arrays or None; raise ValueError for what is not as build_light_tree asks."""
     if position is None and direction is None:

@@ -24,7 +24,7 @@ from .gather import SceneTraits
 from .light_set import LightGroup, LightSet
 from .pairs import Pairs
 from .point_clusters import PointClusters
-from .sampling import derived_seed, find_interval, independent_sampler
+from .sampling import derived_seed, find_interval, independent_sampler, running_sums
 
 
 class PixelCuts:
@@ -40,7 +40,7 @@ class PixelCuts:
         tree = clusters.tree
         end = tree.first.astype(np.int64) + tree.count
         self._of_pixel = pixel[tree.first] == pixel[end - 1]
-        self._cumulative, *self._channels = (_cumulative(x) for x in (channel_mean(weight), *weight))
+        self._cumulative, *self._channels = (running_sums(x) for x in (channel_mean(weight), *weight))
         # Of the channel with most weight: where weights have colours, a pair may add more than the mean suggests
         channels = np.stack([download(channel) for channel in self._channels])
         self._share = (channels[:, end] - channels[:, tree.first]).max(0) / samples
@@ -123,13 +123,3 @@ class PixelCuts:
             total += dr.gather(type(values), values, node)
         dr.eval(total)
         return total
-
-
-def _cumulative(values):
-    """Sums of all values before each, and of all, in double precision."""
-    precise = dr.float64_array_t(mi.Float)
-    count = dr.width(values)
-    sums = dr.zeros(precise, count + 1)
-    dr.scatter(sums, dr.cumsum(precise(values)), dr.arange(mi.UInt32, count) + 1)
-    dr.eval(sums)
-    return sums

@@ -28,6 +28,16 @@ def stratified(sampler, count: int, first: int, total: int):
     return dr.minimum(sample, dr.one_minus_epsilon(mi.Float))
 
 
+def running_sums(values):
+    """The sum of all values before each, and of all, in double precision, evaluated: one more entry than values."""
+    precise = dr.float64_array_t(mi.Float)
+    count = dr.width(values)
+    sums = dr.zeros(precise, count + 1)
+    dr.scatter(sums, dr.cumsum(precise(values)), dr.arange(mi.UInt32, count) + 1)
+    dr.eval(sums)
+    return sums
+
+
 @dr.syntax
 def find_interval(cumulative, first, last, sample):
     """The interval of ``cumulative[first] ... cumulative[last]`` that a uniform number falls into, first .. last - 1.

@@ -1,0 +1,146 @@
+"""LightSlice: one set of clusters for all gather points of a slice, from sampled rows of the light matrix."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from vpl.arrays import download, upload
+from vpl.evaluation import sum_lights
+from vpl.light_matrix import DeviceForest, NearRows, SampledRows
+from vpl.point_clusters import PointClusters
+from vpl.slice_columns import SliceLights, shared_columns, slice_lights
+from vpl.slices import build_slices, six_dimensional
+
+from . import properties
+from .common import ManyLightIntegrator, Shaded, Shading
+from .gathering import Clock
+from .manual import manual_page
+
+
+@manual_page
+class LightSliceIntegrator(ManyLightIntegrator):
+    r"""
+    .. _integrator-lightslice:
+
+    LightSlice (:monosp:`lightslice`)
+    ---------------------------------
+
+    .. pluginparameters::
+
+     * - slices
+       - |int|
+       - Groups of neighbouring gather points that are lit by the same clusters. Fewer make larger ones, which take less
+         time to prepare and more columns to light well. (Default: 1500)
+
+     * - columns
+       - |int|
+       - Most clusters of lights that a slice is lit by, at least one per kind of light. The error falls and the time
+         grows with it. (Default: 200)
+
+     * - shared_columns
+       - |int|
+       - Most clusters of lights that all slices together tell apart; what is sampled at one point of each slice are
+         these. The largest number of lights makes every light a column, as in the paper. (Default: 8192)
+
+     * - neighbours
+       - |int|
+       - The sampled points of so many slices, its own among them, tell how lights are clustered for a slice.
+         (Default: 6)
+
+     * - unseen
+       - |float|
+       - How much of the choice of lights goes by upper bounds, relative to what goes by the sampled points: the lights
+         that none of these saw are chosen with it. (Default: 1)
+
+     * - sets
+       - |int|
+       - Lights that are drawn for each cluster, at most as many as a pixel has samples, which take turns with them.
+         (Default: 16)
+
+     {common parameters}
+
+    Ou and Pellacini 2011, "LightSlice: matrix slice sampling for the many-lights problem" [LS].
+
+    {what is estimated}
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="lightslice">
+                <integer name="max_depth" value="8"/>
+                <integer name="columns" value="200"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            import integrators
+            "integrator": {"type": "lightslice", "max_depth": 8, "columns": 200}
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.slices = properties.integer(props, "slices", 1500, 1)
+        self.columns = properties.integer(props, "columns", 200, 1)
+        self.shared_columns = properties.integer(props, "shared_columns", 8192, 1)
+        self.neighbours = properties.integer(props, "neighbours", 6, 1)
+        self.unseen = properties.number(props, "unseen", 1.0, 1e-6)
+        self.sets = properties.integer(props, "sets", 16, 1)
+
+    def shade(self, job: Shading) -> Shaded:
+        """Slices, the lights of each, and what these send to its points, for one batch."""
+        clock = Clock()
+        sets = min(self.sets, job.grid.samples)
+        turn = download(job.ray).astype(np.int64) % job.grid.samples % sets
+        slices = max(round(self.slices * job.share), 1)
+        build = partial(build_slices, slices=slices, seed=job.seed, rank=turn if sets > 1 else None)
+        clusters = PointClusters(job.batch, build)
+        tree = clusters.tree
+        first, size = (of_node[tree.leaves].astype(np.int64) for of_node in (tree.first, tree.count))
+        # A row of the light matrix is sampled at one random point of each slice
+        points = first + (np.random.default_rng(job.seed).random(len(size)) * size).astype(np.int64)
+        clock.lap("slices")
+        forest, rays, bounds = shared_columns(
+            job.scene, job.traits, job.lights, clusters, points, self.shared_columns, job.seed
+        )
+        clock.lap("shared_columns")
+        rows = SampledRows(job.scene, job.traits, clusters.batch, DeviceForest(forest, job.lights), points)
+        clock.lap("rows")
+        place = six_dimensional(download(clusters.batch.position), download(mi.Vector3f(clusters.batch.normal)))
+        near = NearRows.nearest(place[points], self.neighbours)
+        chosen = slice_lights(rows, near, clusters, self.columns, self.unseen, sets, job.seed)
+        clock.lap("columns")
+        entry = upload(mi.UInt32, turn[tree.order] * rows.count + np.repeat(np.arange(rows.count), size))
+        radiance, traced, columns = self._light(job, clusters, chosen, entry)
+        clock.lap("evaluate")
+        radiance, traced, columns = clusters.in_batch_order([radiance, traced, columns])
+        # What was spent on choosing is shared by all points
+        shared = [(rays + rows.rays) / clusters.count, (bounds + rows.count * rows.forest.columns) / clusters.count]
+        rays, bounds = (dr.opaque(mi.Float, number, clusters.count) for number in shared)
+        return Shaded(radiance, traced + rays, bounds, columns, clock.seconds)
+
+    def _light(self, job: Shading, clusters: PointClusters, chosen: list[SliceLights], entry):
+        """(Radiance, shadow rays, columns) of all points along the slices; ``entry``: the list of lights of each."""
+        radiance = dr.zeros(mi.UnpolarizedSpectrum, clusters.count)
+        traced, columns = dr.zeros(mi.UInt32, clusters.count), dr.zeros(mi.UInt32, clusters.count)
+        for lights in chosen:
+            if job.stopped():
+                break
+            first, last = (dr.gather(mi.UInt32, ends, entry) for ends in (lights.first, lights.last))
+            value, rays = sum_lights(
+                job.scene, job.traits, job.lights, lights.group, clusters.batch.surfaces, first, last, lights.pick
+            )
+            radiance, traced, columns = radiance + value, traced + rays, columns + last - first
+            dr.eval(radiance, traced, columns)
+        return radiance, traced, columns
+
+    def describe(self):
+        """All properties and their values."""
+        names = ("slices", "columns", "shared_columns", "neighbours", "unseen", "sets")
+        return super().describe() | {name: getattr(self, name) for name in names}
+
+
+mi.register_integrator("lightslice", LightSliceIntegrator)
