@@ -91,8 +91,7 @@ def split_threshold(cost: np.ndarray, splits: int) -> np.ndarray:
 
     ``cost`` (s, m): of nodes that can be split, in no order.  Nodes that cost nothing are never split.
     """
-    nodes = cost.shape[1]
+    nodes, splits = cost.shape[1], max(splits, 0)
     if splits >= nodes:
         return np.zeros(len(cost), cost.dtype)
-    splits = max(splits, 0)
     return np.maximum(np.partition(cost, nodes - splits - 1, axis=1)[:, nodes - splits - 1], 0)

@@ -75,10 +75,10 @@ class DeviceForest:
 
 
 class SampledRows:
-    """Some rows of the matrix, evaluated.
+    """Some rows of the matrix, evaluated, in units of their mean sum, so that squares neither overflow nor vanish.
 
-    ``values``: Float, row by row; ``sums``: Float, of the columns of every node, row by row; ``rays``: shadow rays that
-    were traced for them.
+    ``scale``: one over that mean; ``values``: Float, row by row; ``sums``: Float, of the columns of every node, row by
+    row; ``rays``: shadow rays that were traced for them.
     """
 
     def __init__(self, scene, traits: SceneTraits, batch: Batch, forest: DeviceForest, points: np.ndarray):
@@ -96,6 +96,11 @@ class SampledRows:
             return value
 
         self.values = forest.fill(self.count, entry)
+        mean = float(dr.sum(dr.float64_array_t(mi.Float)(self.values))[0]) / self.count
+        # The inverse of the least of numbers is not finite
+        self.scale = 1 / mean if mean > np.finfo(np.float32).tiny else 1.0
+        self.values *= dr.opaque(mi.Float, self.scale)
+        dr.eval(self.values)
         self.sums = dr.empty(mi.Float, self.count * forest.size)
         for first, last in chunks(self.count, forest.size):
             rows = last - first
@@ -166,33 +171,36 @@ class NearRows:
 class ColumnWeights:
     """What every column counts, and what every cluster of them costs, for some groups of gather points.
 
-    ``cumulative``: float64, the running sums of the weights of the columns, group by group: lights are drawn with
-    probabilities proportional to weights.  ``cost``: Float, group by group, of every node.
+    ``cumulative``: float64, the running sums of the weights of the columns, group by group, each of which adds 1:
+    lights are drawn with probabilities proportional to weights.  ``cost``: Float, group by group, of every node.
 
     ``near``: the sampled rows that tell about each group; ``clusters``, ``nodes`` (UInt32): the groups as nodes of a
     point tree.  ``unseen``: how much goes by upper bounds, relative to what goes by sampled rows: a light that no row
-    saw may yet be seen.  A bound counts for no more than all light that was seen.  A column whose bound is zero has no
-    weight.
+    saw may yet be seen.  A bound counts for no more than all light that was seen.
     """
 
     def __init__(self, sampled: SampledRows, near: NearRows, clusters: PointClusters, nodes, unseen: float):
         self._forest, self.groups = sampled.forest, near.count
         self._rows, self._relevance = upload(mi.UInt32, near.rows), upload(mi.Float, near.relevance)
         self._nearby = dr.opaque(mi.UInt32, near.rows.shape[1])
-        bounds = self._bounds(clusters, nodes)
+        bounds = self._bounds(clusters, nodes, dr.opaque(mi.Float, sampled.scale))
         norms = dr.sqrt(self._squares(sampled.values, self._forest.columns))
-        self.cumulative = self._weigh(dr.select(bounds > 0, norms, 0), bounds, unseen)
+        self.cumulative, scale = self._weigh(norms, bounds, unseen)
         total = self._forest.node_sums(self.cumulative, self.groups)
-        self.cost = dr.maximum(dr.square(total) - self._squares(sampled.sums, self._forest.size), 0)
+        group = dr.arange(mi.UInt32, dr.width(total)) // dr.opaque(mi.UInt32, self._forest.size)
+        scale = dr.gather(mi.Float, mi.Float(scale), group)
+        # Scaled before they are squared, which float32 holds for any light
+        squares = dr.square(dr.sqrt(self._squares(sampled.sums, self._forest.size)) * scale)
+        self.cost = dr.maximum(dr.square(total) - squares, 0)
         dr.eval(self.cost)
 
-    def _bounds(self, clusters: PointClusters, nodes):
-        """The most that each column can send to a point of each group."""
+    def _bounds(self, clusters: PointClusters, nodes, scale):
+        """The most that each column can send to a point of each group, in the units of the rows."""
         clamp = dr.opaque(mi.Float, self._forest.lights.smallest_distance)
 
         def entry(group, node, row):
             receiver = clusters.gather(dr.gather(mi.UInt32, nodes, row)).receiver
-            return contribution_bound(group.kind, receiver, group.tree.gather(node), clamp)
+            return scale * contribution_bound(group.kind, receiver, group.tree.gather(node), clamp)
 
         return self._forest.fill(self.groups, entry)
 
@@ -210,18 +218,21 @@ class ColumnWeights:
         return total
 
     def _weigh(self, norms, bounds, unseen: float):
-        """Running sums of the weights: norms, and bounds scaled to ``unseen`` times their sum."""
+        """(Running sums of the weights, scaled to 1 for each group; what they were scaled by, float64 per group)."""
+        precise = dr.float64_array_t(mi.Float)
         columns = dr.opaque(mi.UInt32, self._forest.columns)
         group = dr.arange(mi.UInt32, dr.width(norms)) // columns
 
         def total(values):
-            sums, lane = running_sums(values), dr.arange(mi.UInt32, self.groups)
-            return dr.gather(type(sums), sums, (lane + 1) * columns) - dr.gather(type(sums), sums, lane * columns)
+            return dr.block_sum(precise(values), self._forest.columns)
 
-        seen = total(norms)
-        # Where no row saw anything, bounds decide alone; unclamped ones may be infinite
-        most = dr.select(seen > 0, mi.Float(seen), dr.opaque(mi.Float, 1e30))
-        bounds = dr.minimum(bounds, dr.gather(mi.Float, most, group))
+        seen, finite = total(norms), total(dr.select(dr.isfinite(bounds), bounds, 0))
+        # Where no row saw anything, bounds decide alone; without clamping some are infinite
+        most = dr.select(seen > 0, seen, dr.select(finite > 0, finite, 1))
+        bounds = dr.minimum(bounds, mi.Float(dr.gather(precise, most, group)))
         possible = total(bounds)
-        share = dr.select(seen > 0, dr.opaque(type(seen), unseen) * seen, 1) / dr.select(possible > 0, possible, 1)
-        return running_sums(type(seen)(norms) + dr.gather(type(seen), share, group) * type(seen)(bounds))
+        share = dr.select(seen > 0, dr.opaque(precise, unseen) * seen, 1) / dr.select(possible > 0, possible, 1)
+        weights = precise(norms) + dr.gather(precise, share, group) * precise(bounds)
+        whole = total(weights)
+        scale = dr.select(whole > 0, dr.rcp(whole), 0)
+        return running_sums(weights * dr.gather(precise, scale, group)), scale
