@@ -11,6 +11,7 @@ import numpy as np
 from vpl.arrays import download, upload
 from vpl.evaluation import sum_lights
 from vpl.light_matrix import DeviceForest, NearRows, SampledRows
+from vpl.morton import interleave
 from vpl.point_clusters import PointClusters
 from vpl.slice_columns import SliceLights, shared_columns, slice_lights
 from vpl.slices import build_slices, six_dimensional
@@ -58,14 +59,33 @@ class LightSliceIntegrator(ManyLightIntegrator):
 
      * - sets
        - |int|
-       - Lights that are drawn for each cluster, at most as many as a pixel has samples, which take turns with them.
-         (Default: 16)
+       - Lights that are drawn for each cluster; the samples of a pixel take turns with them, and the pixels of blocks of
+         4 × 4. With 1 all points of a slice share one error, and slices show as blotches. (Default: 16)
 
      {common parameters}
 
-    Ou and Pellacini 2011, "LightSlice: matrix slice sampling for the many-lights problem" [LS].
+    Ou and Pellacini 2011, "LightSlice: matrix slice sampling for the many-lights problem" [LS]. What every light sends to
+    every gather point is a large matrix; slices of its rows, for points that are near to each other and face alike, are
+    lit by the same clusters of lights. One row of each slice is sampled, with shadow rays, and the rows around a slice
+    tell which lights can be joined for it: those that arrive together, or not at all. So occluded lights cost next to
+    nothing, no bound is computed while points are lit, and all points of a slice trace towards the same lights, which is
+    three to five times faster than tracing the cuts of single points. What it cannot do is follow a glossy lobe that
+    differs from point to point: one row says little about its neighbours there, and errors are several times those of
+    :ref:`lightcuts <integrator-lightcuts>`.
 
     {what is estimated}
+
+    There is no bound on the error: it falls about as 1 / ``columns``. With few gather points to a slice (small images)
+    the sampled rows cost more than they save; take fewer slices.
+
+    **Departures from the paper.** Clusters are nodes of the light trees, split where the sampled rows say that it matters
+    most, instead of sets of columns divided by projections on lines; all lights of a shared column count as one, whose
+    representative is traced. A light is drawn for every cluster with a probability proportional to the norm of its
+    column plus a share of its upper bound, and counts with its own colour: the image is that of all lights in
+    expectation, and no light is lost because no row saw it. Rows of neighbours count less the farther away they are.
+    Neighbouring pixels take different lights of a cluster (interleaved sampling), which makes noise of what would be
+    seams between slices; ``sets`` 1 is the paper's. See :mod:`vpl.slices`, :mod:`vpl.light_matrix`,
+    :mod:`vpl.slice_columns`. Lambertian points and all others are in slices of their own.
 
     .. tabs::
         .. code-tab:: xml
@@ -93,10 +113,9 @@ class LightSliceIntegrator(ManyLightIntegrator):
     def shade(self, job: Shading) -> Shaded:
         """Slices, the lights of each, and what these send to its points, for one batch."""
         clock = Clock()
-        sets = min(self.sets, job.grid.samples)
-        turn = download(job.ray).astype(np.int64) % job.grid.samples % sets
+        turn = self._turns(job)
         slices = max(round(self.slices * job.share), 1)
-        build = partial(build_slices, slices=slices, seed=job.seed, rank=turn if sets > 1 else None)
+        build = partial(build_slices, slices=slices, seed=job.seed, rank=turn)
         clusters = PointClusters(job.batch, build)
         tree = clusters.tree
         first, size = (of_node[tree.leaves].astype(np.int64) for of_node in (tree.first, tree.count))
@@ -111,7 +130,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
         clock.lap("rows")
         place = six_dimensional(download(clusters.batch.position), download(mi.Vector3f(clusters.batch.normal)))
         near = NearRows.nearest(place[points], self.neighbours)
-        chosen = slice_lights(rows, near, clusters, self.columns, self.unseen, sets, job.seed)
+        chosen = slice_lights(rows, near, clusters, self.columns, self.unseen, self.sets, job.seed)
         clock.lap("columns")
         entry = upload(mi.UInt32, turn[tree.order] * rows.count + np.repeat(np.arange(rows.count), size))
         radiance, traced, columns = self._light(job, clusters, chosen, entry)
@@ -121,6 +140,16 @@ class LightSliceIntegrator(ManyLightIntegrator):
         shared = [(rays + rows.rays) / clusters.count, (bounds + rows.count * rows.forest.columns) / clusters.count]
         rays, bounds = (dr.opaque(mi.Float, number, clusters.count) for number in shared)
         return Shaded(radiance, traced + rays, bounds, columns, clock.seconds)
+
+    def _turns(self, job: Shading) -> np.ndarray:
+        """The set of lights that each point takes, (n,): another one for each sample, then each pixel of a block."""
+        ray, grid = download(job.ray).astype(np.int64), job.grid
+        pixel = ray // grid.samples
+        x, y = pixel % grid.width, pixel // grid.width
+        tile = interleave(np.stack([x, y, np.zeros_like(x)], axis=1) % 4)
+        # Bits 0, 1, 3 and 4 are those of the place within the block
+        block = (tile & np.uint64(3) | (tile >> np.uint64(1)) & np.uint64(12)).astype(np.int64)
+        return (ray % grid.samples + grid.samples * block) % self.sets
 
     def _light(self, job: Shading, clusters: PointClusters, chosen: list[SliceLights], entry):
         """(Radiance, shadow rays, columns) of all points along the slices; ``entry``: the list of lights of each."""

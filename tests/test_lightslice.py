@@ -13,7 +13,7 @@ from vpl.arrays import download, upload
 from vpl.column_forest import ColumnForest, split_threshold
 from vpl.light_matrix import ColumnWeights, DeviceForest, NearRows, SampledRows
 from vpl.point_clusters import PointClusters
-from vpl.slice_columns import _chosen_nodes, _drawn_columns, _drawn_lights, fine_forest
+from vpl.slice_columns import _Chosen, _drawn_lights, fine_forest, slice_lights
 from vpl.slices import build_slices
 
 from .conftest import area_light, closed_box, render, wall
@@ -232,9 +232,13 @@ def test_lights_are_drawn_as_often_as_their_scale_says(direct):
     forest, draws = rows.forest, 1 << 12
     near = NearRows.nearest(np.random.default_rng(0).random((2, 6)), 2)
     weights = ColumnWeights(rows, near, clusters, upload(mi.UInt32, clusters.tree.leaves), 0.2)
-    chosen, node = _chosen_nodes(forest, weights, 12)
-    assert (np.bincount(chosen) <= max(12, len(forest.forest.roots))).all()
-    column, scale = _drawn_columns(forest, weights, chosen, node, draws, 1)
+    found = _Chosen(2, max(12, len(forest.forest.roots)), draws)
+    found.choose(forest, weights, 12, 0)
+    found.draw_columns(forest, weights, 0, 1)
+    used = np.arange(found.most) < download(found.used)[:, None]
+    assert used.any(1).all()
+    chosen, node = np.nonzero(used)[0], download(found.node)[used.reshape(-1)]
+    column, scale = (download(x).reshape(draws, -1)[:, used.reshape(-1)] for x in (found.column, found.scale))
     weight = np.diff(download(weights.cumulative)).reshape(2, -1)
     first, last = forest.forest.first[node], forest.forest.last[node]
     assert (column >= first).all() and (column < last).all()
@@ -331,6 +335,22 @@ def test_the_mean_over_seeds_is_that_of_all_lights(make):
     assert noisy[-3:].all()
     p_values = stats.ttest_1samp(excess[:, noisy], 0).pvalue
     assert p_values.min() > 1 - (1 - 0.01) ** (1 / noisy.sum())
+
+
+def test_no_light_is_drawn_for_another_kind_and_all_lights_stand_for_all_of_their_kind():
+    """Whatever the cut: on average, scale times intensity of a kind's lights is the intensity of all of them."""
+    job = prepared(glossy_room(), vpl_count=60, direct="vpl", direct_count=32)[1][0]
+    clusters, rows, _ = sampled(job, 2, shared=30)
+    near, sets = NearRows.nearest(np.random.default_rng(0).random((2, 6)), 2), 1 << 12
+    found = slice_lights(rows, near, clusters, 12, 0.2, sets, 3)
+    assert [one.group.kind for one in found] == [group.kind for group in job.lights.groups]
+    for one in found:
+        first, last = (download(ends).astype(int) for ends in (one.first, one.last))
+        light, scale = download(one.light), download(one.scale)
+        inside = np.concatenate([np.arange(low, high) for low, high in zip(first, last, strict=True)]).astype(int)
+        assert (light[inside] < one.group.count).all()
+        total = (scale * one.group.lights.scalar_intensity[np.minimum(light, one.group.count - 1)])[inside].sum()
+        assert np.isclose(total / (2 * sets), one.group.lights.scalar_intensity.sum(), rtol=0.1)
 
 
 def test_samples_of_a_pixel_take_turns_with_the_lights_of_a_cluster():

@@ -88,79 +88,99 @@ def slice_lights(
     ``rows``: one for each slice, ``near``: which of them tell about each; ``unseen``: see :class:`ColumnWeights`.
     """
     forest, leaves = rows.forest, upload(mi.UInt32, clusters.tree.leaves)
-    found = []
-    for number, (first, last) in enumerate(chunks(rows.count, forest.size)):
-        nodes = dr.gather(mi.UInt32, leaves, dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first))
-        weights = ColumnWeights(rows, near.part(first, last), clusters, nodes, unseen)
-        chosen, node = _chosen_nodes(forest, weights, columns)
-        column, scale = _drawn_columns(forest, weights, chosen, node, sets, derived_seed(seed, number))
-        found.append((chosen + first, column, scale))
-    chosen = np.concatenate([one[0] for one in found])
-    column, scale = (np.concatenate([one[k] for one in found], axis=1) for k in (1, 2))
-    return [
-        _lights_of_group(rows, group, part, chosen, column, scale, derived_seed(seed, 1 << 20, number))
-        for number, (group, part) in enumerate(zip(forest.lights.groups, forest.parts, strict=True))
-    ]
+    chosen = _Chosen(rows.count, max(columns, len(forest.forest.roots)), sets)
+    for first, last in chunks(rows.count, forest.size):
+        part = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
+        weights = ColumnWeights(rows, near.part(first, last), clusters, dr.gather(mi.UInt32, leaves, part), unseen)
+        chosen.choose(forest, weights, columns, first)
+        chosen.draw_columns(forest, weights, first, derived_seed(seed, first))
+    return chosen.lights(forest, derived_seed(seed, 1 << 20))
 
 
-def _chosen_nodes(forest: DeviceForest, weights: ColumnWeights, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """The clusters of each slice, those without weight left out: (slices, nodes of the forest), slice by slice."""
-    slices, roots = weights.groups, len(forest.forest.roots)
-    cost = download(weights.cost).reshape(slices, -1)
-    threshold = split_threshold(cost[:, forest.forest.inner], columns - roots)
-    most = max(columns, roots)
-    nodes, count = _walk(forest, weights, upload(mi.Float, threshold), most)
-    used = np.arange(most) < download(count)[:, None]
-    return np.repeat(np.arange(slices), used.sum(1)), download(nodes).reshape(slices, most)[used]
+class _Chosen:
+    """Clusters of all slices, ``most`` places for each, and the column that stands for them in every set.
 
+    ``node``: of the forest; ``used``: how many places of a slice are; ``column``, ``scale``: set by set, the column
+    that was drawn and one over its probability.
+    """
 
-@dr.syntax
-def _walk(forest: DeviceForest, weights: ColumnWeights, threshold, most: int):
-    """From the roots down, split what costs more than the threshold: (nodes, ``most`` places a slice; how many)."""
-    lane, size = dr.arange(mi.UInt32, weights.groups), dr.opaque(mi.UInt32, forest.size)
-    nodes, start = dr.zeros(mi.UInt32, weights.groups * most), lane * dr.opaque(mi.UInt32, most)
-    dr.eval(nodes)
-    node, at = dr.zeros(mi.UInt32, weights.groups), mi.UInt32(start)
-    while dr.hint(node < size, exclude=[forest, weights, nodes]):
-        place = lane * size + node
-        escape = dr.gather(mi.UInt32, forest.escape, node)
-        split = (escape != node + 1) & (dr.gather(mi.Float, weights.cost, place) > threshold)
-        taken = ~split & (forest.node_sum(weights.cumulative, lane, node) > 0)
-        dr.scatter(nodes, node, at, taken)
-        at += dr.select(taken, 1, 0)
-        node = dr.select(split, node + 1, escape)
-    dr.eval(nodes, at)
-    return nodes, at - start
+    def __init__(self, slices: int, most: int, sets: int):
+        self.slices, self.most, self.sets, self.places = slices, most, sets, slices * most
+        self.node, self.used = dr.zeros(mi.UInt32, self.places), dr.zeros(mi.UInt32, slices)
+        self.column, self.scale = dr.zeros(mi.UInt32, sets * self.places), dr.zeros(mi.Float, sets * self.places)
+        dr.eval(self.node, self.used, self.column, self.scale)
 
+    def choose(self, forest: DeviceForest, weights: ColumnWeights, columns: int, first: int) -> None:
+        """The clusters of some consecutive slices from ``first`` on: what costs more than fits is split."""
+        cost = download(weights.cost).reshape(weights.groups, -1)
+        splits = columns - len(forest.forest.roots)
+        threshold = split_threshold(cost[:, forest.forest.inner], splits)
+        self._walk(forest, weights, upload(mi.Float, threshold), first)
 
-def _drawn_columns(forest: DeviceForest, weights: ColumnWeights, chosen, node, sets: int, seed: int):
-    """A column of every cluster, drawn by weight, and one over its probability: (sets, clusters) each."""
-    row, node = upload(mi.UInt32, chosen), upload(mi.UInt32, node)
-    first, last = (row * forest.columns + dr.gather(mi.UInt32, ends, node) for ends in (forest.first, forest.last))
-    cumulative, found = weights.cumulative, []
-    total = dr.gather(type(cumulative), cumulative, last) - dr.gather(type(cumulative), cumulative, first)
-    for number in range(sets):
-        sample = independent_sampler(derived_seed(seed, number), len(chosen)).next_1d()
-        place = find_interval(cumulative, first, last, sample)
-        weight = dr.gather(type(cumulative), cumulative, place + 1) - dr.gather(type(cumulative), cumulative, place)
-        found.append((download(place - row * forest.columns), download(mi.Float(total / weight))))
-    return tuple(np.stack(column) for column in zip(*found, strict=True))
+    @dr.syntax
+    def _walk(self, forest: DeviceForest, weights: ColumnWeights, threshold, first: int):
+        """From the roots down, split what costs more than the threshold; leave out what has no weight."""
+        lane, size = dr.arange(mi.UInt32, weights.groups), dr.opaque(mi.UInt32, forest.size)
+        piece = lane + dr.opaque(mi.UInt32, first)
+        start = piece * dr.opaque(mi.UInt32, self.most)
+        node, at = dr.zeros(mi.UInt32, weights.groups), mi.UInt32(start)
+        while dr.hint(node < size, exclude=[self, forest, weights]):
+            escape = dr.gather(mi.UInt32, forest.escape, node)
+            split = (escape != node + 1) & (dr.gather(mi.Float, weights.cost, lane * size + node) > threshold)
+            taken = ~split & (forest.node_sum(weights.cumulative, lane, node) > 0)
+            dr.scatter(self.node, node, at, taken)
+            at += dr.select(taken, 1, 0)
+            node = dr.select(split, node + 1, escape)
+        dr.scatter(self.used, at - start, piece)
+        dr.eval(self.node, self.used)
 
+    def draw_columns(self, forest: DeviceForest, weights: ColumnWeights, first: int, seed: int) -> None:
+        """A column of every cluster of some consecutive slices in each set, drawn by weight."""
+        count = weights.groups * self.most
+        lane = dr.arange(mi.UInt32, self.sets * count)
+        inside = lane % dr.opaque(mi.UInt32, count)
+        row = inside // dr.opaque(mi.UInt32, self.most)
+        place = inside + dr.opaque(mi.UInt32, first * self.most)
+        piece = row + dr.opaque(mi.UInt32, first)
+        active = place - piece * dr.opaque(mi.UInt32, self.most) < dr.gather(mi.UInt32, self.used, piece)
+        node = dr.gather(mi.UInt32, self.node, place, active)
+        start = row * dr.opaque(mi.UInt32, forest.columns)
+        low, high = (start + dr.gather(mi.UInt32, ends, node, active) for ends in (forest.first, forest.last))
+        sums = weights.cumulative
 
-def _lights_of_group(rows: SampledRows, group: LightGroup, part, chosen, column, scale, seed: int) -> SliceLights:
-    """The lights of one group: of every column that was drawn, one by intensity.  ``part``: its columns."""
-    forest, sets = rows.forest, len(column)
-    begin, count = part
-    # Clusters are of one kind each, whatever columns are drawn of them
-    own = (column[0] >= begin) & (column[0] < begin + count)
-    node = dr.gather(mi.UInt32, forest.node, upload(mi.UInt32, column[:, own]))
-    light, factor = _drawn_lights(group.tree, node, _precise_sample(seed, dr.width(node)))
-    lights = np.bincount(chosen[own], minlength=rows.count)
-    last = np.cumsum(lights)[None] + np.arange(sets)[:, None] * lights.sum()
-    ends = (upload(mi.UInt32, last - lights), upload(mi.UInt32, last))
-    factor = upload(mi.Float, scale[:, own]) * factor * dr.rcp(channel_mean(group.lights.gather(light).intensity))
-    dr.eval(light, factor)
-    return SliceLights(group, *ends, light, factor)
+        def rise(begin, end):
+            return dr.gather(type(sums), sums, end, active) - dr.gather(type(sums), sums, begin, active)
+
+        sample = independent_sampler(seed, self.sets * count).next_1d()
+        chosen = find_interval(sums, low, high, sample)
+        target = place + lane // dr.opaque(mi.UInt32, count) * dr.opaque(mi.UInt32, self.places)
+        dr.scatter(self.column, chosen - start, target, active)
+        dr.scatter(self.scale, mi.Float(rise(low, high) / rise(chosen, chosen + 1)), target, active)
+        dr.eval(self.column, self.scale)
+
+    def lights(self, forest: DeviceForest, seed: int) -> list[SliceLights]:
+        """For every group of lights: of each column that was drawn, a light by intensity."""
+        used = np.arange(self.most) < download(self.used)[:, None]
+        group = forest.forest.group[download(self.node)].reshape(used.shape)
+        light, scale = dr.zeros(mi.UInt32, len(self.column)), mi.Float(self.scale)
+        begin, found = np.arange(self.slices) * self.most, []
+        shift = np.arange(self.sets)[:, None] * self.places
+        for number, one in enumerate(forest.lights.groups):
+            # The clusters of a slice stand in the order of the groups
+            end = begin + (used & (group == number)).sum(1)
+            place = dr.arange(mi.UInt32, len(self.column)) % dr.opaque(mi.UInt32, self.places)
+            piece = place // dr.opaque(mi.UInt32, self.most)
+            low, high = (dr.gather(mi.UInt32, upload(mi.UInt32, ends), piece) for ends in (begin, end))
+            active = (place >= low) & (place < high)
+            node = dr.gather(mi.UInt32, forest.node, self.column, active)
+            sample = _precise_sample(derived_seed(seed, number), len(self.column))
+            drawn, total = _drawn_lights(one.tree, node, sample, active)
+            factor = total / channel_mean(one.lights.gather(drawn, active).intensity)
+            light, scale = dr.select(active, drawn, light), dr.select(active, scale * factor, scale)
+            dr.eval(light, scale)
+            found.append((one, upload(mi.UInt32, begin + shift), upload(mi.UInt32, end + shift)))
+            begin = end
+        return [SliceLights(one, first, last, light, scale) for one, first, last in found]
 
 
 def _precise_sample(seed: int, count: int):
@@ -171,13 +191,14 @@ def _precise_sample(seed: int, count: int):
 
 
 @dr.syntax
-def _drawn_lights(tree: DeviceTree, nodes, sample):
+def _drawn_lights(tree: DeviceTree, nodes, sample, active=True):
     """A light of each node, drawn by intensity, and the intensity of the node.
 
     ``sample``: in double precision, for every level of the tree takes its part of it.
     """
     precise = type(sample)
-    node, sample, end = mi.UInt32(nodes), precise(sample), tree.escape(nodes)
+    node, sample, end = mi.UInt32(nodes), precise(sample), tree.escape(nodes, active)
+    end = dr.select(active, end, node + 1)
     while dr.hint(end != node + 1, exclude=[tree]):
         second = tree.escape(node + 1)
         intensity = precise(tree.summed_intensity(node + 1))
@@ -186,6 +207,6 @@ def _drawn_lights(tree: DeviceTree, nodes, sample):
         sample = dr.minimum(dr.select(stays, sample / share, (sample - share) / (1 - share)), 1 - 1e-15)
         end = dr.select(stays, second, end)
         node = dr.select(stays, node + 1, second)
-    light, total = tree.representative(node), tree.summed_intensity(nodes)
+    light, total = tree.representative(node, active), tree.summed_intensity(nodes, active)
     dr.eval(light, total)
     return light, total
