@@ -59,29 +59,29 @@ class LightSliceIntegrator(ManyLightIntegrator):
 
      * - sets
        - |int|
-       - Lights that are drawn for each cluster; the samples of a pixel take turns with them, and the pixels of blocks of
-         4 × 4. With 1 all points of a slice share one error, and slices show as blotches. (Default: 16)
+       - Lights that are drawn for each cluster; the samples of a pixel take turns with them, and the pixels of blocks
+         of 4 × 4. With 1 all points of a slice share one error, and slices show as blotches. (Default: 16)
 
      {common parameters}
 
-    Ou and Pellacini 2011, "LightSlice: matrix slice sampling for the many-lights problem" [LS]. What every light sends to
-    every gather point is a large matrix; slices of its rows, for points that are near to each other and face alike, are
-    lit by the same clusters of lights. One row of each slice is sampled, with shadow rays, and the rows around a slice
-    tell which lights can be joined for it: those that arrive together, or not at all. So occluded lights cost next to
-    nothing, no bound is computed while points are lit, and all points of a slice trace towards the same lights, which is
-    three to five times faster than tracing the cuts of single points. What it cannot do is follow a glossy lobe that
-    differs from point to point: one row says little about its neighbours there, and errors are several times those of
-    :ref:`lightcuts <integrator-lightcuts>`.
+    Ou and Pellacini 2011, "LightSlice: matrix slice sampling for the many-lights problem" [LS]. What every light sends
+    to every gather point is a large matrix; slices of its rows, for points that are near to each other and face alike,
+    are lit by the same clusters of lights. One row of each slice is sampled, with shadow rays, and the rows around a
+    slice tell which lights can be joined for it: those that arrive together, or not at all. So occluded lights cost
+    next to nothing, no bound is computed while points are lit, and all points of a slice trace towards the same lights,
+    which is three to five times faster than tracing the cuts of single points. What it cannot do is follow a glossy
+    lobe that differs from point to point: one row says little about its neighbours there, and errors are several times
+    those of :ref:`lightcuts <integrator-lightcuts>`.
 
     {what is estimated}
 
     There is no bound on the error: it falls about as 1 / ``columns``. With few gather points to a slice (small images)
     the sampled rows cost more than they save; take fewer slices.
 
-    **Departures from the paper.** Clusters are nodes of the light trees, split where the sampled rows say that it matters
-    most, instead of sets of columns divided by projections on lines; all lights of a shared column count as one, whose
-    representative is traced. A light is drawn for every cluster with a probability proportional to the norm of its
-    column plus a share of its upper bound, and counts with its own colour: the image is that of all lights in
+    **Departures from the paper.** Clusters are nodes of the light trees, split where the sampled rows say that it
+    matters most, instead of sets of columns divided by projections on lines; all lights of a shared column count as
+    one, whose representative is traced. A light is drawn for every cluster with a probability proportional to the norm
+    of its column plus a share of its upper bound, and counts with its own colour: the image is that of all lights in
     expectation, and no light is lost because no row saw it. Rows of neighbours count less the farther away they are.
     Neighbouring pixels take different lights of a cluster (interleaved sampling), which makes noise of what would be
     seams between slices; ``sets`` 1 is the paper's. See :mod:`vpl.slices`, :mod:`vpl.light_matrix`,

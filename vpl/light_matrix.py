@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import channel_mean, download, upload
+from .arrays import channel_mean, upload
 from .bounds import contribution_bound
 from .column_forest import ColumnForest
 from .evaluation import evaluate_pairs
@@ -111,13 +111,17 @@ class SampledRows:
             dr.eval(self.sums)
 
     def balance(self) -> None:
-        """Scale rows to the same sum, those darker than ``_DARK_FLOOR`` times the mean to less, so that clusters are
+        """Scale rows to the same sum, those darker than _DARK_FLOOR times the mean to less, so that clusters are
         judged by what they are to all points."""
-        total = download(self.values).reshape(self.count, -1).sum(1, dtype=np.float64)
-        level = np.maximum(total, _DARK_FLOOR * total.mean())
-        scale = upload(mi.Float, np.divide(1, level, out=np.zeros_like(level), where=level > 0))
-        for matrix, width in ((self.values, self.forest.columns), (self.sums, self.forest.size)):
-            matrix *= dr.gather(mi.Float, scale, dr.arange(mi.UInt32, dr.width(matrix)) // dr.opaque(mi.UInt32, width))
+        total = dr.block_sum(self.values, self.forest.columns)
+        # The mean over rows is 1
+        scale = dr.rcp(dr.maximum(total, _DARK_FLOOR))
+
+        def scaled(matrix, width: int):
+            row = dr.arange(mi.UInt32, dr.width(matrix)) // dr.opaque(mi.UInt32, width)
+            return matrix * dr.gather(mi.Float, scale, row)
+
+        self.values, self.sums = scaled(self.values, self.forest.columns), scaled(self.sums, self.forest.size)
         dr.eval(self.values, self.sums)
 
 
