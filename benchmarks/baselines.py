@@ -1,11 +1,13 @@
-"""``mdlightcuts`` against ``lightcuts`` on every sample, and against the sum of all lights.
+"""``mdlightcuts`` and ``lightslice`` against ``lightcuts`` on every sample, and against the sum of all lights.
 
-    ./run -- python benchmarks/baselines.py [--scenes NAME ...] [--parts curve samples growth]
+    ./run -- python benchmarks/baselines.py [--scenes NAME ...] [--parts curve samples slices growth memory]
 
-curve    the error of both against the sum of all lights, at falling ``error``, with 1 and 9 samples a pixel.
-samples  16 samples a pixel: ``lightcuts`` at 1% on every sample, and ``mdlightcuts`` at the ``error`` that gives the
-         same mean absolute error of pixels, found by trying.
+curve    the error of all against the sum of all lights as their parameter goes on, with 1 and 9 samples a pixel.
+samples  16 samples a pixel: ``lightcuts`` at 1% on every sample, and the others with the parameter that gives the same
+         mean absolute error of pixels, found by trying; where none does, with what comes nearest.
+slices   the same for ``lightslice`` with 1 sample a pixel, four times as wide: as many gather points.
 growth   ``mdlightcuts`` at one ``error`` with 1, 4, 16 and 64 samples a pixel.
+memory   peak memory of ``lightslice`` at 1600×1200 with 600,000 VPLs and 800 columns, above that of the loaded scene.
 
 Errors are those of whole pixels, against the sum of all lights at all samples of a random subset of them. Same lights,
 same gather points, warm, 256 wide; times are medians of three interleaved runs of what a method does after lights,
@@ -15,6 +17,8 @@ their trees and gather points are there, which all methods share ("shared"); tho
 from __future__ import annotations
 
 import argparse
+import multiprocessing
+import resource
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,8 +37,36 @@ from vpl.evaluation import sum_all_lights  # noqa: E402
 DEPTH, VPLS, RUNS = 6, 200_000, 3
 # Points at which all lights are summed
 _EXACT_POINTS = 8000
-# How often, and how closely, the error bound that gives a wanted error is tried for
+# How often, and how closely, the parameter that gives a wanted error is tried for
 _TRIES, _NEAR = 5, 0.03
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What decides how good a method is: a property, a first guess of it, and its limits; the error goes as about its
+    ``power``-th power."""
+
+    name: str
+    guess: float
+    least: float
+    most: float
+    power: float
+
+    def show(self, value: float) -> str:
+        """A value as tables show it."""
+        return f"{self.name} {value:.2g}" if self.name == "error" else f"{self.name} {value}"
+
+    def rounded(self, value: float):
+        """A value within the limits, of the property's type."""
+        value = min(max(value, self.least), self.most)
+        return value if self.name == "error" else round(value)
+
+
+QUALITY = {
+    "lightcuts": Quality("error", 0.01, 1e-4, 0.5, 0.6),
+    "mdlightcuts": Quality("error", 0.01, 1e-4, 0.5, 0.6),
+    "lightslice": Quality("columns", 200, 8, 1600, -0.9),
+}
 
 
 @dataclass
@@ -100,16 +132,19 @@ class Problem:
         rmse, absolute = np.sqrt((difference**2).mean()), np.abs(difference).mean()
         return Found(seconds, rmse / self.mean, absolute / self.mean, rays, cut, stages)
 
-    def error_for(self, absolute: float, error: float) -> float:
-        """The ``error`` of ``mdlightcuts`` that came nearest to a mean absolute error; ``error``: a first guess."""
-        tried = []
+    def quality_for(self, method: str, absolute: float):
+        """The value of a method's parameter that came nearest to a mean absolute error."""
+        quality = QUALITY[method]
+        value, tried = quality.rounded(quality.guess), []
         for _ in range(_TRIES):
-            reached = self.shade(self.plugin("mdlightcuts", error=error)).absolute
-            tried.append((abs(np.log(reached / absolute)), error))
+            reached = self.shade(self.plugin(method, **{quality.name: value})).absolute
+            tried.append((abs(np.log(reached / absolute)), value))
             if tried[-1][0] < _NEAR:
                 break
-            # It grows as about the 0.6th power of the bound
-            error *= float(np.clip((absolute / reached) ** (1 / 0.6), 0.2, 5))
+            step = float(np.clip((absolute / reached) ** (1 / quality.power), 0.2, 5))
+            value = quality.rounded(value * step)
+            if any(value == before for _, before in tried):
+                break
         return min(tried)[1]
 
 
@@ -122,51 +157,65 @@ def curves(names, options) -> None:
     print(
         f"\n## error against the sum of all lights (width {options.width}, {VPLS} VPLs, max_depth {DEPTH}, no max_cut)"
     )
-    print("scene | samples | method | error: RMSE, mean absolute error, rays/px, s")
+    print("scene | samples | method | parameter: RMSE, mean absolute error, rays/px, s")
     for name in names:
         for samples in (1, 9):
             problem = Problem(name, samples, options.width)
-            for method in ("lightcuts", "mdlightcuts"):
-                shown = []
-                for error in (0.04, 0.02, 0.01, 0.005):
-                    plugin = problem.plugin(method, error=error, max_cut=0)
+            for method, quality in QUALITY.items():
+                shown, more = [], {"max_cut": 0} if quality.name == "error" else {}
+                for factor in (0.25, 0.5, 1, 2):
+                    value = quality.rounded(quality.guess * factor ** -np.sign(quality.power))
+                    plugin = problem.plugin(method, **{quality.name: value}, **more)
                     problem.shade(plugin)
                     found = problem.shade(plugin)
                     shown.append(
-                        f"{100 * error:g}%: {found.rmse:.4f}, {100 * found.absolute:.2f}%, {found.rays:.0f}, "
+                        f"{quality.show(value)}: {found.rmse:.4f}, {100 * found.absolute:.2f}%, {found.rays:.0f}, "
                         f"{found.seconds:.2f}"
                     )
                 print(f"{name} | {samples} | {method} | {' | '.join(shown)}", flush=True)
 
 
-def many_samples(names, options) -> None:
-    """Part "samples"."""
-    samples = options.samples
-    print(f"\n## {samples} samples a pixel, equal mean absolute error (width {options.width}, {VPLS} VPLs, warm)")
+def equal_errors(names, width: int, samples: int, methods) -> None:
+    """A table of ``lightcuts`` at 1% and of other methods at its mean absolute error."""
+    print(f"\n## {samples} samples a pixel, equal mean absolute error (width {width}, {VPLS} VPLs, warm)")
     print(
-        "scene | shared s | method | error | render s | rays/px | clusters or pairs/px | RMSE | mean absolute | speedup"
+        "scene | shared s | method | render s | rays/px | lights, clusters or pairs/px | RMSE | mean absolute | speedup"
     )
-    speedups = []
+    speedups: dict = {method: [] for method in methods}
     for name in names:
-        problem = Problem(name, samples, options.width)
+        problem = Problem(name, samples, width)
         target = problem.shade(problem.plugin("lightcuts")).absolute
-        errors = {"lightcuts": 0.01, "mdlightcuts": problem.error_for(target, 0.01)}
-        methods = {label: problem.plugin(label, error=error) for label, error in errors.items()}
-        runs: dict = {label: [] for label in methods}
+        chosen = {"lightcuts": 0.01} | {method: problem.quality_for(method, target) for method in methods}
+        plugins = {one: problem.plugin(one, **{QUALITY[one].name: value}) for one, value in chosen.items()}
+        runs: dict = {one: [] for one in plugins}
         for _ in range(RUNS):
-            for label, plugin in methods.items():
-                runs[label].append(problem.shade(plugin))
-        middle = {label: _median(found) for label, found in runs.items()}
-        for label, found in middle.items():
+            for one, plugin in plugins.items():
+                runs[one].append(problem.shade(plugin))
+        middle = {one: _median(found) for one, found in runs.items()}
+        for one, found in middle.items():
             speedup = middle["lightcuts"].seconds / found.seconds
             print(
-                f"{name} | {problem.shared:.2f} | {label} | {100 * errors[label]:.2g}% | {found.seconds:.2f} | "
+                f"{name} | {problem.shared:.2f} | {one}, {QUALITY[one].show(chosen[one])} | {found.seconds:.2f} | "
                 f"{found.rays:.0f} | {found.cut:.0f} | {found.rmse:.4f} | {100 * found.absolute:.2f}% | {speedup:.1f}",
                 flush=True,
             )
-        speedups.append(speedup)
-        print("  stages:", ", ".join(f"{stage} {spent:.2f}" for stage, spent in found.stages.items()), flush=True)
-    print(f"geometric mean of the speedups: {scenes.geometric_mean(speedups):.2f}")
+            if one in methods:
+                speedups[one].append(speedup)
+                print(
+                    "  stages:", ", ".join(f"{stage} {spent:.2f}" for stage, spent in found.stages.items()), flush=True
+                )
+    for method, found in speedups.items():
+        print(f"geometric mean of the speedups of {method}: {scenes.geometric_mean(found):.2f}")
+
+
+def many_samples(names, options) -> None:
+    """Part "samples"."""
+    equal_errors(names, options.width, options.samples, ("mdlightcuts", "lightslice"))
+
+
+def slices(names, options) -> None:
+    """Part "slices"."""
+    equal_errors(names, 4 * options.width, 1, ("lightslice",))
 
 
 def growth(names, options) -> None:
@@ -186,16 +235,36 @@ def growth(names, options) -> None:
         print(f"{name} | {' | '.join(shown)}", flush=True)
 
 
+def memory(names, options) -> None:
+    """Part "memory": every scene in a process of its own, which tells the most memory that it ever had."""
+    print("\n## lightslice at 1600×1200, 600 000 VPLs, 800 columns")
+    print("scene | peak above the loaded scene, GiB | peak, GiB | render s")
+    for name in names:
+        context = multiprocessing.get_context("spawn")
+        with context.Pool(1) as pool:
+            before, after, seconds = pool.apply(_render_large, (name,))
+        print(f"{name} | {(after - before) / 2**20:.2f} | {after / 2**20:.2f} | {seconds:.1f}", flush=True)
+
+
+def _render_large(name: str):
+    """(Peak memory after loading, peak memory after rendering, both in KiB, seconds)."""
+    scene = mi.load_file(str(scenes.scene_file(name)), resx=1600, resy=1200)
+    plugin = mi.load_dict({"type": "lightslice", "max_depth": DEPTH, "vpl_count": 600_000, "columns": 800})
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    _, seconds = scenes.timed(lambda: mi.render(scene, integrator=plugin, spp=1))
+    return before, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, seconds
+
+
 def main() -> None:
     """Parse the command line and run the parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(scenes.NAMES), choices=scenes.NAMES)
-    parser.add_argument("--parts", nargs="+", default=["curve", "samples", "growth"])
+    parser.add_argument("--parts", nargs="+", default=["curve", "samples", "slices", "growth", "memory"])
     parser.add_argument("--width", type=int, default=256, help="pixels (default: 256)")
     parser.add_argument("--samples", type=int, default=16, help="samples a pixel of part samples (default: 16)")
     options = parser.parse_args()
     names = scenes.available(options.scenes)
-    parts = {"curve": curves, "samples": many_samples, "growth": growth}
+    parts = {"curve": curves, "samples": many_samples, "slices": slices, "growth": growth, "memory": memory}
     for part in options.parts:
         parts[part](names, options)
 
