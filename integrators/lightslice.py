@@ -13,13 +13,17 @@ from vpl.evaluation import sum_lights
 from vpl.light_matrix import DeviceForest, NearRows, SampledRows
 from vpl.morton import interleave
 from vpl.point_clusters import PointClusters
-from vpl.slice_columns import SliceLights, shared_columns, slice_lights
-from vpl.slices import build_slices, six_dimensional
+from vpl.sampling import derived_seed
+from vpl.slice_columns import SliceLights, shared_columns, slice_lights, slice_places
+from vpl.slices import build_slices
 
 from . import properties
 from .common import ManyLightIntegrator, Shaded, Shading
 from .gathering import Clock
 from .manual import manual_page
+
+# Lights of every point that one kernel adds up; between kernels the render may be stopped
+_COLUMNS_PER_KERNEL = 256
 
 
 @manual_page
@@ -45,7 +49,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
      * - shared_columns
        - |int|
        - Most clusters of lights that all slices together tell apart; what is sampled at one point of each slice are
-         these. The largest number of lights makes every light a column, as in the paper. (Default: 8192)
+         these, in 12 bytes for each. As many as there are lights is what the paper does. (Default: 8192)
 
      * - neighbours
        - |int|
@@ -112,25 +116,22 @@ class LightSliceIntegrator(ManyLightIntegrator):
 
     def shade(self, job: Shading) -> Shaded:
         """Slices, the lights of each, and what these send to its points, for one batch."""
-        clock = Clock()
-        turn = self._turns(job)
-        slices = max(round(self.slices * job.share), 1)
-        build = partial(build_slices, slices=slices, seed=job.seed, rank=turn)
-        clusters = PointClusters(job.batch, build)
+        clock, turn = Clock(), self._turns(job)
+        slices, seeds = max(round(self.slices * job.share), 1), [derived_seed(job.seed, k) for k in range(4)]
+        clusters = PointClusters(job.batch, partial(build_slices, slices=slices, seed=seeds[0], rank=turn))
         tree = clusters.tree
         first, size = (of_node[tree.leaves].astype(np.int64) for of_node in (tree.first, tree.count))
         # A row of the light matrix is sampled at one random point of each slice
-        points = first + (np.random.default_rng(job.seed).random(len(size)) * size).astype(np.int64)
+        points = first + (np.random.default_rng(seeds[1]).random(len(size)) * size).astype(np.int64)
         clock.lap("slices")
         forest, rays, bounds = shared_columns(
-            job.scene, job.traits, job.lights, clusters, points, self.shared_columns, job.seed
+            job.scene, job.traits, job.lights, clusters, points, self.shared_columns, seeds[2]
         )
         clock.lap("shared_columns")
         rows = SampledRows(job.scene, job.traits, clusters.batch, DeviceForest(forest, job.lights), points)
         clock.lap("rows")
-        place = six_dimensional(download(clusters.batch.position), download(mi.Vector3f(clusters.batch.normal)))
-        near = NearRows.nearest(place[points], self.neighbours)
-        chosen = slice_lights(rows, near, clusters, self.columns, self.unseen, self.sets, job.seed)
+        near = NearRows.nearest(slice_places(clusters), self.neighbours)
+        chosen = slice_lights(rows, near, clusters, self.columns, self.unseen, self.sets, seeds[3])
         clock.lap("columns")
         entry = upload(mi.UInt32, turn[tree.order] * rows.count + np.repeat(np.arange(rows.count), size))
         radiance, traced, columns = self._light(job, clusters, chosen, entry)
@@ -156,14 +157,18 @@ class LightSliceIntegrator(ManyLightIntegrator):
         radiance = dr.zeros(mi.UnpolarizedSpectrum, clusters.count)
         traced, columns = dr.zeros(mi.UInt32, clusters.count), dr.zeros(mi.UInt32, clusters.count)
         for lights in chosen:
-            if job.stopped():
-                break
             first, last = (dr.gather(mi.UInt32, ends, entry) for ends in (lights.first, lights.last))
-            value, rays = sum_lights(
-                job.scene, job.traits, job.lights, lights.group, clusters.batch.surfaces, first, last, lights.pick
-            )
-            radiance, traced, columns = radiance + value, traced + rays, columns + last - first
-            dr.eval(radiance, traced, columns)
+            columns += last - first
+            dr.eval(first, last, columns)
+            for _ in range(0, self.columns, _COLUMNS_PER_KERNEL):
+                if job.stopped():
+                    break
+                end = dr.minimum(first + _COLUMNS_PER_KERNEL, last)
+                value, rays = sum_lights(
+                    job.scene, job.traits, job.lights, lights.group, clusters.batch.surfaces, first, end, lights.pick
+                )
+                radiance, traced, first = radiance + value, traced + rays, end
+                dr.eval(radiance, traced, first)
         return radiance, traced, columns
 
     def describe(self):

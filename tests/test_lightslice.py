@@ -1,5 +1,7 @@
 """The integrator ``lightslice``: slices, columns of the light matrix and their costs, and images against ``vpl``."""
 
+from types import SimpleNamespace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
+from scipy.spatial.distance import cdist
 
 from vpl import light_matrix
 from vpl.arrays import download, upload
@@ -176,6 +179,36 @@ def sampled(job, slices, shared=10**9):
     return clusters, SampledRows(job.scene, job.traits, clusters.batch, forest, points), points
 
 
+def column_of_each_light(forest, every):
+    """For every light along the trees, the column of a coarser forest that holds it."""
+    place = {(group, node): k for k, (group, node) in enumerate(zip(every.group, every.node, strict=True))}
+    whole = [place[key] for key in zip(forest.group[forest.columns], forest.node[forest.columns], strict=True)]
+    return np.repeat(np.arange(len(whole)), every.last[whole] - every.first[whole])
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_value_that_is_not_finite_counts_as_none(monkeypatch, bad):
+    """And spoils neither its row nor the others."""
+    job = prepared(glossy_room(), vpl_count=100)[1][0]
+    good = sampled(job, 6)[1]
+    evaluate, calls = light_matrix.evaluate_pairs, []
+
+    def spoilt(*given):
+        value, traced = evaluate(*given)
+        calls.append(0)
+        lane = dr.arange(mi.UInt32, dr.width(value))
+        return dr.select(lane == 5, mi.UnpolarizedSpectrum(bad, 0.5, 0.5), value), traced
+
+    monkeypatch.setattr(light_matrix, "evaluate_pairs", spoilt)
+    clusters, rows, _ = sampled(job, 6)
+    assert calls
+    near, leaves = NearRows.nearest(np.random.default_rng(0).random((6, 6)), 3), upload(mi.UInt32, clusters.tree.leaves)
+    weights = ColumnWeights(rows, near, clusters, leaves, 1.0)
+    assert all(np.isfinite(download(x)).all() for x in (rows.values, rows.sums, weights.cumulative, weights.cost))
+    ratio = download(rows.values) / rows.scale - download(good.values) / good.scale
+    assert np.count_nonzero(np.abs(ratio) > 1e-5 * np.abs(download(good.values)).max()) <= 2 * len(calls)
+
+
 def test_weights_and_costs_are_what_they_are_said_to_be(monkeypatch):
     monkeypatch.setattr(light_matrix, "ENTRIES", 4000)  # so that there are several chunks
     job = prepared(glossy_room(), vpl_count=300, direct="vpl", direct_count=64)[1][0]
@@ -204,24 +237,31 @@ def test_weights_and_costs_are_what_they_are_said_to_be(monkeypatch):
         assert np.allclose(cost[k], expected, rtol=1e-3, atol=1e-5 * expected.max())
 
 
-def test_no_column_that_can_arrive_has_a_weight_of_zero():
-    """Whatever rows saw: here none saw anything, and then one that is not near."""
-    job = prepared(glossy_room(), vpl_count=300, direct="vpl", direct_count=64)[1][0]
-    clusters, rows, _ = sampled(job, 5)
+@pytest.mark.parametrize("batch", [0, 1])
+@pytest.mark.parametrize("shared", [30, 10**9])
+@pytest.mark.parametrize("clamping", [0.01, 0.0])
+def test_no_column_that_can_arrive_has_a_weight_of_zero(batch, shared, clamping):
+    """Whatever rows saw: here something, and then nothing."""
+    job = prepared(glossy_room(), vpl_count=300, direct="vpl", direct_count=64, clamping=clamping)[1][batch]
+    clusters, rows, _ = sampled(job, 5, shared)
+    every = DeviceForest(fine_forest(job.lights, 10**9), job.lights)
     near = NearRows.nearest(np.random.default_rng(0).random((5, 6)), 2)
     leaves = upload(mi.UInt32, clusters.tree.leaves)
     points = np.arange(0, clusters.count, clusters.count // 40)
     light = [
-        download(SampledRows(job.scene, job.traits, clusters.batch, rows.forest, points[k : k + 1]).values)
+        download(SampledRows(job.scene, job.traits, clusters.batch, every, points[k : k + 1]).values)
         for k in range(len(points))
     ]
+    column = column_of_each_light(rows.forest.forest, every.forest)
     slice_of = np.repeat(np.arange(5), clusters.tree.count[clusters.tree.leaves])[points]
     for seen in (1.0, 0.0):
         rows.values *= seen
         rows.sums *= seen
+        rows.dark = seen == 0
         weights = ColumnWeights(rows, near, clusters, leaves, 0.01)
         found = np.diff(download(weights.cumulative)).reshape(5, -1)
-        assert all((found[s][values > 0] > 0).all() for s, values in zip(slice_of, light, strict=True))
+        assert np.isfinite(found).all()
+        assert all((found[s][column[values > 0]] > 0).all() for s, values in zip(slice_of, light, strict=True))
 
 
 @pytest.mark.parametrize("direct", ["nee", "vpl"])
@@ -276,9 +316,7 @@ def test_a_light_of_a_node_is_drawn_by_intensity(place):
 def test_near_rows_are_the_nearest_and_their_own():
     places = np.random.default_rng(0).random((1100, 6))
     near = NearRows.nearest(places, 5)
-    distance = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=2) * 0
-    for axis in range(6):
-        distance += (places[:, None, axis] - places[None, :, axis]) ** 2
+    distance = cdist(places, places)
     assert np.array_equal(np.sort(near.rows, axis=1), np.sort(np.argsort(distance, axis=1)[:, :5], axis=1))
     own = near.rows == np.arange(1100)[:, None]
     assert (own.sum(1) == 1).all() and np.allclose(near.relevance[own], 1)
@@ -361,6 +399,19 @@ def test_samples_of_a_pixel_take_turns_with_the_lights_of_a_cluster():
     assert errors[1] < 0.5 * errors[0]
 
 
+@pytest.mark.parametrize(("samples", "sets"), [(1, 16), (4, 16), (4, 3), (16, 16), (1, 1)])
+def test_pixels_of_a_block_and_their_samples_take_all_sets(samples, sets):
+    plugin = mi.load_dict({"type": NAME, "sets": sets})
+    grid = SimpleNamespace(samples=samples, width=12)
+    job = SimpleNamespace(ray=dr.arange(mi.UInt32, 12 * 8 * samples), grid=grid)
+    turn = plugin._turns(job).reshape(8, 12, samples)
+    assert all(len(np.unique(of_pixel)) == min(samples, sets) for of_pixel in turn.reshape(-1, samples))
+    blocks = turn.reshape(2, 4, 3, 4, samples).transpose(0, 2, 1, 3, 4).reshape(6, -1)
+    assert all(np.array_equal(np.unique(block), np.arange(min(sets, 16 * samples))) for block in blocks)
+    counts = np.stack([np.bincount(block, minlength=sets) for block in blocks])
+    assert counts.max() - counts.min() <= 1
+
+
 def test_columns_are_counted_and_rays_include_those_of_rows():
     scene = mi.load_dict(closed_box({"lamp": area_light()}, size=24))
     given = {"vpl_count": 3000, "max_depth": 5, "columns": 30, "slices": 20, "shared_columns": 500}
@@ -416,7 +467,7 @@ def test_rows_that_see_nothing_leave_the_choice_to_bounds():
     assert np.allclose(image, render(scene, "vpl", 4, **given), rtol=1e-4)
 
 
-def test_clusters_of_rows_that_coincide_are_one():
+def test_points_that_coincide_are_one_slice():
     """Points without any extent: one slice, whatever is asked for."""
     position, normal = np.zeros((50, 3), np.float32), np.tile(np.float32([0, 0, 1]), (50, 1))
     tree = PointClusters(batch_of(position, normal), lambda p, n: build_slices(p, n, 8)).tree

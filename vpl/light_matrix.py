@@ -20,12 +20,15 @@ from .column_forest import ColumnForest
 from .evaluation import evaluate_pairs
 from .gather import SceneTraits
 from .light_set import LightSet
+from .lights import finite_or_zero
 from .point_clusters import PointClusters
 from .sampling import running_sums
 from .surfaces import Batch
 
 # Entries of a matrix that are worked on at a time
 ENTRIES = 1 << 23
+# What a bound counts for at most, relative to the light that was seen; and what float32 still squares or adds up
+_BOUND_LIMIT, _LARGEST = 10.0, 1e30
 # Rows that are darker than this fraction of the mean count for less
 _DARK_FLOOR = 0.5
 
@@ -77,8 +80,8 @@ class DeviceForest:
 class SampledRows:
     """Some rows of the matrix, evaluated, in units of their mean sum, so that squares neither overflow nor vanish.
 
-    ``scale``: one over that mean; ``values``: Float, row by row; ``sums``: Float, of the columns of every node, row by
-    row; ``rays``: shadow rays that were traced for them.
+    ``scale``: one over that mean, or 1 where they are ``dark``, without any light; ``values``: Float, row by row;
+    ``sums``: Float, of the columns of every node, row by row; ``rays``: shadow rays that were traced for them.
     """
 
     def __init__(self, scene, traits: SceneTraits, batch: Batch, forest: DeviceForest, points: np.ndarray):
@@ -90,7 +93,8 @@ class SampledRows:
             surface = batch.surfaces_at(dr.gather(mi.UInt32, index, row))
             light, scale = group.representatives(node)
             value, traced = evaluate_pairs(scene, traits, forest.lights, group, surface, light, scale)
-            value, traced = channel_mean(value), dr.select(traced, mi.UInt32(1), 0)
+            # One value that is not finite would spoil the sums of all that follow
+            value, traced = channel_mean(finite_or_zero(value)), dr.select(traced, mi.UInt32(1), 0)
             dr.eval(value, traced)
             self.rays += int(dr.sum(mi.UInt64(traced))[0])
             return value
@@ -98,7 +102,8 @@ class SampledRows:
         self.values = forest.fill(self.count, entry)
         mean = float(dr.sum(dr.float64_array_t(mi.Float)(self.values))[0]) / self.count
         # The inverse of the least of numbers is not finite
-        self.scale = 1 / mean if mean > np.finfo(np.float32).tiny else 1.0
+        self.dark = mean <= np.finfo(np.float32).tiny
+        self.scale = 1.0 if self.dark else 1 / mean
         self.values *= dr.opaque(mi.Float, self.scale)
         dr.eval(self.values)
         self.sums = dr.empty(mi.Float, self.count * forest.size)
@@ -111,8 +116,8 @@ class SampledRows:
             dr.eval(self.sums)
 
     def balance(self) -> None:
-        """Scale rows to the same sum, those darker than _DARK_FLOOR times the mean to less, so that clusters are
-        judged by what they are to all points."""
+        """Scale rows to the same sum of 1, those darker than _DARK_FLOOR times the mean to less, so that clusters are
+        judged by what they are to all points; ``scale`` remains what it was."""
         total = dr.block_sum(self.values, self.forest.columns)
         # The mean over rows is 1
         scale = dr.rcp(dr.maximum(total, _DARK_FLOOR))
@@ -175,12 +180,14 @@ class NearRows:
 class ColumnWeights:
     """What every column counts, and what every cluster of them costs, for some groups of gather points.
 
-    ``cumulative``: float64, the running sums of the weights of the columns, group by group, each of which adds 1:
-    lights are drawn with probabilities proportional to weights.  ``cost``: Float, group by group, of every node.
+    ``cumulative``: float64, the running sums of the weights of the columns, group by group, each of which adds 1, or 0
+    if nothing can arrive: lights are drawn with probabilities proportional to weights.  ``cost``: Float, of every node,
+    group by group.
 
     ``near``: the sampled rows that tell about each group; ``clusters``, ``nodes`` (UInt32): the groups as nodes of a
     point tree.  ``unseen``: how much goes by upper bounds, relative to what goes by sampled rows: a light that no row
-    saw may yet be seen.  A bound counts for no more than all light that was seen.
+    saw may yet be seen.  A bound counts for no more than _BOUND_LIMIT times all light that was seen, or all that rows
+    see on average: those of boxes with a light inside would leave nothing to the others.
     """
 
     def __init__(self, sampled: SampledRows, near: NearRows, clusters: PointClusters, nodes, unseen: float):
@@ -189,7 +196,7 @@ class ColumnWeights:
         self._nearby = dr.opaque(mi.UInt32, near.rows.shape[1])
         bounds = self._bounds(clusters, nodes, dr.opaque(mi.Float, sampled.scale))
         norms = dr.sqrt(self._squares(sampled.values, self._forest.columns))
-        self.cumulative, scale = self._weigh(norms, bounds, unseen)
+        self.cumulative, scale = self._weigh(norms, bounds, unseen, sampled.dark)
         total = self._forest.node_sums(self.cumulative, self.groups)
         group = dr.arange(mi.UInt32, dr.width(total)) // dr.opaque(mi.UInt32, self._forest.size)
         scale = dr.gather(mi.Float, mi.Float(scale), group)
@@ -204,7 +211,9 @@ class ColumnWeights:
 
         def entry(group, node, row):
             receiver = clusters.gather(dr.gather(mi.UInt32, nodes, row)).receiver
-            return scale * contribution_bound(group.kind, receiver, group.tree.gather(node), clamp)
+            bound = scale * contribution_bound(group.kind, receiver, group.tree.gather(node), clamp)
+            # Without clamping some are infinite
+            return dr.select(bound > 0, dr.minimum(bound, _LARGEST), 0)
 
         return self._forest.fill(self.groups, entry)
 
@@ -221,7 +230,7 @@ class ColumnWeights:
             k += 1
         return total
 
-    def _weigh(self, norms, bounds, unseen: float):
+    def _weigh(self, norms, bounds, unseen: float, dark: bool):
         """(Running sums of the weights, scaled to 1 for each group; what they were scaled by, float64 per group)."""
         precise = dr.float64_array_t(mi.Float)
         columns = dr.opaque(mi.UInt32, self._forest.columns)
@@ -230,9 +239,12 @@ class ColumnWeights:
         def total(values):
             return dr.block_sum(precise(values), self._forest.columns)
 
-        seen, finite = total(norms), total(dr.select(dr.isfinite(bounds), bounds, 0))
-        # Where no row saw anything, bounds decide alone; without clamping some are infinite
-        most = dr.select(seen > 0, seen, dr.select(finite > 0, finite, 1))
+        seen = total(norms)
+        if dark:
+            finite = total(dr.select(bounds < _LARGEST, bounds, 0))
+            most = dr.select(finite > 0, finite, 1)
+        else:
+            most = dr.maximum(_BOUND_LIMIT * seen, 1)
         bounds = dr.minimum(bounds, mi.Float(dr.gather(precise, most, group)))
         possible = total(bounds)
         share = dr.select(seen > 0, dr.opaque(precise, unseen) * seen, 1) / dr.select(possible > 0, possible, 1)

@@ -34,6 +34,8 @@ from .clustering import (
     require_rows,
 )
 
+# Factor of the squared angular term of the metric: a quarter of the scene's diagonal, squared
+ANGULAR_WEIGHT = 1 / 16
 # Columns of LightTree.records
 BOX_MIN, BOX_MAX, CONE_AXIS, CONE_COS = slice(0, 3), slice(3, 6), slice(6, 9), 9
 INTENSITY, FLUX, ESCAPE, REPRESENTATIVE = 10, slice(11, 14), 14, 15
@@ -69,7 +71,7 @@ class LightTree:
         return self.records.view(np.uint32)[:, REPRESENTATIVE]
 
 
-def build_light_tree(position, direction, flux, rng, window=16, angular_weight=1 / 16) -> LightTree:
+def build_light_tree(position, direction, flux, rng, window=16, angular_weight=ANGULAR_WEIGHT) -> LightTree:
     """Cluster lights into a binary tree; the module's docstring says how.
 
     position: (n, 3) float32, world units; None for lights at infinity, which cluster by direction alone.
@@ -92,7 +94,7 @@ def build_light_tree(position, direction, flux, rng, window=16, angular_weight=1
     return _assemble(order, rounds, position, direction, flux, rng)
 
 
-def cluster_sizes(records: np.ndarray, angular_weight: float = 1 / 16) -> np.ndarray:
+def cluster_sizes(records: np.ndarray) -> np.ndarray:
     """Cluster size [LC, section 5] of every node of a tree, (m,) float64, from its records, (m, 16).
 
     In units of the squared diagonal of all lights, or of angles where lights have no places.
@@ -100,7 +102,7 @@ def cluster_sizes(records: np.ndarray, angular_weight: float = 1 / 16) -> np.nda
     diagonal2 = np.square(records[:, BOX_MAX].astype(np.float64) - records[:, BOX_MIN]).sum(1)
     angular = np.square(1 - records[:, CONE_COS].astype(np.float64))
     if diagonal2[0] > 0:
-        angular = angular_weight * angular + diagonal2 / diagonal2[0]
+        angular = ANGULAR_WEIGHT * angular + diagonal2 / diagonal2[0]
     return records[:, INTENSITY] * angular
 
 

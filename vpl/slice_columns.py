@@ -27,6 +27,7 @@ from .light_set import LightGroup, LightSet
 from .light_tree import ESCAPE, cluster_sizes
 from .point_clusters import PointClusters
 from .sampling import derived_seed, find_interval, independent_sampler
+from .slices import six_dimensional
 
 # For each column that all slices share: clusters that were compared; and of all slices, those whose rows decided
 _FINE, _DECIDING = 8, 1 / 8
@@ -80,6 +81,12 @@ def shared_columns(
     return fine.pruned(download(weights.cost), most), rows.rays, forest.columns
 
 
+def slice_places(clusters: PointClusters) -> np.ndarray:
+    """Where slices are, and where they face, as :func:`vpl.slices.six_dimensional` has it: (slices, 6)."""
+    receiver = clusters.gather(upload(mi.UInt32, clusters.tree.leaves)).receiver
+    return six_dimensional(download(receiver.position), download(receiver.normal))
+
+
 def slice_lights(
     rows: SampledRows, near: NearRows, clusters: PointClusters, columns: int, unseen: float, sets: int, seed: int
 ) -> list[SliceLights]:
@@ -88,6 +95,7 @@ def slice_lights(
     ``rows``: one for each slice, ``near``: which of them tell about each; ``unseen``: see :class:`ColumnWeights`.
     """
     forest, leaves = rows.forest, upload(mi.UInt32, clusters.tree.leaves)
+    columns = min(columns, forest.columns)
     chosen = _Chosen(rows.count, max(columns, len(forest.forest.roots)), sets)
     for first, last in chunks(rows.count, forest.size):
         part = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
@@ -136,58 +144,64 @@ class _Chosen:
 
     def draw_columns(self, forest: DeviceForest, weights: ColumnWeights, first: int, seed: int) -> None:
         """A column of every cluster of some consecutive slices in each set, drawn by weight."""
-        count = weights.groups * self.most
-        lane = dr.arange(mi.UInt32, self.sets * count)
-        inside = lane % dr.opaque(mi.UInt32, count)
-        row = inside // dr.opaque(mi.UInt32, self.most)
-        place = inside + dr.opaque(mi.UInt32, first * self.most)
-        piece = row + dr.opaque(mi.UInt32, first)
-        active = place - piece * dr.opaque(mi.UInt32, self.most) < dr.gather(mi.UInt32, self.used, piece)
-        node = dr.gather(mi.UInt32, self.node, place, active)
-        start = row * dr.opaque(mi.UInt32, forest.columns)
-        low, high = (start + dr.gather(mi.UInt32, ends, node, active) for ends in (forest.first, forest.last))
-        sums = weights.cumulative
-
-        def rise(begin, end):
-            return dr.gather(type(sums), sums, end, active) - dr.gather(type(sums), sums, begin, active)
-
-        sample = independent_sampler(seed, self.sets * count).next_1d()
-        chosen = find_interval(sums, low, high, sample)
-        target = place + lane // dr.opaque(mi.UInt32, count) * dr.opaque(mi.UInt32, self.places)
-        dr.scatter(self.column, chosen - start, target, active)
-        dr.scatter(self.scale, mi.Float(rise(low, high) / rise(chosen, chosen + 1)), target, active)
-        dr.eval(self.column, self.scale)
+        count, most, sums = weights.groups * self.most, dr.opaque(mi.UInt32, self.most), weights.cumulative
+        for begin, end in chunks(self.sets, count):
+            lane = dr.arange(mi.UInt32, (end - begin) * count)
+            inside, number = lane % dr.opaque(mi.UInt32, count), lane // dr.opaque(mi.UInt32, count)
+            row, place = inside // most, inside + dr.opaque(mi.UInt32, first * self.most)
+            active = inside % most < dr.gather(mi.UInt32, self.used, row + dr.opaque(mi.UInt32, first))
+            node = dr.gather(mi.UInt32, self.node, place, active)
+            start = row * dr.opaque(mi.UInt32, forest.columns)
+            low, high = (start + dr.gather(mi.UInt32, ends, node, active) for ends in (forest.first, forest.last))
+            sample = _precise_sample(derived_seed(seed, begin), (end - begin) * count)
+            chosen = find_interval(sums, low, high, sample)
+            whole, own = (
+                dr.gather(type(sums), sums, last, active) - dr.gather(type(sums), sums, one, active)
+                for one, last in ((low, high), (chosen, chosen + 1))
+            )
+            target = place + (number + dr.opaque(mi.UInt32, begin)) * dr.opaque(mi.UInt32, self.places)
+            dr.scatter(self.column, chosen - start, target, active)
+            # Rounding may pick a column without weight, where nothing arrives
+            dr.scatter(self.scale, mi.Float(dr.select(own > 0, whole / own, 0)), target, active)
+            dr.eval(self.column, self.scale)
 
     def lights(self, forest: DeviceForest, seed: int) -> list[SliceLights]:
         """For every group of lights: of each column that was drawn, a light by intensity."""
         used = np.arange(self.most) < download(self.used)[:, None]
         group = forest.forest.group[download(self.node)].reshape(used.shape)
-        light, scale = dr.zeros(mi.UInt32, len(self.column)), mi.Float(self.scale)
-        begin, found = np.arange(self.slices) * self.most, []
-        shift = np.arange(self.sets)[:, None] * self.places
+        light, found = dr.zeros(mi.UInt32, len(self.column)), []
+        dr.eval(light)
+        begin, shift = np.arange(self.slices) * self.most, np.arange(self.sets)[:, None] * self.places
         for number, one in enumerate(forest.lights.groups):
             # The clusters of a slice stand in the order of the groups
             end = begin + (used & (group == number)).sum(1)
-            place = dr.arange(mi.UInt32, len(self.column)) % dr.opaque(mi.UInt32, self.places)
-            piece = place // dr.opaque(mi.UInt32, self.most)
-            low, high = (dr.gather(mi.UInt32, upload(mi.UInt32, ends), piece) for ends in (begin, end))
-            active = (place >= low) & (place < high)
-            node = dr.gather(mi.UInt32, forest.node, self.column, active)
-            sample = _precise_sample(derived_seed(seed, number), len(self.column))
-            drawn, total = _drawn_lights(one.tree, node, sample, active)
-            factor = total / channel_mean(one.lights.gather(drawn, active).intensity)
-            light, scale = dr.select(active, drawn, light), dr.select(active, scale * factor, scale)
-            dr.eval(light, scale)
-            found.append((one, upload(mi.UInt32, begin + shift), upload(mi.UInt32, end + shift)))
+            first, last = (upload(mi.UInt32, ends + shift) for ends in (begin, end))
+            for low, high in chunks(self.sets, self.places):
+                self._draw_lights(forest, one, first, last, light, (low, high), derived_seed(seed, number, low))
+            found.append(SliceLights(one, first, last, light, self.scale))
             begin = end
-        return [SliceLights(one, first, last, light, scale) for one, first, last in found]
+        return found
+
+    def _draw_lights(self, forest: DeviceForest, group: LightGroup, first, last, light, sets: tuple, seed: int) -> None:
+        """Replace the columns of a group by lights, and the factors by those on the intensities of these."""
+        lane = dr.arange(mi.UInt32, (sets[1] - sets[0]) * self.places) + dr.opaque(mi.UInt32, sets[0] * self.places)
+        piece = lane // dr.opaque(mi.UInt32, self.most)
+        active = (lane >= dr.gather(mi.UInt32, first, piece)) & (lane < dr.gather(mi.UInt32, last, piece))
+        node = dr.gather(mi.UInt32, forest.node, dr.gather(mi.UInt32, self.column, lane), active)
+        drawn, total = _drawn_lights(group.tree, node, _precise_sample(seed, dr.width(lane)), active)
+        factor = total / channel_mean(group.lights.gather(drawn, active).intensity)
+        scale = dr.gather(mi.Float, self.scale, lane) * factor
+        dr.eval(scale)
+        dr.scatter(light, drawn, lane, active)
+        dr.scatter(self.scale, scale, lane, active)
+        dr.eval(light, self.scale)
 
 
 def _precise_sample(seed: int, count: int):
-    """Uniform numbers of 48 bits in double precision."""
+    """Uniform numbers of 46 bits in double precision."""
     sampler = independent_sampler(seed, count)
     precise = dr.float64_array_t(mi.Float)
-    return precise(sampler.next_1d()) + precise(sampler.next_1d()) * 2.0**-24
+    return precise(sampler.next_1d()) + precise(sampler.next_1d()) * 2.0**-23
 
 
 @dr.syntax

@@ -1,6 +1,6 @@
 """Slices: groups of gather points that are near to each other and face alike, by splitting 6-D boxes (NumPy only) [LS].
 
-A point is its position and its normal, scaled by an eighth of the extent of all points. The box with the most points
+A point is its position and its normal, scaled by an eighth of the diagonal of all points. The box with the most points
 times its squared longest side is halved across that side, until there are as many boxes as wanted. A few dozen random
 points for each slice decide where; then all points go down the tree that resulted, whose leaves are the slices.
 
