@@ -241,11 +241,11 @@ class ColumnWeights:
 
         seen = total(norms)
         if dark:
-            finite = total(dr.select(bounds < _LARGEST, bounds, 0))
-            most = dr.select(finite > 0, finite, 1)
+            # Nothing tells which bounds are much
+            bounds = dr.select(bounds > 0, mi.Float(1), 0)
         else:
-            most = dr.maximum(_BOUND_LIMIT * seen, 1)
-        bounds = dr.minimum(bounds, mi.Float(dr.gather(precise, most, group)))
+            most = mi.Float(dr.maximum(_BOUND_LIMIT * seen, 1))
+            bounds = dr.minimum(bounds, dr.gather(mi.Float, most, group))
         possible = total(bounds)
         share = dr.select(seen > 0, dr.opaque(precise, unseen) * seen, 1) / dr.select(possible > 0, possible, 1)
         weights = precise(norms) + dr.gather(precise, share, group) * precise(bounds)
