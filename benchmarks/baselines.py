@@ -35,8 +35,6 @@ from vpl.arrays import download, upload  # noqa: E402
 from vpl.evaluation import sum_all_lights  # noqa: E402
 
 DEPTH, VPLS, RUNS = 6, 200_000, 3
-# Points at which all lights are summed
-_EXACT_POINTS = 8000
 # How often, and how closely, the parameter that gives a wanted error is tried for
 _TRIES, _NEAR = 5, 0.03
 
@@ -83,16 +81,16 @@ class Found:
 
 
 class Problem:
-    """Lights and gather points of a scene, and the exact light of some of its pixels."""
+    """Lights and gather points of a scene, and the exact light of as many of its pixels as have ``points`` samples."""
 
-    def __init__(self, name: str, samples: int, width: int):
+    def __init__(self, name: str, samples: int, width: int, points: int):
         self.settings = {"max_depth": DEPTH, "vpl_count": VPLS}
         self.scene, self.samples = scenes.load(name, width), samples
         self.pixels = width * scenes.height(name, width)
         rays = scenes.camera_rays(self.scene, 0, samples)
         plugin = self.plugin("lightcuts")
         self.prepared, self.shared = scenes.timed(lambda: plugin.prepare(self.scene, *rays))
-        pixels = np.random.default_rng(0).permutation(self.pixels)[: _EXACT_POINTS // samples]
+        pixels = np.random.default_rng(0).permutation(self.pixels)[: points // samples]
         self._place = np.full(self.pixels, -1)
         self._place[pixels] = np.arange(len(pixels))
         self._chosen = [self._rows_of(job) for job in self.prepared.jobs]
@@ -160,7 +158,7 @@ def curves(names, options) -> None:
     print("scene | samples | method | parameter: RMSE, mean absolute error, rays/px, s")
     for name in names:
         for samples in (1, 9):
-            problem = Problem(name, samples, options.width)
+            problem = Problem(name, samples, options.width, options.points)
             for method, quality in QUALITY.items():
                 shown, more = [], {"max_cut": 0} if quality.name == "error" else {}
                 for factor in (0.25, 0.5, 1, 2):
@@ -175,7 +173,7 @@ def curves(names, options) -> None:
                 print(f"{name} | {samples} | {method} | {' | '.join(shown)}", flush=True)
 
 
-def equal_errors(names, width: int, samples: int, methods) -> None:
+def equal_errors(names, width: int, samples: int, points: int, methods) -> None:
     """A table of ``lightcuts`` at 1% and of other methods at its mean absolute error."""
     print(f"\n## {samples} samples a pixel, equal mean absolute error (width {width}, {VPLS} VPLs, warm)")
     print(
@@ -183,7 +181,7 @@ def equal_errors(names, width: int, samples: int, methods) -> None:
     )
     speedups: dict = {method: [] for method in methods}
     for name in names:
-        problem = Problem(name, samples, width)
+        problem = Problem(name, samples, width, points)
         target = problem.shade(problem.plugin("lightcuts")).absolute
         chosen = {"lightcuts": 0.01} | {method: problem.quality_for(method, target) for method in methods}
         plugins = {one: problem.plugin(one, **{QUALITY[one].name: value}) for one, value in chosen.items()}
@@ -210,12 +208,12 @@ def equal_errors(names, width: int, samples: int, methods) -> None:
 
 def many_samples(names, options) -> None:
     """Part "samples"."""
-    equal_errors(names, options.width, options.samples, ("mdlightcuts", "lightslice"))
+    equal_errors(names, options.width, options.samples, options.points, ("mdlightcuts", "lightslice"))
 
 
 def slices(names, options) -> None:
     """Part "slices"."""
-    equal_errors(names, 4 * options.width, 1, ("lightslice",))
+    equal_errors(names, 4 * options.width, 1, options.points, ("lightslice",))
 
 
 def growth(names, options) -> None:
@@ -225,7 +223,7 @@ def growth(names, options) -> None:
     for name in names:
         base, shown = 0.0, []
         for samples in (1, 4, 16, 64):
-            problem = Problem(name, samples, options.width)
+            problem = Problem(name, samples, options.width, options.points)
             plugin = problem.plugin("mdlightcuts")
             problem.shade(plugin)
             found = _median([problem.shade(plugin) for _ in range(RUNS)])
@@ -262,6 +260,7 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", default=["curve", "samples", "slices", "growth", "memory"])
     parser.add_argument("--width", type=int, default=256, help="pixels (default: 256)")
     parser.add_argument("--samples", type=int, default=16, help="samples a pixel of part samples (default: 16)")
+    parser.add_argument("--points", type=int, default=8000, help="where all lights are summed (default: 8000)")
     options = parser.parse_args()
     names = scenes.available(options.scenes)
     parts = {"curve": curves, "samples": many_samples, "slices": slices, "growth": growth, "memory": memory}
