@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy import stats
 
 VARIANT = "llvm_ad_rgb"
 
@@ -73,3 +74,25 @@ def render(scene, integrator, spp=4, seed=0, **more):
     """Render to NumPy, (height, width, channels) float64."""
     plugin = mi.load_dict({"type": integrator, **more}) if isinstance(integrator, str) else integrator
     return np.array(mi.render(scene, integrator=plugin, spp=spp, seed=seed), dtype=np.float64)
+
+
+def relative_error(image, expected):
+    """Sum of absolute differences over the sum of what is expected."""
+    return np.abs(image - expected).sum() / expected.sum()
+
+
+def assert_same_mean_over_seeds(pairs, tiles=4, alpha=0.01):
+    """A t test, Šidák-corrected, on the differences of images that are paired, (ours, expected), one pair a seed.
+
+    Of the means over tiles and over the image, which are where bias shows.
+    """
+    excess = []
+    for found, every in pairs:
+        size = found.shape[0] // tiles
+        blocks = (found - every)[: size * tiles, : size * tiles].reshape(tiles, size, tiles, size, 3)
+        excess.append(np.append(blocks.mean((1, 3)).reshape(-1), (found - every).mean((0, 1))))
+    excess = np.array(excess)
+    noisy = excess.std(0) > 1e-6 * np.abs(every).mean()
+    assert noisy[-3:].all()
+    p_values = stats.ttest_1samp(excess[:, noisy], 0).pvalue
+    assert p_values.min() > 1 - (1 - alpha) ** (1 / noisy.sum())

@@ -11,7 +11,7 @@ from scipy import stats
 
 from vpl.arrays import download, upload
 
-from .conftest import area_light, closed_box, render, sensor, wall
+from .conftest import area_light, closed_box, relative_error, render, sensor, wall
 from .test_integrators import ODD_SCENES
 from .test_lightcuts import GLOSSY, many_kinds, prepared
 from .test_pairs import glossy_room
@@ -24,10 +24,6 @@ def rendered(scene, spp=1, seed=0, **more):
     """An image and the statistics of its render."""
     plugin = mi.load_dict({"type": NAME, **more})
     return render(scene, plugin, spp, seed), plugin.statistics
-
-
-def relative_error(image, expected):
-    return np.abs(image - expected).sum() / expected.sum()
 
 
 def counts(statistics):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
 from vpl import gather_tree
 from vpl.arrays import download, upload
@@ -17,7 +16,15 @@ from vpl.pairs import Pairs
 from vpl.pixel_cuts import PixelCuts
 from vpl.point_clusters import PointClusters
 
-from .conftest import area_light, closed_box, render, sensor, wall
+from .conftest import (
+    area_light,
+    assert_same_mean_over_seeds,
+    closed_box,
+    relative_error,
+    render,
+    sensor,
+    wall,
+)
 from .test_lightcuts import many_kinds
 from .test_pairs import batch_of, glossy_room
 
@@ -28,10 +35,6 @@ def rendered(scene, spp=1, seed=0, **more):
     """An image and the statistics of its render."""
     plugin = mi.load_dict({"type": NAME, **more})
     return render(scene, plugin, spp, seed), plugin.statistics
-
-
-def relative_error(image, expected):
-    return np.abs(image - expected).sum() / expected.sum()
 
 
 # ---- Gather trees
@@ -119,19 +122,11 @@ def test_the_mean_over_seeds_is_that_of_all_lights(make):
     scene = make()
     scene = mi.load_dict(scene) if isinstance(scene, dict) else scene
     given = {"vpl_count": 400, "max_depth": 4, "direct": "vpl", "direct_count": 64}
-    seeds, tiles = 24, 4
-    excess = []
-    for seed in range(seeds):
-        # So coarse a cut that representatives of points as well as lights matter everywhere
-        found, every = rendered(scene, 16, seed, error=0.3, **given)[0], render(scene, "vpl", 16, seed, **given)
-        size = found.shape[0] // tiles
-        blocks = (found - every)[: size * tiles, : size * tiles].reshape(tiles, size, tiles, size, 3)
-        excess.append(np.append(blocks.mean((1, 3)).reshape(-1), (found - every).mean((0, 1))))
-    excess = np.array(excess)
-    noisy = excess.std(0) > 1e-6 * np.abs(every).mean()
-    assert noisy[-3:].all()
-    p_values = stats.ttest_1samp(excess[:, noisy], 0).pvalue
-    assert p_values.min() > 1 - (1 - 0.01) ** (1 / noisy.sum())
+    # So coarse a cut that representatives of points as well as lights matter everywhere
+    cut = {"error": 0.3, **given}
+    assert_same_mean_over_seeds(
+        (rendered(scene, 16, seed, **cut)[0], render(scene, "vpl", 16, seed, **given)) for seed in range(24)
+    )
 
 
 @pytest.mark.parametrize("black", [False, True])

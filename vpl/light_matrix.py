@@ -161,7 +161,8 @@ class NearRows:
         """
         most = min(most, len(places))
         squares, rows, found = (places**2).sum(1), [], []
-        for part in np.array_split(np.arange(len(places)), -(-len(places) // 1024)):
+        for first, last in chunks(len(places), len(places)):
+            part = np.arange(first, last)
             distance2 = np.maximum(squares + squares[part, None] - 2 * places[part] @ places.T, 0)
             distance2[np.arange(len(part)), part] = -1
             rows.append(np.argpartition(distance2, most - 1, axis=1)[:, :most])
