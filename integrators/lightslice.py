@@ -79,8 +79,9 @@ class LightSliceIntegrator(ManyLightIntegrator):
 
     {what is estimated}
 
-    There is no bound on the error: it falls about as 1 / ``columns``. With few gather points to a slice (small images)
-    the sampled rows cost more than they save; take fewer slices.
+    There is no bound on the error. On diffuse surfaces it falls about as 1 / ``columns``; next to corners, and wherever
+    there is gloss, single pixels can be far too bright, because no sampled row was as near to a light or in its lobe.
+    With few gather points to a slice (small images) the sampled rows cost more than they save; take fewer slices.
 
     **Departures from the paper.** Clusters are nodes of the light trees, split where the sampled rows say that it
     matters most, instead of sets of columns divided by projections on lines; all lights of a shared column count as
