@@ -161,7 +161,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
             first, last = (dr.gather(mi.UInt32, ends, entry) for ends in (lights.first, lights.last))
             columns += last - first
             dr.eval(first, last, columns)
-            for _ in range(0, self.columns, _COLUMNS_PER_KERNEL):
+            for _ in range(0, int(download(lights.last - lights.first).max()), _COLUMNS_PER_KERNEL):
                 if job.stopped():
                     break
                 end = dr.minimum(first + _COLUMNS_PER_KERNEL, last)

@@ -96,3 +96,16 @@ def assert_same_mean_over_seeds(pairs, tiles=4, alpha=0.01):
     assert noisy[-3:].all()
     p_values = stats.ttest_1samp(excess[:, noisy], 0).pvalue
     assert p_values.min() > 1 - (1 - alpha) ** (1 / noisy.sum())
+
+
+def assert_property_is_refused(plugin, name, value):
+    """With an error that names the property and the value."""
+    with pytest.raises((ValueError, RuntimeError)) as error:
+        mi.load_dict({"type": plugin, name: value})
+    assert f'property "{name}" must be' in str(error.value) and f"got {value!r}" in str(error.value)
+
+
+def assert_properties_are_shown(plugin, given):
+    """With their values, in what the plugin prints as."""
+    text = str(mi.load_dict({"type": plugin, **given}))
+    assert all(f"{name} = {value}" in text for name, value in given.items())

@@ -18,6 +18,8 @@ from vpl.point_clusters import PointClusters
 
 from .conftest import (
     area_light,
+    assert_properties_are_shown,
+    assert_property_is_refused,
     assert_same_mean_over_seeds,
     closed_box,
     relative_error,
@@ -281,12 +283,9 @@ BAD = [
 
 @pytest.mark.parametrize(("name", "value"), BAD, ids=[f"{name}={value}" for name, value in BAD])
 def test_bad_properties_are_named_with_their_value(name, value):
-    with pytest.raises((ValueError, RuntimeError)) as error:
-        mi.load_dict({"type": NAME, name: value})
-    assert f'property "{name}" must be' in str(error.value) and f"got {value!r}" in str(error.value)
+    assert_property_is_refused(NAME, name, value)
 
 
 def test_properties_are_shown():
     given = {"error": 0.25, "dark_floor": 0.75, "max_cut": 77, "leaf_points": 3}
-    text = str(mi.load_dict({"type": NAME, **given}))
-    assert all(f"{name} = {value}" in text for name, value in given.items())
+    assert_properties_are_shown(NAME, given)

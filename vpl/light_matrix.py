@@ -54,10 +54,9 @@ class DeviceForest:
         arrays of one entry per lane, and returns what to store."""
         matrix = dr.empty(mi.Float, rows * self.columns)
         for group, (first, count) in zip(self.lights.groups, self.parts, strict=True):
-            step = max(ENTRIES // count, 1)
             width, columns = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, self.columns)
-            for begin in range(0, rows, step):
-                lane = dr.arange(mi.UInt32, min(step, rows - begin) * count)
+            for begin, end in chunks(rows, count):
+                lane = dr.arange(mi.UInt32, (end - begin) * count)
                 row, column = lane // width, lane % width + dr.opaque(mi.UInt32, first)
                 row += dr.opaque(mi.UInt32, begin)
                 value = entry(group, dr.gather(mi.UInt32, self.node, column), row)

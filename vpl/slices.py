@@ -6,7 +6,7 @@ points for each slice decide where; then all points go down the tree that result
 
 Departures from the paper: boxes are chosen by how far their points lie apart rather than by number alone, and halved in
 the middle rather than at the median, which at equal slices and columns gave three quarters of the error (cornell).
-A box whose middle divides nothing, for all its points coincide but for rounding, is divided by number.
+A box whose middle divides nothing, for all its points coincide but for rounding, is divided above the lowest of them.
 
 [LS] Ou and Pellacini 2011, LightSlice: matrix slice sampling for the many-lights problem.
 """
