@@ -15,7 +15,16 @@ import_drjit()
 
 import mitsuba as mi  # noqa: E402  (after the check that turns its import error into advice)
 
-PLUGINS = ("vpl", "lightcuts", "mdlightcuts", "lightslice", "illuminationcut", "adaptivedirect", "unoccludeddirect")
+PLUGINS = (
+    "vpl",
+    "lightcuts",
+    "mdlightcuts",
+    "lightslice",
+    "matrixrecovery",
+    "illuminationcut",
+    "adaptivedirect",
+    "unoccludeddirect",
+)
 _SUPPORTED = (
     "llvm_ad_rgb",
     "llvm_ad_mono",

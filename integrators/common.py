@@ -56,7 +56,7 @@ class Shaded:
 
     ``shadow_rays``, ``upper_bounds``, ``cut_size``: UInt32, or Float where several points share one; ``seconds``: time
     by stage; ``phase_one``: radiance that a first phase assumed, where the method has one; ``dropped``: values left out
-    because they were not finite.
+    because they were not finite; ``counts``: numbers for the statistics, which are added up over batches.
     """
 
     radiance: object
@@ -66,6 +66,7 @@ class Shaded:
     seconds: dict = field(default_factory=dict)
     phase_one: object = None
     dropped: int = 0
+    counts: dict = field(default_factory=dict)
 
 
 @dataclass
@@ -164,7 +165,8 @@ class ManyLightIntegrator(GatheringIntegrator):
                 total = totals.setdefault(name, dr.zeros(type(values), start.paths.points.count))
                 dr.scatter(total, values, job.batch.index)
             start.clock.split(part.seconds)
-            prepared.counts["dropped"] += part.dropped
+            for name, number in (part.counts | {"dropped": part.dropped}).items():
+                prepared.counts[name] = prepared.counts.get(name, 0) + number
         names = {"shadow_rays": "shadow_rays", "upper_bounds": "bound_computations", "cut_size": "cut_size"}
         found = {label: whole_sum(totals.get(name)) for name, label in names.items()}
         return radiance, totals, found | {"lights": {}, "light_paths": 0, "emitter_rays": 0} | prepared.counts

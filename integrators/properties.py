@@ -43,9 +43,9 @@ def choice(props, name: str, default: str, allowed: tuple[str, ...]) -> str:
     return value
 
 
-def words(props, name: str, allowed: tuple[str, ...]) -> tuple[str, ...]:
-    """A comma-separated list of words out of ``allowed``, each at most once; empty by default."""
-    value = props.get(name, "")
+def words(props, name: str, allowed: tuple[str, ...], default: str = "") -> tuple[str, ...]:
+    """A comma-separated list of words out of ``allowed``, each at most once; by default that of ``default``."""
+    value = props.get(name, default)
     found = [word.strip() for word in value.split(",")] if isinstance(value, str) and value.strip() else []
     if not isinstance(value, str) or any(word not in allowed for word in found) or len(set(found)) < len(found):
         _fail(props, name, "a comma-separated list out of " + ", ".join(f'"{word}"' for word in allowed), value)

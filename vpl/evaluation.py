@@ -25,7 +25,7 @@ def evaluate_pairs(scene, traits: SceneTraits, lights: LightSet, group: LightGro
     taken to arrive without a ray (None: none).  Returns (radiance with visibility, mask of the lanes whose ray was
     traced).
     """
-    value = _unoccluded(lights, group, surface, light) * scale
+    value = unoccluded(lights, group, surface, light) * scale
     arrives = dr.any(value > 0)
     traced = arrives if seen is None else arrives & ~seen
     passed = _visibility(scene, traits, group, surface, light, traced)
@@ -34,17 +34,20 @@ def evaluate_pairs(scene, traits: SceneTraits, lights: LightSet, group: LightGro
     return dr.select(arrives, value * passed, 0), traced
 
 
-def probe_visibility(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface: Surface, light):
+def probe_visibility(
+    scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface: Surface, light, active=True
+):
     """The fraction of light that arrives, (surface, light) pair by pair, where any would if nothing was between.
 
     Returns (fraction, mask of the lanes for which it was asked).
     """
-    traced = dr.any(_unoccluded(lights, group, surface, light) > 0)
+    traced = dr.any(unoccluded(lights, group, surface, light) > 0) & active
     # Always of several channels: all() and any() over those of one would run over the lanes
     return mi.UnpolarizedSpectrum(_visibility(scene, traits, group, surface, light, traced)), traced
 
 
-def _unoccluded(lights: LightSet, group: LightGroup, surface: Surface, light):
+def unoccluded(lights: LightSet, group: LightGroup, surface: Surface, light):
+    """What lights would send to surfaces if nothing was between, pair by pair."""
     allowed = lights.allowed(surface.depth, light.depth)
     return contribution(group.kind, surface, light, lights.smallest_distance, allowed)
 
