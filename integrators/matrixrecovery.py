@@ -116,9 +116,10 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
     (:mod:`vpl.slice_rows`). Clusters are split in rounds, and lend their samples to those beside them along the light
     tree (:mod:`vpl.reduced_columns`); ``alpha`` is a tenth of the paper's, with which slices have 200 columns here
     rather than its 700; ``density`` is 0.5 instead of 0.2, for errors lie denser here. Rows that are traced follow each
-    other by golden sections instead of being drawn at random (:mod:`vpl.visibility_samples`). Nearest rows are found by looking at all samples of a column, and the line of the
-    linear predictor lies in the slice's plane (:mod:`vpl.visibility_prediction`). A slice whose separation fails is
-    traced whole and counted. Lambertian points and all others are in slices of their own.
+    other by golden sections instead of being drawn at random (:mod:`vpl.visibility_samples`). Nearest rows are found by
+    looking at all samples of a column, and the line of the linear predictor lies in the slice's plane
+    (:mod:`vpl.visibility_prediction`). A slice whose separation fails is traced whole and counted. Lambertian points
+    and all others are in slices of their own.
 
     .. tabs::
         .. code-tab:: xml
@@ -178,10 +179,13 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
 
     def _light_slices(self, work: _Work, columns: Columns, slices: tuple[int, int], seed: int) -> None:
         """Light the points of some slices, given their initial columns."""
-        entries, count = work.entries, math.ceil(self.sampling * self.slice_rows)
+        entries, rows = work.entries, work.entries.rows.most
+        count = min(math.ceil(self.sampling * self.slice_rows), rows)
         columns, first = split_columns(entries, columns, self.alpha, self.max_columns, count, seed)
         work.lap("columns")
-        samples = VisibilitySamples(entries, columns, count * (self.rounds + 1), seed)
+        if not columns.count:
+            return
+        samples = VisibilitySamples(entries, columns, min(count * (self.rounds + 1), rows), seed)
         samples.resume(first)
         kinds = tuple(PREDICTORS[name] for name in self.predictors)
         rounds = self.rounds if self.prediction else 0
@@ -191,6 +195,8 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
             work.add(f"{name}_columns", int((best == kind).sum()))
         for begin, end in _chunks(entries, columns, slices):
             low, high = np.searchsorted(columns.piece, (begin, end))
+            if low == high:
+                continue
             block = MatrixBlock(entries, columns.select(np.arange(low, high)), begin, end)
             found = recover(block, predictors, best, int(low), self.options(), derived_seed(seed, 1, begin))
             dr.sync_thread()

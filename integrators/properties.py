@@ -44,10 +44,14 @@ def choice(props, name: str, default: str, allowed: tuple[str, ...]) -> str:
 
 
 def words(props, name: str, allowed: tuple[str, ...], default: str = "") -> tuple[str, ...]:
-    """A comma-separated list of words out of ``allowed``, each at most once; by default that of ``default``."""
+    """A comma-separated list of words out of ``allowed``, each at most once; by default that of ``default``.
+
+    An empty one is allowed where it is the default.
+    """
     value = props.get(name, default)
     found = [word.strip() for word in value.split(",")] if isinstance(value, str) and value.strip() else []
-    if not isinstance(value, str) or any(word not in allowed for word in found) or len(set(found)) < len(found):
+    known = all(word in allowed for word in found) and len(set(found)) == len(found)
+    if not isinstance(value, str) or not known or (default and not found):
         _fail(props, name, "a comma-separated list out of " + ", ".join(f'"{word}"' for word in allowed), value)
     return tuple(found)
 

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import channel_mean, upload
+from .arrays import channel_mean, download, upload
 from .evaluation import unoccluded
 from .light_set import LightGroup
 from .reduced_matrix import Columns, MatrixEntries
@@ -36,8 +36,7 @@ class MatrixBlock:
             node, light = (upload(mi.UInt32, values[index]) for values in (columns.node, columns.light))
             whole, own = trees[columns.group[index[0]]].summed_intensity(node), group.lights.gather(light).intensity
             ratio = whole / channel_mean(own)
-            dr.eval(ratio)
-            scale[index] = ratio.numpy()
+            scale[index] = download(ratio)
         self.scale, self.light = upload(mi.Float, scale), upload(mi.UInt32, columns.light)
 
     @property

@@ -86,7 +86,8 @@ def separate(whole, free, weight, shape: tuple[int, int, int], limits: Separatio
     width = min(limits.rank + _OVERSAMPLING, n, m)
     test = np.random.default_rng(seed).standard_normal((m, width)).astype(np.float32)
     norm = np.sqrt(np.square(matrices).sum((1, 2), dtype=np.float64))
-    active = np.flatnonzero(norm > 0)
+    # What is zero altogether has no errors
+    active = np.flatnonzero(np.isfinite(norm) & (norm > 0))
     rank, right, product = np.zeros(count, np.int64), [np.zeros((0, m))] * count, np.zeros(shape, np.float32)
 
     def begin(number):
@@ -116,7 +117,7 @@ def separate(whole, free, weight, shape: tuple[int, int, int], limits: Separatio
         history.append(residual)
         falls = residual < (1 - limits.progress) * before
         active = active[falls[active] & (residual[active] > limits.residual)]
-    failed = ~np.isfinite(residual) | (residual > np.maximum(first, limits.residual))
+    failed = ~np.isfinite(norm + residual) | (residual > np.maximum(first, limits.residual))
     return Separation(state.error, rank, iterations, failed, history)
 
 

@@ -124,6 +124,8 @@ class MatrixEntries:
 
     def columns_of(self, piece, group: int, node) -> Columns:
         """Columns with the representatives of some nodes."""
+        if not len(node):
+            return Columns.none()
         tree = self.lights.groups[group].tree
         light = download(tree.representative(upload(mi.UInt32, node))).astype(np.int64)
         return Columns(piece, np.full(len(node), group), node, light)

@@ -55,7 +55,7 @@ def build_row_slices(pixel: np.ndarray, most: int, position: np.ndarray, normal:
 
 
 def rows_of(pixel: np.ndarray, leaf: np.ndarray) -> np.ndarray:
-    """Where each row begins, and the number of points, (rows + 1,), from the pixels and leaves of points along a tree."""
+    """Where each row begins, and the number of points, (rows + 1,): from pixels and leaves of points along a tree."""
     begins = (pixel[1:] != pixel[:-1]) | (leaf[1:] != leaf[:-1])
     return np.concatenate([[0], np.flatnonzero(begins) + 1, [len(pixel)]])
 

@@ -61,6 +61,10 @@ class VisibilitySamples:
     @classmethod
     def first(cls, entries: MatrixEntries, columns: Columns, count: int, seed: int) -> FirstSamples:
         """The first ``count`` samples of columns."""
+        if not columns.count:
+            return FirstSamples(
+                np.zeros((0, count), np.uint32), np.zeros((0, count), np.float32), np.zeros(0, np.uint32)
+            )
         samples = cls(entries, columns, count, seed)
         index = np.arange(columns.count)
         rows = samples.draw(index, count)
