@@ -70,7 +70,7 @@ QUALITY = {
 @dataclass
 class Found:
     """One run: seconds of ``shade``; of pixels, relative to the image's mean: RMSE and mean absolute error; shadow rays
-    and clusters or pairs per pixel."""
+    and clusters or pairs per pixel; what the method counted."""
 
     seconds: float
     rmse: float
@@ -78,6 +78,7 @@ class Found:
     rays: float
     cut: float
     stages: dict
+    counts: dict
 
 
 class Problem:
@@ -119,34 +120,36 @@ class Problem:
     def shade(self, plugin) -> Found:
         """Shade all points with a plugin and compare the chosen pixels."""
         shaded, seconds = scenes.timed(lambda: [plugin.shade(job) for job in self.prepared.jobs])
-        values, rays, cut, stages = 0, 0.0, 0.0, {}
+        values, rays, cut, stages, counts = 0, 0.0, 0.0, {}, {}
         for (job, rows, _), part in zip(self._chosen, shaded, strict=True):
             values += self._of_pixels(job, rows, download(part.radiance)[rows])
             rays += float(download(part.shadow_rays).sum(dtype=np.float64)) / self.pixels
             cut += float(download(part.cut_size).sum(dtype=np.float64)) / self.pixels
-            for stage, spent in part.seconds.items():
-                stages[stage] = stages.get(stage, 0.0) + spent
+            for total, more in ((stages, part.seconds), (counts, part.counts)):
+                for name, number in more.items():
+                    total[name] = total.get(name, 0) + number
         difference = values - self._exact
         rmse, absolute = np.sqrt((difference**2).mean()), np.abs(difference).mean()
-        return Found(seconds, rmse / self.mean, absolute / self.mean, rays, cut, stages)
+        return Found(seconds, rmse / self.mean, absolute / self.mean, rays, cut, stages, counts)
 
-    def quality_for(self, method: str, absolute: float):
-        """The value of a method's parameter that came nearest to a mean absolute error."""
+    def quality_for(self, method: str, wanted: float, measure: str = "absolute"):
+        """The value of a method's parameter that came nearest to a mean absolute error, or to so many ``rays``."""
         quality = QUALITY[method]
+        power = quality.power if measure == "absolute" else -np.sign(quality.power)
         value, tried = quality.rounded(quality.guess), []
         for _ in range(_TRIES):
-            reached = self.shade(self.plugin(method, **{quality.name: value})).absolute
-            tried.append((abs(np.log(reached / absolute)), value))
+            reached = getattr(self.shade(self.plugin(method, **{quality.name: value})), measure)
+            tried.append((abs(np.log(reached / wanted)), value))
             if tried[-1][0] < _NEAR:
                 break
-            step = float(np.clip((absolute / reached) ** (1 / quality.power), 0.2, 5))
+            step = float(np.clip((wanted / reached) ** (1 / power), 0.2, 5))
             value = quality.rounded(value * step)
             if any(value == before for _, before in tried):
                 break
         return min(tried)[1]
 
 
-def _median(runs: list[Found]) -> Found:
+def median(runs: list[Found]) -> Found:
     return sorted(runs, key=lambda one: one.seconds)[len(runs) // 2]
 
 
@@ -189,7 +192,7 @@ def equal_errors(names, width: int, samples: int, points: int, methods) -> None:
         for _ in range(RUNS):
             for one, plugin in plugins.items():
                 runs[one].append(problem.shade(plugin))
-        middle = {one: _median(found) for one, found in runs.items()}
+        middle = {one: median(found) for one, found in runs.items()}
         for one, found in middle.items():
             speedup = middle["lightcuts"].seconds / found.seconds
             print(
@@ -226,7 +229,7 @@ def growth(names, options) -> None:
             problem = Problem(name, samples, options.width, options.points)
             plugin = problem.plugin("mdlightcuts")
             problem.shade(plugin)
-            found = _median([problem.shade(plugin) for _ in range(RUNS)])
+            found = median([problem.shade(plugin) for _ in range(RUNS)])
             base = base or found.seconds
             time = f"{found.seconds:.2f}" if samples == 1 else f"{found.seconds / base:.1f}"
             shown.append(f"{time}, {found.rays:.0f}")

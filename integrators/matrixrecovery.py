@@ -16,7 +16,7 @@ from vpl.matrix_recovery import RecoveryOptions, recover
 from vpl.matrix_separation import SeparationLimits
 from vpl.point_clusters import PointClusters
 from vpl.reduced_columns import initial_columns, split_columns
-from vpl.reduced_matrix import Columns, MatrixEntries, MatrixRows
+from vpl.reduced_matrix import MatrixEntries, MatrixRows
 from vpl.sampling import derived_seed
 from vpl.slice_rows import build_row_slices
 from vpl.visibility_prediction import PREDICTORS, predict_columns
@@ -155,56 +155,65 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
 
     def shade(self, job: Shading) -> Shaded:
         """Slices, their columns, what is traced of their matrices, and what these send to the points of one batch."""
+        work = self.start(job)
+        clusters = work.entries.rows.clusters
+        for block, found in self.recovered(job, work):
+            work.light(block, found.visibility)
+        if failed := work.counts["failed_slices"]:
+            whole = work.counts["slices"]
+            mi.Log(mi.LogLevel.Warn, f"{failed} of {whole} slices could not be separated and were traced whole.")
+        radiance, used = clusters.in_batch_order([work.radiance, work.columns])
+        spent = (work.entries.rays, work.bounds)
+        rays, bounds = (dr.opaque(mi.Float, count / clusters.count, clusters.count) for count in spent)
+        return Shaded(radiance, rays, bounds, used, work.clock.seconds, counts=work.counts)
+
+    def start(self, job: Shading) -> Work:
+        """The slices of a batch."""
         clock = Clock()
         pixel = download(job.ray).astype(np.int64) // job.grid.samples
         clusters = PointClusters(job.batch, partial(build_row_slices, pixel, self.slice_rows))
         rows = MatrixRows(clusters, pixel, job.seed)
         clock.lap("slices")
-        entries = MatrixEntries(job.scene, job.traits, job.lights, rows)
-        columns, bounds = initial_columns(entries, job.mean, self.initial_columns)
-        clock.lap("initial_cut")
-        work = _Work(entries, clock, clusters)
+        return Work(MatrixEntries(job.scene, job.traits, job.lights, rows), clock)
+
+    def recovered(self, job: Shading, work: Work):
+        """Yield the matrices of all slices, recovered: (block, what was found), block by block."""
+        rows = work.entries.rows
+        columns, work.bounds = initial_columns(work.entries, job.mean, self.initial_columns)
+        work.lap("initial_cut")
         for number, begin in enumerate(range(0, rows.slices, _SLICES)):
             if job.stopped():
                 break
-            end = min(begin + _SLICES, rows.slices)
-            part = columns.select(np.flatnonzero((columns.piece >= begin) & (columns.piece < end)))
+            slices = (begin, min(begin + _SLICES, rows.slices))
+            part = columns.select(np.arange(*np.searchsorted(columns.piece, slices)))
+            seed = derived_seed(job.seed, number)
+            count = min(math.ceil(self.sampling * self.slice_rows), rows.most)
+            part, first = split_columns(work.entries, part, self.alpha, self.max_columns, count, seed)
+            work.lap("columns")
             if part.count:
-                self._light_slices(work, part, (begin, end), derived_seed(job.seed, number))
-        if failed := work.counts["failed_slices"]:
-            mi.Log(mi.LogLevel.Warn, f"{failed} of {rows.slices} slices could not be separated and were traced whole.")
-        radiance, used = clusters.in_batch_order([work.radiance, work.columns])
-        rays, bounds = (dr.opaque(mi.Float, count / clusters.count, clusters.count) for count in (entries.rays, bounds))
-        return Shaded(radiance, rays, bounds, used, clock.seconds, counts=work.counts)
+                samples = VisibilitySamples(work.entries, part, min(count * (self.rounds + 1), rows.most), seed)
+                samples.resume(first)
+                yield from self._blocks(work, samples, count, slices, seed)
 
-    def _light_slices(self, work: _Work, columns: Columns, slices: tuple[int, int], seed: int) -> None:
-        """Light the points of some slices, given their initial columns."""
-        entries, rows = work.entries, work.entries.rows.most
-        count = min(math.ceil(self.sampling * self.slice_rows), rows)
-        columns, first = split_columns(entries, columns, self.alpha, self.max_columns, count, seed)
-        work.lap("columns")
-        if not columns.count:
-            return
-        samples = VisibilitySamples(entries, columns, min(count * (self.rounds + 1), rows), seed)
-        samples.resume(first)
-        kinds = tuple(PREDICTORS[name] for name in self.predictors)
-        rounds = self.rounds if self.prediction else 0
+    def _blocks(self, work: Work, samples: VisibilitySamples, count: int, slices: tuple[int, int], seed: int):
+        """Predict the columns of some slices, and recover their matrices as many at a time as memory allows."""
+        entries, columns = work.entries, samples.columns
+        kinds, rounds = tuple(PREDICTORS[name] for name in self.predictors), self.rounds if self.prediction else 0
         predictors, best = predict_columns(samples, kinds, count, self.prediction_error, rounds, seed)
         work.lap("prediction")
         for name, kind in PREDICTORS.items():
             work.add(f"{name}_columns", int((best == kind).sum()))
         for begin, end in _chunks(entries, columns, slices):
             low, high = np.searchsorted(columns.piece, (begin, end))
-            if low == high:
-                continue
-            block = MatrixBlock(entries, columns.select(np.arange(low, high)), begin, end)
-            found = recover(block, predictors, best, int(low), self.options(), derived_seed(seed, 1, begin))
-            dr.sync_thread()
-            work.lap("separation")
-            work.add("failed_slices", found.failed)
-            work.add("entries", int(block.counts.prod(1).sum()))
-            work.light(block, found.visibility)
-            work.lap("evaluate")
+            if low < high:
+                block = MatrixBlock(entries, columns.select(np.arange(low, high)), begin, end)
+                found = recover(block, predictors, best, int(low), self.options(), derived_seed(seed, 1, begin))
+                dr.sync_thread()
+                work.lap("separation")
+                work.add("failed_slices", found.failed)
+                work.add("entries", int(block.counts.prod(1).sum()))
+                yield block, found
+                work.lap("evaluate")
 
     def options(self) -> RecoveryOptions:
         """How matrices are recovered."""
@@ -220,17 +229,18 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
         return super().describe() | {"predictors": ",".join(self.predictors)} | {n: getattr(self, n) for n in names}
 
 
-class _Work:
+class Work:
     """Light of all points along the slices, filled block by block, and what it took.
 
-    ``counts``: slices, rows and entries; shadow rays by stage; columns by predictor; slices that failed.
+    ``bounds``: upper bounds that were computed; ``counts``: slices, rows and entries; shadow rays by stage;
+    columns by predictor; slices that failed.
     """
 
-    def __init__(self, entries: MatrixEntries, clock: Clock, clusters: PointClusters):
-        self.entries, self._clock, rows = entries, clock, entries.rows
-        self._begin = np.append(clusters.tree.first[clusters.tree.leaves].astype(np.int64), clusters.count)
-        self.radiance = dr.zeros(mi.UnpolarizedSpectrum, clusters.count)
-        self.columns = dr.zeros(mi.UInt32, clusters.count)
+    def __init__(self, entries: MatrixEntries, clock: Clock):
+        self.entries, self.clock, self.bounds, rows = entries, clock, 0, entries.rows
+        tree, count = rows.clusters.tree, rows.clusters.count
+        self._begin = np.append(tree.first[tree.leaves].astype(np.int64), count)
+        self.radiance, self.columns = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UInt32, count)
         dr.eval(self.radiance, self.columns)
         self.counts = {"slices": rows.slices, "rows": rows.count, "entries": 0, "failed_slices": 0}
 
@@ -240,7 +250,7 @@ class _Work:
 
     def lap(self, stage: str) -> None:
         """A stage has ended: its time, and its shadow rays."""
-        self._clock.lap(stage)
+        self.clock.lap(stage)
         before = sum(number for name, number in self.counts.items() if name.endswith("_rays"))
         self.add(f"{stage}_rays", self.entries.rays - before)
 

@@ -25,6 +25,8 @@ from .arrays import download, upload
 
 # Step of the multipliers, in units of the penalty; [SWZ] allows up to 1.6, which errs more here
 _STEP = 1.0
+# So many times further from D than after the first iteration, a separation has failed
+_DIVERGED = 2.0
 # Columns that a sketch has beyond the largest rank [HMT]
 _OVERSAMPLING = 8
 
@@ -47,7 +49,7 @@ class SeparationLimits:
 @dataclass
 class Separation:
     """``error``: Z, Float, in the layout of D.  Of every matrix, of NumPy: ``rank``, ``iterations``, ``failed`` (bool:
-    not finite, or further from D than it was at first), ``residual``: ‖XY + Z − D‖ / ‖D‖ after each iteration, a list.
+    not finite, or much further from D than it was at first), ``residual``: ‖XY + Z − D‖ / ‖D‖ after each iteration, a list.
     """
 
     error: object
@@ -117,7 +119,7 @@ def separate(whole, free, weight, shape: tuple[int, int, int], limits: Separatio
         history.append(residual)
         falls = residual < (1 - limits.progress) * before
         active = active[falls[active] & (residual[active] > limits.residual)]
-    failed = ~np.isfinite(norm + residual) | (residual > np.maximum(first, limits.residual))
+    failed = ~np.isfinite(norm + residual) | (residual > _DIVERGED * np.maximum(first, limits.residual))
     return Separation(state.error, rank, iterations, failed, history)
 
 

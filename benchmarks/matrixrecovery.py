@@ -1,0 +1,162 @@
+"""``matrixrecovery`` against ``mdlightcuts`` and ``lightslice``, and what each of its steps does.
+
+    ./run -- python benchmarks/matrixrecovery.py [--scenes NAME ...] [--parts table steps pictures]
+
+table     [MSR] Table 1: shadow rays, sampling rate, columns, time by stage and error; the other methods with the
+          parameter that gives the same mean absolute error of pixels, and with that which takes as many rays; and what
+          a shadow ray would have to cost more for both to take as long.
+steps     [MSR] figure 8: error and rays with one step after another left out, and with light separated as in the paper.
+pictures  [MSR] figure 7: the matrices of one slice of each scene, as PNG files below --out (needs matplotlib).
+
+Four samples a pixel, 256 wide, 200,000 VPLs, max_depth 6. Errors are those of whole pixels relative to the image's
+mean, direct light included, against the sum of all lights at all samples of a random subset of them. Rates are of all
+entries. Times are medians of three interleaved warm runs of what a method does after lights, their trees and gather
+points are there, which all methods share.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+mi.set_variant("llvm_ad_rgb")
+
+from benchmarks import scenes  # noqa: E402
+from benchmarks.baselines import QUALITY, RUNS, VPLS, Found, Problem, median  # noqa: E402
+
+METHOD, OTHERS = "matrixrecovery", ("mdlightcuts", "lightslice")
+SAMPLES = 4
+# Where all lights are summed for pictures, which do not look at errors
+_FEW_POINTS = 400
+NAMES = ("cornell", "kitchen", "sponza_crytek", "dining_room", "bistro_interior")
+STEPS = {
+    "all": {},
+    "no prediction": {"prediction": False},
+    "no separation": {"separation": False},
+    "no correction": {"correction": False},
+    "no columns split": {"alpha": 1.0},
+    "light separated": {"recover": "light"},
+    "nearest only": {"predictors": "nearest"},
+    "linear only": {"predictors": "linear"},
+    "bayes only": {"predictors": "bayes"},
+}
+
+
+def _rate(found: Found, pixels: int) -> float:
+    """Shadow rays over entries."""
+    return found.rays * pixels / found.counts["entries"]
+
+
+def _interleaved(problem: Problem, plugins: dict) -> dict:
+    """The median run of each plugin."""
+    runs: dict = {name: [] for name in plugins}
+    for plugin in plugins.values():
+        problem.shade(plugin)
+    for _ in range(RUNS):
+        for name, plugin in plugins.items():
+            runs[name].append(problem.shade(plugin))
+    return {name: median(found) for name, found in runs.items()}
+
+
+def table(names, options) -> None:
+    """Part "table"."""
+    print(f"\n## equal error and equal rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
+    print("scene | method | s | rays/px | rate | columns | mean absolute | RMSE | fewer rays | faster | dearer ray, ns")
+    ratios: dict = {}
+    for name in names:
+        problem = Problem(name, SAMPLES, options.width, options.points)
+        plugins = {METHOD: problem.plugin(METHOD)}
+        ours = problem.shade(plugins[METHOD])
+        for other in OTHERS:
+            for measure in ("absolute", "rays"):
+                value = problem.quality_for(other, getattr(ours, measure), measure)
+                plugins[f"{other}, equal {measure}: {QUALITY[other].show(value)}"] = problem.plugin(
+                    other, **{QUALITY[other].name: value}
+                )
+        found = _interleaved(problem, plugins)
+        ours = found[METHOD]
+        for label, one in found.items():
+            _show(name, label, one, ours, problem)
+            if "equal absolute" in label:
+                method = label.split(",")[0]
+                pair = (one.rays / ours.rays, one.seconds / ours.seconds)
+                ratios.setdefault(method, []).append(pair)
+    for method, pairs in ratios.items():
+        rays, seconds = (scenes.geometric_mean(values) for values in zip(*pairs, strict=True))
+        print(f"geometric means over {method}: {rays:.2f} times fewer rays, {seconds:.2f} times faster")
+
+
+def _show(name: str, label: str, one: Found, ours: Found, problem: Problem) -> None:
+    """One row of the table."""
+    rate, columns = "", f"{one.cut / SAMPLES:.0f}"
+    if label == METHOD:
+        rate = f"{100 * _rate(one, problem.pixels):.1f}%"
+    saved, spent = one.rays - ours.rays, ours.seconds - one.seconds
+    dearer = f"{1e9 * spent / (saved * problem.pixels):.0f}" if saved > 0 and spent > 0 else ""
+    print(
+        f"{name} | {label} | {one.seconds:.2f} | {one.rays:.1f} | {rate} | {columns} | {100 * one.absolute:.2f}% | "
+        f"{one.rmse:.4f} | {one.rays / ours.rays:.1f} | {one.seconds / ours.seconds:.2f} | {dearer}",
+        flush=True,
+    )
+    if label == METHOD:
+        stages = ", ".join(f"{stage} {spent:.2f}" for stage, spent in one.stages.items())
+        share = (one.stages["prediction"] + one.stages["separation"]) / one.seconds
+        print(f"  stages: {stages}; prediction and separation {100 * share:.0f}%; counted: {one.counts}", flush=True)
+
+
+def steps(names, options) -> None:
+    """Part "steps"."""
+    print(f"\n## steps left out ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs)")
+    print("scene | steps | rays/px | rate | mean absolute | RMSE")
+    for name in names:
+        problem = Problem(name, SAMPLES, options.width, options.points)
+        for label, settings in STEPS.items():
+            found = problem.shade(problem.plugin(METHOD, **settings))
+            rate = 100 * _rate(found, problem.pixels)
+            print(
+                f"{name} | {label} | {found.rays:.1f} | {rate:.1f}% | {100 * found.absolute:.2f}% | {found.rmse:.4f}",
+                flush=True,
+            )
+
+
+def pictures(names, options) -> None:
+    """Part "pictures"."""
+    from benchmarks.matrix_pictures import draw_slice
+
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        problem = Problem(name, SAMPLES, options.width, _FEW_POINTS)
+        plugin = problem.plugin(METHOD)
+        job = max(problem.prepared.jobs, key=lambda one: one.share)
+        file = options.out / f"{name}_slice{options.slice}.png"
+        unfinished = file.with_suffix(".part.png")
+        draw_slice(plugin, job, options.slice, unfinished, {"scene": name, "VPLs": VPLS, "seed": 0})
+        os.replace(unfinished, file)
+        print(file, flush=True)
+
+
+def main() -> None:
+    """Parse the command line and run the parts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(NAMES), choices=scenes.NAMES)
+    parts = {"table": table, "steps": steps, "pictures": pictures}
+    parser.add_argument("--parts", nargs="+", default=list(parts), choices=list(parts))
+    parser.add_argument("--width", type=int, default=256, help="pixels (default: 256)")
+    parser.add_argument("--points", type=int, default=8000, help="where all lights are summed (default: 8000)")
+    parser.add_argument("--slice", type=int, default=20, help="the slice of part pictures (default: 20)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("matrices"), help="folder of part pictures (default: matrices)"
+    )
+    options = parser.parse_args()
+    names = scenes.available(options.scenes)
+    for part in options.parts:
+        parts[part](names, options)
+
+
+if __name__ == "__main__":
+    main()
