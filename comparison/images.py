@@ -56,8 +56,17 @@ def read_exr(path):
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = sorted(file.channels())
         image = np.stack([file.channels()[name].pixels.astype(np.float32) for name in channels], axis=-1)
-        metadata = {key: value for key, value in file.header().items() if isinstance(value, int | float | str)}
-    return image, channels, metadata
+        return image, channels, _plain(file.header())
+
+
+def read_exr_metadata(path):
+    """Return the metadata of an EXR file without reading its pixels."""
+    with OpenEXR.File(str(path), header_only=True) as file:
+        return _plain(file.header())
+
+
+def _plain(header):
+    return {key: value for key, value in header.items() if isinstance(value, int | float | str)}
 
 
 def colour(image, channels, layer=""):
@@ -85,14 +94,24 @@ def tone_map(rgb, exposure):
     return (encoded * 255 + 0.5).astype(np.uint8)
 
 
+def logarithmic_position(values, ends):
+    """Return where values, (height, width), are on a logarithmic scale with the given ends: 0 to 1. What is below it,
+    such as zero, is at 0, what is above it or not a number at 1."""
+    low, high = np.log(ends)
+    position = (np.log(np.maximum(np.nan_to_num(values, nan=np.inf), ends[0])) - low) / (high - low)
+    return np.clip(position, 0, 1)
+
+
 def false_colours(values, ends=ERROR_RANGE):
     """Return the colours, (height, width, 3) uint8, of values, (height, width), on a logarithmic scale with the given
     ends, by default that of relative errors. What is below it, such as zero, has the lowest colour, what is above it or
     not a number the highest."""
-    low, high = np.log(ends)
-    position = (np.log(np.maximum(np.nan_to_num(values, nan=np.inf), ends[0])) - low) / (high - low)
-    position = np.clip(position, 0, 1) * (len(FALSE_COLOURS) - 1)
-    stops = np.arange(len(FALSE_COLOURS))
+    return palette(logarithmic_position(values, ends))
+
+
+def palette(position):
+    """Return the colours (..., 3) uint8 of positions (...) between 0 and 1 on the scale of false colours."""
+    stops = np.linspace(0, 1, len(FALSE_COLOURS))
     return np.stack([np.interp(position, stops, FALSE_COLOURS[:, i]) for i in range(3)], axis=-1).astype(np.uint8)
 
 
