@@ -36,6 +36,7 @@ try:
     from comparison.progress import Progress
     from comparison.runs import Runs, locked
     from comparison.scene_comparison import SceneComparison
+    from comparison.scene_files import short_name
 except ModuleNotFoundError as missing:
     sys.exit(f"compare: the package '{missing.name}' is missing; pip install 'manylights[compare]' brings it")
 
@@ -198,12 +199,22 @@ def chosen_settings(options):
     return settings
 
 
+def check_scenes(paths):
+    """Raise UsageError for scenes that are not there, and for two of the same name."""
+    names = {}
+    for path in paths:
+        command_line.check_scene(path)
+        name = short_name(path)
+        if name in names:
+            raise UsageError(f"'{names[name]}' and '{path}' would have files of the same name, '{name}'")
+        names[name] = path
+
+
 def run(options, command):
     """Compare on all scenes; return the exit status."""
     command_line.set_variant(options.mode)
     settings = chosen_settings(options)
-    for path in options.scenes:
-        command_line.check_scene(path)
+    check_scenes(options.scenes)
     earlier = baseline.read(options.check) if options.check else None
     command_line.make_folder(options.out)
     with locked(options.out / ".lock", f"another comparison is writing to '{options.out}'"):

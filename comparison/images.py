@@ -5,6 +5,7 @@ EXR files are OpenEXR's matter rather than Mitsuba's, whose writer waits for eve
 
 import json
 import os
+import re
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,6 +30,13 @@ def replacing(path):
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_abandoned(folder):
+    """Remove temporary files that killed processes left in a folder; nobody may be writing there."""
+    for file in Path(folder).iterdir():
+        if re.fullmatch(r"\..+\.\d+\.(exr|png|json|html)", file.name):
+            file.unlink()
 
 
 def write_exr(path, image, channels, metadata=None, half=False):

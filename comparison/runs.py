@@ -21,13 +21,17 @@ NOT_OF_THE_RUN = ("label", "output", "run", "scene", "kernel_cache", "vpl_folder
 
 
 class Runs:
-    """The finished runs of an output folder. `made_by` is what, besides jobs and scenes, they depend on (a dict)."""
+    """The finished runs of an output folder, which is this process's alone. `made_by` is what, besides jobs and scenes,
+    they depend on (a dict)."""
 
     def __init__(self, out, made_by):
         self.folder, self._made_by = Path(out) / FOLDER, made_by
         self.kernels = self.folder / "kernels"
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.forget_kernels()  # of a comparison that was killed
+        # What a comparison that was killed left behind:
+        self.forget_kernels()
+        for folder in (out, self.folder):
+            images.remove_abandoned(folder)
 
     def key(self, job, scene_hash):
         """Return what a run is recognised by: 32 hexadecimal digits."""

@@ -9,7 +9,7 @@ import numpy as np
 from . import analysis, images, metrics, references, worker
 from .command_line import explain, own_integrators
 from .pictures import Pictures
-from .scene_files import SceneFile
+from .scene_files import SceneFile, short_name
 from .sweeps import order
 
 FIRST_SPP = 64  # of a reference that is continued until its noise is small enough
@@ -28,13 +28,13 @@ class SceneComparison:
         self.path, self.settings, self.options = path, settings, options
         self._store, self._progress = store, progress
         self._reference, self.pictures = None, None
-        self.result = {"scene": str(path), "name": Path(path).stem, "renders": []}
+        self.result = {"scene": str(path), "name": short_name(path), "renders": []}
 
     def run(self):
         """Make all runs. What fails is recorded, and the others go on."""
         try:
             file = self._parse()
-            self.result |= {"name": file.name, "hash": file.fingerprint()}
+            self.result["hash"] = file.fingerprint()
             self._reference = self._first_reference(file)
         except Exception as error:  # whatever it is, it must not lose the other scenes
             self._fail(error)

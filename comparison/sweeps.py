@@ -24,7 +24,7 @@ DEFAULTS = {
     "adaptivedirect": ("error", (0.12, 0.06, 0.03, 0.015)),
     "unoccludeddirect": ("error", (0.12, 0.06, 0.03, 0.015)),
 }
-# ... and, where errors are those of the whole image, samples per pixel: every other value with each of these.
+# ... and, where nobody said anything, samples per pixel: every other value with each of these.
 DEFAULT_SAMPLES = (1, 4, 16)
 DEFAULT = ("spp", (4, 16, 64, 256))  # of all others, such as Mitsuba's own
 
@@ -102,10 +102,12 @@ def settings(integrators, sweeps, spp, time, samples=True):
     """Return all settings, a dict from label to a list.
 
     `integrators` maps labels to names and parameters; `sweeps` are what `sweep` returned for each option; `spp` and
-    `time` are the efforts of what is not swept over one; with neither, and `samples`, default sweeps are also over
-    samples per pixel. Several parameters of one label make a grid. Once there is any sweep, labels without one have the
-    default of their integrator. Raises UsageError for labels that do not exist and parameters that are given twice.
+    `time` are the efforts of what is not swept over one. Several parameters of one label make a grid. Once there is any
+    sweep, labels without one have the default of their integrator; where that is all that is swept, `samples` is true,
+    and there is neither `spp` nor `time`, it is also over samples per pixel. Raises UsageError for labels that do not
+    exist and parameters that are given twice.
     """
+    samples = samples and not spp and not time and all(key is None for _, key, _ in sweeps)
     grids = {label: {} for label in integrators}
     for label, key, values in sweeps:
         if label not in grids and not (label == "all" and key is None):
@@ -118,7 +120,7 @@ def settings(integrators, sweeps, spp, time, samples=True):
     for label, (name, parameters) in integrators.items():
         grid = grids[label]
         if sweeps and not grid:
-            grid = default_grid(name, samples and not spp and not time)
+            grid = default_grid(name, samples)
         _check_grid(label, grid, parameters)
         found[label] = [
             _setting(label, name, parameters, spp, time, dict(zip(grid, values, strict=True)))

@@ -80,7 +80,9 @@ def run(job, tick=lambda: None):
         environment = os.environ | {"DRJIT_CACHE_DIR": str(kernels)}
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
         command = [sys.executable, "-m", "comparison.worker", str(job_file), str(result_file)]
-        status = _wait(subprocess.Popen(command, env=environment, stdin=subprocess.PIPE), tick)
+        # In a session of its own, so that Ctrl-C is for this process alone, which then ends that one.
+        process = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, start_new_session=True)
+        status = _wait(process, tick)
         if result_file.exists():
             result |= json.loads(result_file.read_text())
             return result if is_cold or "error" in result else result | {"cold_seconds": None}
@@ -230,8 +232,6 @@ def main():
         result = render(Job(**json.loads(job_file.read_text())))
     except Exception as error:
         result = {"error": explain(error), "traceback": traceback.format_exc()}
-    except KeyboardInterrupt:
-        return 130  # said by the process that waits for this one
     with images.replacing(result_file) as temporary:
         temporary.write_text(json.dumps(result))
     return 1 if "error" in result else 0

@@ -373,6 +373,7 @@ def test_aovs_that_not_all_know_are_asked_of_those_that_do(monkeypatch):
     [
         ([], "no scene given"),
         (["nosuch.xml"], "no scene file 'nosuch.xml'"),
+        ([str(CORNELL), str(CORNELL)], "would have files of the same name, 'cornell'"),
         ([str(CORNELL), "-i", "nosuch"], "unknown integrator 'nosuch'; there are"),
         ([str(CORNELL), "-i", "path,path"], "'path' is no name of its own"),
         ([str(CORNELL), "-p", "vpl.error=1"], "LABEL is path or lightcuts"),

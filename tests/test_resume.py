@@ -81,12 +81,13 @@ def test_killed_comparison_goes_on_where_it_stopped(tmp_path, monkeypatch):
     while workers_of(tmp_path):  # they end with it
         assert time.monotonic() < end
         time.sleep(0.05)
+    (tmp_path / ".cornell.path.123.exr").write_text("as if killed while writing")
     before = {file: file.read_text() for file in finished(tmp_path)}
 
     made, run = [], worker.run
     monkeypatch.setattr(worker, "run", lambda job, tick: made.append(job) or run(job, tick))
     assert compare.main([*command(tmp_path), "--resume"]) == 0
-    assert len(made) == 6 - len(before)
+    assert len(made) == 6 - len(before) and not (tmp_path / ".cornell.path.123.exr").exists()
     assert len(finished(tmp_path)) == 6 and all(file.read_text() == text for file, text in before.items())
     results = json.loads((tmp_path / "results.json").read_text())
     assert results["complete"] and len(results["scenes"][0]["renders"]) == 6

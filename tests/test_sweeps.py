@@ -72,12 +72,17 @@ def test_several_parameters_make_a_grid():
 
 def test_labels_without_a_sweep_have_their_default():
     found = settings("path:spp=4")
-    assert [one.name for one in found["cuts"]] == [
+    assert [one.name for one in found["cuts"]] == ["error=0.08", "error=0.04", "error=0.02", "error=0.01"]
+    assert {one.spp for one in found["cuts"]} == {sweeps.DEFAULT_SPP}  # as in sweeps that were given
+    assert [one.name for one in settings("all")["path"]] == ["spp=4", "spp=16", "spp=64", "spp=256"]
+
+
+def test_default_sweeps_are_over_samples_too():
+    assert [one.name for one in settings("all")["cuts"]] == [
         f"error={error},spp={spp}" for error in ("0.04", "0.01") for spp in (1, 4, 16)
     ]
     assert [one.name for one in settings("all", spp=2)["cuts"]][:2] == ["error=0.08", "error=0.04"]
     assert [one.name for one in settings("cuts", samples=False)["cuts"]][:2] == ["error=0.08", "error=0.04"]
-    assert [one.name for one in settings("all")["path"]] == ["spp=4", "spp=16", "spp=64", "spp=256"]
 
 
 def test_default_sweeps_are_of_parameters_that_exist():
