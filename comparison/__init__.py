@@ -14,6 +14,7 @@
                 error against time and rays: means, intervals, what is read off; from runs to these
 `tables`, `report`, `plots`, `pictures`, `page_images`, `page`
                 tables, `results.json` (`results.schema.json`) and `report.html`
+`strip`         pictures beside each other, for a paper
 `baseline`      have speed-ups fallen since an earlier comparison?
 `machine`       processor, load, versions
 `command_line`  what the two commands' options and error messages have in common

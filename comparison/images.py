@@ -135,6 +135,11 @@ def logarithmic_ends(planes):
     return min(low, high / 2), high
 
 
+def read_png(path):
+    """Return the pixels, (height, width, 3) uint8, of a PNG file of colours."""
+    return np.array(mi.Bitmap(str(path)))
+
+
 def write_png(path, pixels):
     """Write (height, width, 3) uint8 sRGB values."""
     with replacing(path) as temporary:

@@ -28,10 +28,11 @@ def describe(command, options, scenes, complete):
 
 def text(scene):
     """Return a scene's results as tables in plain text."""
-    if "error" in scene:
-        return f"{scene['name']}: FAILED: {scene['error']}"
+    parts = [f"{scene['name']}: FAILED: {scene['error']}"] if "error" in scene else []
     rows = tables.rows(scene)
-    parts = [f"{scene['name']}, reference: {reference_text(scene)}"]
+    if not rows:
+        return "\n".join(parts)
+    parts.append(f"{scene['name']}, reference: {reference_text(scene)}")
     parts.append(tables.text([list(tables.COLUMNS), *(row for row in rows if len(row) > 2)]))
     parts += [f"{row[0]}: FAILED: {row[1]}" for row in rows if len(row) == 2]
     for title, table in (
@@ -48,7 +49,7 @@ def reference_text(scene):
     """Say in a few words what a scene's images were compared with."""
     reference = scene.get("reference")
     if reference is None:
-        return "vpl, with the same virtual lights"
+        return "vpl, with the same virtual lights" if any(map(_has_vpl, scene["renders"])) else "none"
     text = ", ".join(
         f"{reference[key]}{unit}" for key, unit in (("integrator", ""), ("spp", " spp")) if key in reference
     )
@@ -67,3 +68,7 @@ def write(folder, results, pictures):
         file.write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
     with images.replacing(folder / "report.html") as file:
         file.write_text(page.render(results, pictures, reference_text), encoding="utf-8")
+
+
+def _has_vpl(render):
+    return bool(render.get("vpl_output"))
