@@ -123,8 +123,9 @@ def interval(value, seeds):
 
 def equal_errors(curves, targets=None):
     """Return what each curve costs at the same errors: a list of {"error", "costs"}, the latter from label to {"value",
-    "at_most", "low", "high", "speed_up", "speed_up_low", "speed_up_high"}; a speed-up is the cost of the first curve
-    over that of the label's. What is not known is None; "not reached" is where both value and at_most are."""
+    "at_most", "low", "high", "speed_up", "speed_up_low", "speed_up_high", "speed_up_at_least"}; a speed-up is the cost
+    of the first curve over that of the label's, the last one over `at_most`. What is not known is None; "not reached"
+    is where both value and at_most are."""
     targets = _targets([curve.front()[1] for curve in curves]) if targets is None else targets
     return [
         {"error": target, "costs": {curve.label: _read(curves[0], curve, Curve.cost_at, target) for curve in curves}}
@@ -147,7 +148,7 @@ def _read(base, curve, read, target):
         over, under = read(base, target, without)[0], read(curve, target, without)[0]
         return over / under if over and under else None
 
-    value, at_most = read(curve, target)
+    over, (value, at_most) = read(base, target)[0], read(curve, target)
     low, high = interval(lambda without: read(curve, target, without)[0], curve.seeds) if value else (None, None)
     speed_up = ratio(None)
     both = sorted({*base.seeds, *curve.seeds})
@@ -155,13 +156,15 @@ def _read(base, curve, read, target):
     return {
         "value": value, "at_most": at_most, "low": low, "high": high,
         "speed_up": speed_up, "speed_up_low": speed_low, "speed_up_high": speed_high,
+        "speed_up_at_least": over / at_most if over and at_most else None,
     }  # fmt: skip
 
 
 def _targets(ranges):
     """Choose the numbers at which to compare: round ones (1, 2 or 5 times a power of ten) that as many as possible of
-    the ranges hold, `TARGETS` of them at most; the middle of what the ranges share where no round one is."""
-    ranges = [(values.min(), values.max()) for values in ranges if values.size]
+    the ranges hold, `TARGETS` of them at most; the middle of what the ranges share where no round one is. Where they
+    share nothing, the ends that are closest to each other, so that one of them is a bound."""
+    ranges = [(float(values.min()), float(values.max())) for values in ranges if values.size]
     if not ranges:
         return []
     low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
@@ -172,8 +175,8 @@ def _targets(ranges):
     candidates += [float(f"{np.sqrt(a * b):.3g}") for a, b in pairwise(corners)]
     holders = [sum(low <= number <= high for low, high in ranges) for number in candidates]
     most = max(holders, default=0)
-    if most == 0:
-        return []
+    if most < min(2, len(ranges)):
+        return sorted({min(high for _, high in ranges), max(low for low, _ in ranges)})
     best = [number for number, count in zip(candidates, holders, strict=True) if count == most]
     is_round = [number for number in best if f"{number:e}"[0] in "125" and float(f"{number:.0e}") == number]
     best = sorted(is_round or best[:1])

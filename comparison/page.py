@@ -17,21 +17,18 @@ KINDS = {"relative": "relative error", "distance": "distance × 16", "flip": "FL
 
 def render(results, pictures, reference_text):
     """Return the page for the content of `results.json` and the `Pictures` (or None) of each of its scenes."""
-    metric = results["metrics"]["compared"]
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(PARTS), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     return environment.get_template("report.html.jinja").render(
         results=results,
-        scenes=[
-            _scene(*pair, results["metrics"]["compared"]) for pair in zip(results["scenes"], pictures, strict=True)
-        ],
+        scenes=[_scene(*pair, results) for pair in zip(results["scenes"], pictures, strict=True)],
         columns=tables.COLUMNS,
         explanation=tables.EXPLANATION,
         reference_text=reference_text,
         embedded=embedded,
         kinds=KINDS,
-        metric=plots.ERRORS[metric],
+        metric=plots.ERRORS[results["metrics"]["compared"]],
         error_range=[f"{value:.0%}" for value in images.ERROR_RANGE],
         false_colours=", ".join(f"rgb{tuple(map(int, stop))}" for stop in images.FALSE_COLOURS),
         palettes=_palettes(),
@@ -40,8 +37,9 @@ def render(results, pictures, reference_text):
     )
 
 
-def _scene(scene, pictures, metric):
+def _scene(scene, pictures, results):
     """Return what the template shows of a scene."""
+    metric = results["metrics"]["compared"]
     shown = {"result": scene, "name": scene["name"], "error": scene.get("error"), "views": None}
     if pictures is None:
         return shown
@@ -56,6 +54,7 @@ def _scene(scene, pictures, metric):
         for title, table in (("equal error", tables.equal_errors), ("equal cost", tables.equal_costs)):
             if rows := table(scene, cost):
                 shown["comparisons"].append((cost, title, rows))
+    shown["warnings"] = tables.warnings(scene, results["machine"]["cores"])
     counted = {render["label"] for render in scene["renders"] if render.get("rays_per_sample") is not None}
     shown["uncounted"] = [label for label in labels if label not in counted]
     return shown

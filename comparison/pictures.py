@@ -8,9 +8,9 @@ DISTANCE_FACTOR = 16  # of the images of Euclidean distance, as in the paper on 
 class Pictures:
     """Pictures of a scene called `name`, written to `folder`.
 
-    `views` is a list for the page: a dict an image with "title", "image", and, if it has a reference, "maps": from the
-    kind ("relative", "distance", "flip") to a plane (see page_images.py). The first image that is shown chooses the
-    exposure of all, `exposure`.
+    `views` is a list for the page: a dict an image with "title", "label", "image", and, if it has a reference, "maps":
+    from the kind ("relative", "distance", "flip") to a plane (see page_images.py). The first image that is shown
+    chooses the exposure of all, `exposure`.
     """
 
     def __init__(self, folder, name):
@@ -18,13 +18,13 @@ class Pictures:
         self.exposure, self.views, self.block = None, [], 1
         self._aovs = {}  # channel -> title -> values, (height, width)
 
-    def show(self, title, file_name, image, reference=None, flip=None):
-        """Show an image, (height, width, 3) linear; if there is a reference also its errors, `flip` being the map of
-        metrics.flip."""
+    def show(self, title, label, file_name, image, reference=None, flip=None):
+        """Show an image, (height, width, 3) linear, of an integrator's label (None: the reference); if it has a
+        reference also its errors, `flip` being the map of metrics.flip."""
         self.exposure = self.exposure or images.automatic_exposure(image)
         self.block = page_images.block_size(*image.shape[:2])
         images.write_png(self.path(file_name, ".png"), images.tone_map(image, self.exposure))
-        view = {"title": title, "image": page_images.colours(image, self.exposure), "maps": {}}
+        view = {"title": title, "label": label, "image": page_images.colours(image, self.exposure), "maps": {}}
         if reference is not None:
             relative = metrics.relative_error(image, reference)
             images.write_png(self.path(file_name, ".error.png"), images.false_colours(relative))

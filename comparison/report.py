@@ -42,6 +42,7 @@ def text(scene):
         if table:
             parts += ["", f"{title} (in brackets: how many times better than {table[0][1]}, 95% interval)"]
             parts.append(tables.text(table))
+    parts += tables.warnings(scene, machine.cores())
     return "\n".join(parts)
 
 

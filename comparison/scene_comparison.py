@@ -54,8 +54,9 @@ class SceneComparison:
         self.pictures = Pictures(self.options.out, self.result["name"])
         if self._reference:
             self._describe_reference()
-            self.pictures.show("reference", "reference", self._reference.image)
-        for result in self._finished():
+            self.pictures.show("reference", None, "reference", self._reference.image)
+        labels = list(self.settings)
+        for result in sorted(self._finished(), key=lambda result: labels.index(result["label"])):
             try:
                 self._assess(result)
             except Exception as error:
@@ -181,7 +182,7 @@ class SceneComparison:
             title = f"{result['label']} {result['setting']}".strip()
             file_name = Path(result["output"]).name[len(self.result["name"]) + 1 : -len(".exr")]
             file_name = file_name.removesuffix(f".seed{result['seed']}")
-            self.pictures.show(title, file_name, image, reference.image if reference else None, flip)
+            self.pictures.show(title, result["label"], file_name, image, reference.image if reference else None, flip)
             self.pictures.add_aovs(self.options.aovs, title, planes, channels)
 
     @staticmethod

@@ -87,6 +87,8 @@ def _run(options):
         results = json.loads((options.folder / "results.json").read_text())
     except FileNotFoundError:
         raise UsageError(f"no results.json in '{options.folder}'") from None
+    if not options.output.absolute().parent.is_dir():
+        raise UsageError(f"no folder '{options.output.absolute().parent}' for the output")
     command_line.set_variant(results["variant"])
     found = panels(results, options.scene)
     pictures = [images.read_png(options.folder / f"{file}.png") for file, _ in found]

@@ -15,6 +15,7 @@ EXPLANATION = (
     "bounds: shadow rays and upper bounds computed, per pixel sample. memory: peak, MB. load: the machine's load "
     "average before the runs, the largest."
 )
+BUSY = 1.5  # load a core; what is measured makes up to one itself
 HEADS = {"seconds": "time [s]", "rays": "rays per pixel"}
 
 
@@ -117,10 +118,19 @@ def number(value):
 
 def _reading(reading):
     if reading["at_most"] is not None:
-        return f"≤ {number(reading['at_most'])}"
+        least = reading["speed_up_at_least"]
+        return f"≤ {number(reading['at_most'])}" + (f" (≥ {least:.3g}×)" if least is not None and least > 1 else "")
     if reading["value"] is None:
         return "not reached"
     cell = number(reading["value"])
     if reading["speed_up_low"] is not None:
         return f"{cell} ({reading['speed_up']:.3g}×, {reading['speed_up_low']:.3g} to {reading['speed_up_high']:.3g})"
     return f"{cell} ({reading['speed_up']:.3g}×)" if reading["speed_up"] not in (None, 1) else cell
+
+
+def warnings(scene, cores):
+    """Return sentences about what makes a scene's numbers doubtful; [] if there is nothing."""
+    load = max((render["load_average"] for render in scene["renders"]), default=0)
+    if load > BUSY * cores:
+        return [f"The machine was busy with other things (load {load:.1f} on {cores} cores): do not trust the times."]
+    return []

@@ -327,14 +327,17 @@ def test_comparison_reports_results_and_failures(tmp_path, capsys):
 
 def test_reference_by_vpl_shares_the_lights(tmp_path, capsys):
     status = compare.main([
-        str(CORNELL), "-i", "path,all=vpl", "-p", "all.vpl_count=300", "--spp", "1", "--width", "16",
-        "--max-depth", "3", "--reference", "vpl", "-o", str(tmp_path),
+        str(CORNELL), "-i", "path,all=vpl,cuts=lightcuts", "-p", "all.vpl_count=300", "-p", "cuts.vpl_count=300",
+        "-p", "cuts.error=0.3", "--spp", "1", "--width", "16", "--max-depth", "3", "--reference", "vpl", "-o",
+        str(tmp_path),
     ])  # fmt: skip
     assert status == 0, capsys.readouterr().out
-    path, every = json.loads((tmp_path / "results.json").read_text())["scenes"][0]["renders"]
+    path, every, cuts = json.loads((tmp_path / "results.json").read_text())["scenes"][0]["renders"]
     assert "errors" not in path
     assert every["errors"]["relative_l1"] < 1e-4
     assert every["rays_per_sample"] > 0
+    assert every["vpl_output"] == cuts["vpl_output"] and len(list(tmp_path.glob("*.vpl.*.exr"))) == 1
+    assert 1e-3 < cuts["errors"]["relative_l1"] < 0.2
 
 
 def test_aovs_are_asked_for_and_shown_on_one_scale(tmp_path, capsys):

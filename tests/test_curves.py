@@ -98,6 +98,9 @@ def test_speed_up_at_equal_error():
     beyond = curves.equal_errors([slow, fast], [0.05])[0]["costs"]
     assert beyond["slow"]["value"] is None and beyond["slow"]["at_most"] is None
     assert beyond["fast"]["value"] == pytest.approx(4) and beyond["fast"]["speed_up"] is None
+    cheap = curves.equal_errors([slow, fast], [0.4])[0]["costs"]["fast"]
+    assert (cheap["value"], cheap["at_most"], cheap["speed_up"]) == (None, 1, None)
+    assert cheap["speed_up_at_least"] == pytest.approx(2.5)
 
 
 def test_error_at_equal_cost():
@@ -133,6 +136,7 @@ def test_targets_are_round_and_shared():
     assert curves._targets([np.array([0.3, 0.45]), np.array([0.33, 0.6])]) == [0.385]
     assert curves._targets([np.array([0.001, 1.0])]) == [0.001, 0.01, 0.1, 1.0]
     assert curves._targets([np.array([]), np.array([])]) == []
+    assert curves._targets([np.array([0.1, 3.0]), np.array([0.01, 0.04])]) == [0.04, 0.1]  # nothing shared
 
 
 def test_pareto_front_is_of_all_labels():

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import compare
-from comparison import analysis, baseline, images, page_images, report
+from comparison import analysis, baseline, images, page_images, report, strip
 from comparison.command_line import UsageError
 
 from . import chromium
@@ -147,15 +147,9 @@ def test_page_needs_nothing_else(swept):
     assert len(figures) == 2
     for figure in figures:
         xml.etree.ElementTree.fromstring(figure)
-    titles = [
-        "reference",
-        "path spp=1",
-        "lightcuts error=0.4",
-        "vpl vpl_count=2000",
-        "path spp=8",
-        "lightcuts error=0.1",
-    ]
-    assert re.findall('"title": "([^"]*)"', page) == titles
+    assert re.findall('"title": "([^"]*)"', page) == [
+        "reference", "path spp=1", "path spp=8", "lightcuts error=0.4", "lightcuts error=0.1", "vpl vpl_count=2000",
+    ]  # fmt: skip
 
 
 def test_page_escapes_what_it_is_given(tmp_path, swept):
@@ -283,6 +277,35 @@ def test_the_wheel_zooms_and_pictures_move(page):
     assert page.value(transform) != zoomed
     page.click(".fit")
     assert page.value(transform) == before
+
+
+# --- Strips ---
+
+
+def test_strip_of_pictures(swept, tmp_path, capsys):
+    output = tmp_path / "strip.png"
+    assert strip.main([str(swept), "--output", str(output)]) == 0
+    assert "made by: compare.py" in capsys.readouterr().out
+    pixels = images.read_png(output)
+    assert pixels.shape == (24 + 45, 11 * 28 - 4, 3)  # five settings, the reference, five errors
+    expected = images.read_png(swept / "cornell.path.spp=1.png")
+    np.testing.assert_array_equal(pixels[:24, :24], expected)
+    assert pixels[24:].min() < 128  # captions
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["--scene", "nosuch"], "there are cornell"), (["--output", "/no/folder.png"], "no folder")],
+)
+def test_strip_refuses(swept, tmp_path, capsys, arguments, message):
+    given = arguments if "--output" in arguments else [*arguments, "--output", str(tmp_path / "a.png")]
+    assert strip.main([str(swept), *given]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_strip_needs_a_comparison(tmp_path, capsys):
+    assert strip.main([str(tmp_path), "--output", str(tmp_path / "a.png")]) == 2
+    assert "no results.json in" in capsys.readouterr().err
 
 
 # --- --check ---

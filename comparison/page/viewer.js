@@ -66,10 +66,17 @@ class Viewer {
     for (const select of [this.find(".a"), this.find(".b")]) {
       this.views.forEach((view, index) => select.add(new Option(view.title, index)));
     }
-    this.find(".a").value = Math.min(1, this.views.length - 1);
-    this.find(".b").value = this.views.length > 2 ? this.views.length - 1 : 0;
+    [this.find(".a").value, this.find(".b").value] = this.first();
     this.listen();
     this.repaint();
+  }
+
+  // What is shown first: the last settings of the first and of the last label, or of the only one and the reference.
+  first() {
+    const labels = this.views.map((view) => view.label), own = labels.filter((label) => label !== null);
+    const last = [own[0], own.at(-1)].map((label) => labels.lastIndexOf(label));
+    if (!own.length) return [0, 0];
+    return last[0] === last[1] && labels[0] === null ? [last[0], 0] : last;
   }
 
   listen() {
