@@ -231,8 +231,7 @@ def run(options, command):
 
 def _compare(options, settings, command):
     """Make all runs, and write the report after each scene; return the content of `results.json`."""
-    made_by = {"versions": machine.versions(), "machine": machine.describe()}
-    store = Runs(options.out, made_by)
+    store = Runs(options.out, {"versions": machine.versions(), "machine": machine.identity()})
     progress = Progress(options.scenes, sweeps.order(settings, options.seeds))
     done = []
     try:

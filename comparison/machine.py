@@ -28,6 +28,12 @@ def describe():
     }
 
 
+def identity():
+    """Return what of the machine seconds depend on, and what stays the same for as long as it does: memory may be lent
+    and taken back, systems are brought up to date."""
+    return {key: value for key, value in describe().items() if key in ("processor", "cores")}
+
+
 def cores():
     """Number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()

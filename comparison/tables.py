@@ -3,17 +3,17 @@
 from . import metrics
 
 COLUMNS = (
-    "integrator", "seeds", "time [s]", "cold [s]", "spp", "rel. L1", "RMSE", "relMSE", "trimmed", "FLIP", "bias",
+    "integrator", "seeds", "time [s]", "cold [s]", "spp", "rel. L1", "RMSE", "relMSE", "trimmed", "95%", "FLIP", "bias",
     "rays", "bounds", "memory", "load",
 )  # fmt: skip
 EXPLANATION = (
     "Means over seeds. time: of the passes in the image, kernels being compiled; cold: the first pass of all with an "
     "empty kernel cache, compilation included. rel. L1: sum |x - r| / sum r; "
     f"relMSE: mean (x - r)² / (r² + {metrics.EPSILON:g} mean(r)²); trimmed: the same without the worst "
-    f"{metrics.TRIMMED:.1%} of the pixels; FLIP: mean of HDR-FLIP at 67 pixels per degree; bias: of the mean. The "
-    "reference's own noise is taken off squared errors; < marks errors below that noise, and gives the noise. rays, "
-    "bounds: shadow rays and upper bounds computed, per pixel sample. memory: peak, MB. load: the machine's load "
-    "average before the runs, the largest."
+    f"{metrics.TRIMMED:.1%} of the pixels; 95%: interval of the mean of the error that curves show (--metric); FLIP: "
+    "mean of HDR-FLIP at 67 pixels per degree; bias: of the mean. The reference's own noise is taken off squared "
+    "errors; < marks errors below that noise, and gives the noise. rays, bounds: shadow rays and upper bounds "
+    "computed, per pixel sample. memory: peak, MB. load: the machine's load average before the runs, the largest."
 )
 BUSY = 1.5  # load a core; what is measured makes up to one itself
 HEADS = {"seconds": "time [s]", "rays": "rays per pixel"}
@@ -40,17 +40,27 @@ def settings(scene):
 
 def rows(scene):
     """Return the rows of a scene: as many cells as `COLUMNS`, or (title, message) for a failure."""
-    found = []
+    intervals, found = _intervals(scene), []
     for title, renders in settings(scene).items():
         good = [render for render in renders if "error" not in render]
         if good:
-            found.append(_row(title, good))
+            found.append(_row(title, good, intervals.get(title, "")))
         failures = {render["error"]: render["seed"] for render in renders if "error" in render}
         found += [(title, message) for message in failures]
     return found
 
 
-def _row(title, renders):
+def _intervals(scene):
+    """Return the 95% intervals of errors as text, by title; none for single seeds."""
+    found = {}
+    for point in scene.get("points", []):
+        low, high = point["error"]["low"], point["error"]["high"]
+        if low is not None:
+            found[f"{point['label']} {point['setting']}".strip()] = f"{number(low)} to {number(high)}"
+    return found
+
+
+def _row(title, renders, interval):
     errors = [render["errors"] for render in renders if "errors" in render]
     bad = sum(one["bad_pixels"] for one in errors)
     cold = [render["cold_seconds"] for render in renders if render["cold_seconds"] is not None]
@@ -64,6 +74,7 @@ def _row(title, renders):
             _error(errors, *column)
             for column in (("relative_l1", ".2%"), ("rmse", ".3g"), ("relmse", ".3g"), ("relmse_trimmed", ".3g"))
         ),
+        interval,
         f"{_mean(one['flip'] for one in errors):.4f}" if errors else "n/a",
         f"{_mean(one['bias'] for one in errors):+.2%}" if errors else "n/a",
         *(_count(renders, key) for key in ("rays_per_sample", "bounds_per_sample")),

@@ -14,7 +14,8 @@ import pytest
 import compare
 from comparison import worker
 
-from .test_report import CORNELL, ROOT, SCHEMA
+from .conftest import CORNELL
+from .test_report import ROOT, SCHEMA
 
 
 def command(out):
