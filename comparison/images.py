@@ -140,7 +140,10 @@ def read_png(path):
     return np.array(mi.Bitmap(str(path)))
 
 
-def write_png(path, pixels):
-    """Write (height, width, 3) uint8 sRGB values."""
+def write_png(path, pixels, metadata=None):
+    """Write (height, width, 3) uint8 sRGB values, and metadata: a dict of text."""
+    bitmap = mi.Bitmap(np.ascontiguousarray(pixels))
+    for key, value in (metadata or {}).items():
+        bitmap.metadata()[key] = value
     with replacing(path) as temporary:
-        mi.Bitmap(np.ascontiguousarray(pixels)).write(str(temporary))
+        bitmap.write(str(temporary))

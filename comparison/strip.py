@@ -92,7 +92,8 @@ def _run(options):
     command_line.set_variant(results["variant"])
     found = panels(results, options.scene)
     pictures = [images.read_png(options.folder / f"{file}.png") for file, _ in found]
-    images.write_png(options.output, draw(pictures, [caption for _, caption in found]))
+    made = {key: results[key] for key in ("command", "created")}
+    images.write_png(options.output, draw(pictures, [caption for _, caption in found]), made)
     print(f"{options.output} ({options.output.stat().st_size / 1000:.0f} kB), made by: {results['command']}")
     return 0
 

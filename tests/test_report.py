@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import jsonschema
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -128,6 +129,7 @@ def test_strip_of_pictures(swept, tmp_path, capsys):
     expected = images.read_png(swept / "cornell.path.spp=1.png")
     np.testing.assert_array_equal(pixels[:24, :24], expected)
     assert pixels[24:].min() < 128  # captions
+    assert mi.Bitmap(str(output)).metadata()["command"].startswith("compare.py")
 
 
 @pytest.mark.parametrize(
