@@ -129,7 +129,7 @@ def test_strip_of_pictures(swept, tmp_path, capsys):
     expected = images.read_png(swept / "cornell.path.spp=1.png")
     np.testing.assert_array_equal(pixels[:24, :24], expected)
     assert pixels[24:].min() < 128  # captions
-    assert mi.Bitmap(str(output)).metadata()["command"].startswith("compare.py")
+    assert "compare.py" in mi.Bitmap(str(output)).metadata()["command"]
 
 
 @pytest.mark.parametrize(
