@@ -200,8 +200,8 @@ def chosen_settings(options):
     return settings
 
 
-def check_scenes(paths):
-    """Raise UsageError for scenes that are not there, and for two of the same name."""
+def check_scenes(paths, reference):
+    """Raise UsageError for scenes or references that are not there, and for two scenes of the same name."""
     names = {}
     for path in paths:
         command_line.check_scene(path)
@@ -209,13 +209,16 @@ def check_scenes(paths):
         if name in names:
             raise UsageError(f"'{names[name]}' and '{path}' would have files of the same name, '{name}'")
         names[name] = path
+        file = reference.file_of(name)
+        if file and not file.is_file():
+            raise UsageError(f"--reference: no file '{file}' for the scene '{path}'")
 
 
 def run(options, command):
     """Compare on all scenes; return the exit status."""
     command_line.set_variant(options.mode)
     settings = chosen_settings(options)
-    check_scenes(options.scenes)
+    check_scenes(options.scenes, options.reference)
     earlier = baseline.read(options.check) if options.check else None
     command_line.make_folder(options.out)
     with locked(options.out / ".lock", f"another comparison is writing to '{options.out}'"):

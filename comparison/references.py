@@ -40,6 +40,10 @@ class Wanted:
     fraction: float | None = None
     file: Path | None = None
 
+    def file_of(self, name):
+        """Return the file for the scene `name`, None for kinds other than "file"."""
+        return self.file / f"{name}.exr" if self.file and self.file.is_dir() else self.file
+
 
 AUTOMATIC_FRACTION = 0.2  # of which the square, 4%, is what the noise adds to a squared error before it is taken off
 

@@ -84,7 +84,7 @@ class SceneComparison:
             return None
         if wanted.kind == "path":
             return self._path_traced(wanted.spp or FIRST_SPP)
-        reference = references.read(wanted.file / f"{file.name}.exr" if wanted.file.is_dir() else wanted.file)
+        reference = references.read(wanted.file_of(file.name))
         depth, known = file.integrator[1].get("max_depth", -1), reference.description.get("max_depth")
         if known not in (None, depth):
             raise ValueError(f"the reference has max_depth {known}, the scene {depth}; try --max-depth {known}")

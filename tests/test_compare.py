@@ -396,6 +396,7 @@ def test_aovs_that_not_all_know_are_asked_of_those_that_do(monkeypatch):
         ([str(CORNELL), "--check-share", "2"], "'2' is not a fraction from 0 to 1"),
         ([str(CORNELL), "--seed", "4294967295", "--seeds", "2"], "too large for 2 seeds"),
         ([str(CORNELL), "-r", "nosuch.exr"], "neither a file"),
+        ([str(CORNELL), "-r", str(ROOT / "tests")], "/tests/cornell.exr' for the scene"),
         ([str(CORNELL), "--spp", "1", "--time", "1"], "not allowed with"),
         ([str(CORNELL), "-m", "bogus"], "unknown variant 'bogus'"),
     ],
