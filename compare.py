@@ -219,7 +219,8 @@ def run(options, command):
     command_line.set_variant(options.mode)
     settings = chosen_settings(options)
     check_scenes(options.scenes, options.reference)
-    earlier = baseline.read(options.check) if options.check else None
+    names = map(short_name, options.scenes)
+    earlier = baseline.read(options.check, options.metric, names) if options.check else None
     command_line.make_folder(options.out)
     with locked(options.out / ".lock", f"another comparison is writing to '{options.out}'"):
         results = _compare(options, settings, command)

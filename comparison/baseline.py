@@ -11,14 +11,19 @@ from . import analysis, curves
 from .command_line import UsageError
 
 
-def read(path):
-    """Return the content of a `results.json`. Raises UsageError if it is none, or has no speed-ups to check."""
+def read(path, metric, names):
+    """Return the content of a `results.json`. Raises UsageError if it is none, has no speed-ups to check, measures
+    another error than `metric`, or has none of the scenes of these names."""
     try:
         results = json.loads(Path(path).read_text())
     except (OSError, ValueError) as error:
         raise UsageError(f"--check: '{path}' cannot be read: {error}") from None
     if not isinstance(results, dict) or not list(_speed_ups(results)):
         raise UsageError(f"--check: '{path}' has no speed-ups at equal error; make it with --sweep")
+    if results["metrics"]["compared"] != metric:
+        raise UsageError(f"--check: the errors of '{path}' are {results['metrics']['compared']}, not {metric}")
+    if not {scene for scene, *_ in _speed_ups(results)} & set(names):
+        raise UsageError(f"--check: '{path}' has none of these scenes")
     return results
 
 
@@ -35,24 +40,18 @@ def _speed_ups(results):
 
 def check(results, baseline, share):
     """Return what has become worse, a list of lines: speed-ups that fell by more than a `share` (a fraction), or that
-    are not there any more. Raises UsageError if the two measure another error, or share no scene."""
+    are not there any more. Scenes that only one of the two has are left out."""
     metric = results["metrics"]["compared"]
-    if baseline["metrics"]["compared"] != metric:
-        raise UsageError(f"--check: the baseline's errors are {baseline['metrics']['compared']}, not {metric}")
-    found = {scene["name"]: scene for scene in results["scenes"]}
-    lines, compared = [], 0
+    found, lines = {scene["name"]: scene for scene in results["scenes"]}, []
     for name, base, label, cost, error, before in _speed_ups(baseline):
         if name not in found:
             continue
-        compared += 1
         now = _speed_up(found[name], base, label, cost, error, metric)
         head = f"{name}: {label} over {base}, {cost} at error {error:.3g}: {before:.3g}× before, "
         if now is None:
             lines.append(f"{head}not reached now")
         elif now < (1 - share) * before:
             lines.append(f"{head}{now:.3g}× now, {1 - now / before:.0%} less")
-    if not compared:
-        raise UsageError("--check: the baseline has none of these scenes")
     return lines
 
 

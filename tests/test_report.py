@@ -181,16 +181,16 @@ def test_check_finds_errors_that_are_no_longer_reached():
 
 
 def test_check_refuses_what_cannot_be_compared(tmp_path):
-    now, before = fake_results(5), fake_results(5)
-    before["scenes"][0]["name"] = "other"
+    file = tmp_path / "a.json"
+    file.write_text(json.dumps(fake_results(5)))
+    assert baseline.read(file, "relmse", ["box", "other"])["scenes"][0]["name"] == "box"
     with pytest.raises(UsageError, match="none of these scenes"):
-        baseline.check(now, before, 0.2)
-    before["metrics"]["compared"] = "rmse"
-    with pytest.raises(UsageError, match="errors are rmse, not relmse"):
-        baseline.check(now, before, 0.2)
-    (tmp_path / "a.json").write_text("{}")
+        baseline.read(file, "relmse", ["other"])
+    with pytest.raises(UsageError, match="are relmse, not rmse"):
+        baseline.read(file, "rmse", ["box"])
+    file.write_text("{}")
     with pytest.raises(UsageError, match="no speed-ups"):
-        baseline.read(tmp_path / "a.json")
+        baseline.read(file, "relmse", ["box"])
 
 
 def test_check_sets_the_exit_status(swept, tmp_path, capsys, monkeypatch):
