@@ -1,32 +1,48 @@
-"""Compare integrators on scenes: same scene, same time or same samples, same reference, each in a process of its own.
+"""Compare integrators on scenes: same scene, same seeds, same reference, each run in a process of its own.
 
     python compare.py scenes/hall.xml --integrators path,lightcuts --time 20 --reference path:4096
+    python compare.py scenes/cornell.xml --integrators path,lightcuts,illuminationcut --reference path:auto --sweep
     python compare.py scenes/cornell.xml --integrators coarse=lightcuts,fine=lightcuts \\
         --param coarse.error=0.02 --param fine.error=0.005 --spp 4 --reference vpl
     python compare.py --demo
 
-Prints a table and writes to the output folder, for each scene and integrator, the image (`SCENE.LABEL.exr`, with how it
-was made, and `.png`), its error (`SCENE.LABEL.error.png`) and with `--aovs` its other channels in false colours
-(`SCENE.LABEL.CHANNEL.png`), and `results.json` and `report.html` for all of them; comparison/report.py documents the
-keys of the former.
+Prints tables and writes to the output folder `report.html` (one file, with all pictures), `results.json` (documented in
+comparison/results.schema.json), and for each scene and setting the image (`SCENE.SETTING.exr`, with how it was made,
+and `.png`), its error (`SCENE.SETTING.error.png`) and with `--aovs` its other channels in false colours.
 
-Times are wall-clock seconds of rendering alone. The first pass of each process, with an empty kernel cache, is the cold
-one and is reported apart; the time budget is for warm passes. comparison/metrics.py defines the errors.
+With --sweep every integrator is rendered with several values of its quality parameter, and with several seeds: the
+report then has curves of error against time and against shadow rays, and what the same error costs.
 
-Exit status: 0; 1 if anything failed (what did not is reported all the same); 2 for a command that makes no sense.
+Times are wall-clock seconds of rendering alone. The first pass of each process is in no image, unless it alone takes
+longer than the budget. The first of all of an integrator begins with an empty kernel cache: it is the cold one, and
+reported apart. Runs of integrators take turns.
+comparison/metrics.py defines the errors.
+
+Ctrl-C leaves a report of what was finished; --resume goes on from there, also after a crash.
+
+Exit status: 0; 1 if anything failed (what did not is reported all the same); 2 for a command that makes no sense; 3 if
+--check found that a speed-up fell; 130 after Ctrl-C.
 """
 
 import argparse
 import re
 import shlex
+import signal
 import sys
 from pathlib import Path
 
-from comparison import command_line, references, report
-from comparison.command_line import UsageError, parameter, positive
-from comparison.scene_comparison import SceneComparison
+try:
+    from comparison import baseline, command_line, machine, metrics, references, report, sweeps, tables
+    from comparison.command_line import UsageError, parameter, positive
+    from comparison.progress import Progress
+    from comparison.runs import Runs, locked
+    from comparison.scene_comparison import SceneComparison
+    from comparison.scene_files import short_name
+except ModuleNotFoundError as missing:
+    sys.exit(f"compare: the package '{missing.name}' is missing; pip install 'manylights[compare]' brings it")
 
 ROOT = Path(__file__).resolve().parent
+SWEEP_SEEDS = 3  # the fewest that say something about their spread
 DEMO = [
     str(ROOT / "scenes" / "hall.xml"), "--integrators", "path,lightcuts", "--time", "30",
     "--reference", str(ROOT / "scenes" / "hall_reference.exr"),
@@ -41,36 +57,84 @@ def parse(arguments):
     add = parser.add_argument
     add("scenes", nargs="*", metavar="SCENE", help="scene files (XML)")
     add("-i", "--integrators", default="path,lightcuts", metavar="NAME,...",
-        help="integrators, each NAME or LABEL=NAME to have one twice (default: path,lightcuts)")  # fmt: skip
-    effort = parser.add_mutually_exclusive_group()
-    effort.add_argument("--time", type=positive(float), metavar="SECONDS", help="time budget of each (default: 20)")
-    effort.add_argument("--spp", type=positive(int), metavar="N", help="samples per pixel of each")
-    add("--pass-spp", type=positive(int), metavar="N",
-        help="samples per pixel of one pass, which has virtual lights of its own (default: chosen)")  # fmt: skip
+        help="integrators, each NAME or LABEL=NAME to have one twice (default: path,lightcuts); the others are "
+             "compared with the first")  # fmt: skip
     add("-p", "--param", action="append", type=parameter, default=[], metavar="LABEL.KEY=VALUE",
         help="parameter of an integrator, such as lightcuts.error=0.02; repeat for more")  # fmt: skip
-    add("--aovs", type=_names, default=[], metavar="NAME,...",
-        help="channels to show in false colours, asked of the integrators that know them: shadow_rays, upper_bounds, "
-             "cut_size, phase_one (see their docstrings)")  # fmt: skip
-    add("-r", "--reference", type=_reference, default="path:1024",
-        help="an EXR file, or a folder that holds SCENE.exr, which also gives the width; path:SPP (path traced, kept, "
-             "continued); vpl (each image by all of its own virtual lights) (default: path:1024)")  # fmt: skip
-    add("--max-depth", type=int, metavar="N", help="longest paths (default: the scene's)")
-    add("--width", type=positive(int), metavar="N", help="width of the images (default: the scene's)")
-    add("--seed", type=command_line.seed, default=0, metavar="N", help="seed (default: 0)")
-    add("--cache", type=Path, default=references.default_cache(), metavar="FOLDER",
-        help="where path-traced references are kept (default: ~/.cache/manylights)")  # fmt: skip
-    add("-o", "--out", type=Path, metavar="FOLDER", help="output folder (default: output, or output/demo)")
-    add("--demo", action="store_true", help="path and lightcuts on scenes/hall.xml, in less than three minutes")
+    _add_effort(parser)
+    _add_reference(parser)
+    _add_scene(parser)
+    _add_output(parser)
     command_line.add_common_options(parser)
 
     options = parser.parse_args(DEMO + arguments if "--demo" in arguments else arguments)
     options.out = options.out or Path("output/demo" if options.demo else "output")
     if not options.scenes:
         parser.error("no scene given; try --demo")
-    if not options.spp and not options.time:
+    if not options.spp and not options.time and not options.sweep:
         options.time = 20.0
+    count = options.seeds or (SWEEP_SEEDS if options.sweep else 1)
+    if options.seed + count > 2**32:
+        parser.error(f"--seed {options.seed}: too large for {count} seeds")
+    options.seeds = list(range(options.seed, options.seed + count))
     return options
+
+
+def _add_effort(parser):
+    effort = parser.add_mutually_exclusive_group()
+    effort.add_argument("--time", type=positive(float), metavar="SECONDS",
+                        help="time budget of each image (default: 20, unless --sweep)")  # fmt: skip
+    effort.add_argument("--spp", type=positive(int), metavar="N",
+                        help="samples per pixel of each image (default of sweeps over other parameters: "
+                             f"{sweeps.DEFAULT_SPP})")  # fmt: skip
+    add = parser.add_argument
+    add("--pass-spp", type=positive(int), metavar="N",
+        help="samples per pixel of one pass, which has virtual lights of its own (default: chosen)")  # fmt: skip
+    add("--sweep", action="append", type=sweeps.sweep, nargs="?", const=("all", None, ()), default=[],
+        metavar="LABEL:KEY=VALUE,...",
+        help="render with each of several values of a parameter, or of spp or time, such as "
+             "lightcuts:error=0.04,0.02,0.01 or path:spp=4,16,64; repeat for others; several parameters of a label "
+             "make a grid. Alone or as 'all', and for labels without one: over what trades error for time")  # fmt: skip
+    add("--seeds", type=positive(int), metavar="N",
+        help=f"how many seeds, beginning with --seed (default: 1, with --sweep {SWEEP_SEEDS})")  # fmt: skip
+    add("--seed", type=command_line.seed, default=0, metavar="N", help="first seed (default: 0)")
+
+
+def _add_reference(parser):
+    add = parser.add_argument
+    add("-r", "--reference", type=references.wanted, default="path:1024",
+        help="an EXR file, or a folder that holds SCENE.exr, which also gives the width; path:SPP (path traced, kept, "
+             "continued); path:auto or path:auto:FRACTION (continued until its noise is at most that fraction of the "
+             f"smallest error that is measured, {references.AUTOMATIC_FRACTION:g}); vpl (each image by all of its own "
+             "virtual lights) (default: path:1024)")  # fmt: skip
+    add("--reference-limit", type=positive(int), default=2**17, metavar="SPP",
+        help="most samples per pixel of path:auto (default: 131072)")  # fmt: skip
+    add("--cache", type=Path, default=references.default_cache(), metavar="FOLDER",
+        help="where path-traced references are kept (default: ~/.cache/manylights)")  # fmt: skip
+    add("--metric", choices=metrics.NAMES, default="relmse_trimmed",
+        help="error of the curves, of path:auto and of --check (default: relmse_trimmed)")  # fmt: skip
+
+
+def _add_scene(parser):
+    add = parser.add_argument
+    add("--max-depth", type=int, metavar="N", help="longest paths (default: the scene's)")
+    add("--width", type=positive(int), metavar="N", help="width of the images (default: the scene's)")
+    add("--aovs", type=_names, default=[], metavar="NAME,...",
+        help="channels to show in false colours, asked of the integrators that know them: shadow_rays, upper_bounds, "
+             "cut_size, phase_one (see their docstrings)")  # fmt: skip
+
+
+def _add_output(parser):
+    add = parser.add_argument
+    add("-o", "--out", type=Path, metavar="FOLDER", help="output folder (default: output, or output/demo)")
+    add("--resume", action="store_true",
+        help="do not repeat runs that are finished in the output folder, if parameters, scene, software and machine "
+             "are the same")  # fmt: skip
+    add("--check", type=Path, metavar="BASELINE",
+        help="a results.json: fail if a speed-up at equal error has fallen since, and say which")  # fmt: skip
+    add("--check-share", type=_share, default=0.2, metavar="FRACTION",
+        help="by how much a speed-up may fall (default: 0.2)")  # fmt: skip
+    add("--demo", action="store_true", help="path and lightcuts on scenes/hall.xml, in less than three minutes")
 
 
 def _names(text):
@@ -78,21 +142,22 @@ def _names(text):
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def _reference(text):
-    """Check the text of --reference; an argparse type."""
-    kind, _, spp = text.partition(":")
-    if kind == "path" and (not spp.isdecimal() or int(spp) == 0):
-        raise argparse.ArgumentTypeError(f"'{text}' is not of the form path:SPP")
-    if kind not in ("path", "vpl") and not Path(text).exists():
-        raise argparse.ArgumentTypeError(f"'{text}' is neither a file, nor a folder, path:SPP or vpl")
-    return text
+def _share(text):
+    """Convert a fraction from 0 to 1; an argparse type."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = -1.0
+    if not 0 <= number < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a fraction from 0 to 1")
+    return number
 
 
 def chosen_integrators(options):
     """Return a dict from label to name and parameters; raises UsageError for what does not exist or fit together."""
     chosen = {}
     for entry in options.integrators.split(","):
-        label, _, name = entry.rpartition("=")
+        label, _, name = entry.strip().rpartition("=")
         label = label or name
         if not re.fullmatch(r"[\w-]+", label) or label in chosen:
             raise UsageError(
@@ -124,26 +189,74 @@ def _ask_for(aov, chosen):
             parameters["aovs"] = ",".join(dict.fromkeys([*given, aov]))
 
 
-def run(options, command):
-    """Compare on all scenes, writing the report anew after each; return whether all went well."""
-    command_line.set_variant(options.mode)
-    integrators = chosen_integrators(options)
-    for path in options.scenes:
+def chosen_settings(options):
+    """Return all settings, label -> list; raises UsageError for those that their integrators refuse."""
+    # What `vpl` makes of the same lights and camera rays has no noise of its own that more samples would take away.
+    samples = options.reference.kind != "vpl"
+    settings = sweeps.settings(chosen_integrators(options), options.sweep, options.spp, options.time, samples)
+    for of in settings.values():
+        for setting in of:
+            command_line.check_parameters(setting.title, setting.integrator, setting.parameters)
+    return settings
+
+
+def check_scenes(paths, reference):
+    """Raise UsageError for scenes or references that are not there, and for two scenes of the same name."""
+    names = {}
+    for path in paths:
         command_line.check_scene(path)
-    options.out.mkdir(parents=True, exist_ok=True)
-    scenes, pictures = [], {}
-    for path in options.scenes:
-        comparison = SceneComparison(path, options)
-        try:
-            comparison.run(integrators)
-        finally:  # an interruption, too, leaves a report of what there is
-            scenes.append(comparison.result)
-            pictures[comparison.result["name"]] = comparison.pictures
-            report.write(options.out, report.describe(command, options, scenes), pictures)
-        print(report.table(comparison.result), end="\n\n", flush=True)
-    print(report.EXPLANATION, end="\n\n")
+        name = short_name(path)
+        if name in names:
+            raise UsageError(f"'{names[name]}' and '{path}' would have files of the same name, '{name}'")
+        names[name] = path
+        file = reference.file_of(name)
+        if file and not file.is_file():
+            raise UsageError(f"--reference: no file '{file}' for the scene '{path}'")
+
+
+def run(options, command):
+    """Compare on all scenes; return the exit status."""
+    command_line.set_variant(options.mode)
+    settings = chosen_settings(options)
+    check_scenes(options.scenes, options.reference)
+    names = map(short_name, options.scenes)
+    earlier = baseline.read(options.check, options.metric, names) if options.check else None
+    command_line.make_folder(options.out)
+    with locked(options.out / ".lock", f"another comparison is writing to '{options.out}'"):
+        results = _compare(options, settings, command)
+    print(tables.EXPLANATION, end="\n\n")
     print(f"report: {options.out / 'report.html'}")
-    return not any("error" in part for scene in scenes for part in (scene, *scene["renders"]))
+    if any("error" in part for scene in results["scenes"] for part in (scene, *scene["renders"])):
+        return 1
+    worse = baseline.check(results, earlier, options.check_share) if earlier else []
+    for line in worse:
+        print(f"compare: {line}", file=sys.stderr)
+    return 3 if worse else 0
+
+
+def _compare(options, settings, command):
+    """Make all runs, and write the report after each scene; return the content of `results.json`."""
+    store = Runs(options.out, {"versions": machine.versions(), "machine": machine.identity()})
+    progress = Progress(options.scenes, sweeps.order(settings, options.seeds))
+    done = []
+    try:
+        for path in options.scenes:
+            comparison = SceneComparison(path, settings, options, store, progress)
+            complete = False
+            try:
+                comparison.run()
+                complete = len(done) + 1 == len(options.scenes)
+            finally:  # an interruption, too, leaves a report of what there is
+                progress.skip(path)
+                comparison.finish()
+                done.append(comparison)
+                results = report.describe(command, options, [one.result for one in done], complete)
+                report.write(options.out, results, [one.pictures for one in done])
+                progress.write(report.text(comparison.result) + "\n")
+        return results
+    finally:
+        progress.close()
+        store.forget_kernels()
 
 
 def main(arguments=None):
@@ -152,9 +265,13 @@ def main(arguments=None):
     options = parse(arguments)
     command = shlex.join(["compare.py", *arguments])
     return command_line.exit_status(
-        "compare", lambda: 0 if run(options, command) else 1, f"what was finished is in {options.out}", options.verbose
+        "compare",
+        lambda: run(options, command),
+        f"what was finished is in {options.out}; --resume goes on",
+        options.verbose,
     )
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     sys.exit(main())

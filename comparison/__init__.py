@@ -1,11 +1,26 @@
 """What `manylights.py` and `compare.py` share: loading scenes, rendering them in passes, images, errors, and reports.
 
-`scene_files`  parse a scene file, change its integrator or its size, and load it
-`rendering`    average passes of different seeds, within samples or seconds
-`images`       EXR files with metadata, tone mapping, false colours
-`metrics`      how far an image is from a reference (NumPy only)
-`references`   references from files, and path-traced ones that are kept and continued
-`worker`       render and measure one integrator in a process of its own
-`report`       the table, `results.json` and `report.html`
-`command_line` what the two commands' options and error messages have in common
+`scene_files`   parse a scene file, change its integrator or its size, and load it
+`rendering`     average passes of different seeds, within samples or seconds
+`images`        EXR files with metadata, tone mapping, false colours
+`metrics`       how far an image is from a reference
+`references`    references from files, and path-traced ones that are kept and continued
+`worker`        render and measure one integrator in a process of its own
+`runs`          finished runs, kept to go on after an interruption
+`sweeps`        which parameters integrators are rendered with, and in which order
+`scene_comparison`, `progress`
+                all runs on one scene; how far they are
+`curves`, `analysis`
+                error against time and rays: means, intervals, what is read off; from runs to these
+`tables`, `report`, `plots`, `pictures`, `page_images`, `page`
+                tables, `results.json` (`results.schema.json`) and `report.html`
+`strip`         pictures beside each other, for a paper
+`baseline`      have speed-ups fallen since an earlier comparison?
+`machine`       processor, load, versions
+`command_line`  what the two commands' options and error messages have in common
 """
+
+import os
+
+# FLIP's threads would otherwise wait for each other in a busy loop: a hundred times slower on a loaded machine.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")

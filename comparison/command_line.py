@@ -1,8 +1,9 @@
 """What the two commands share: options of the form key=value, variants and integrators by name, errors in one line."""
 
-import argparse
 import re
 import sys
+import tempfile
+from argparse import ArgumentTypeError
 from importlib import metadata
 from pathlib import Path
 
@@ -29,7 +30,7 @@ def definition(text):
     """Split `key=value`; an argparse type."""
     key, separator, content = text.partition("=")
     if not separator or not key:
-        raise argparse.ArgumentTypeError(f"'{text}' is not of the form key=value")
+        raise ArgumentTypeError(f"'{text}' is not of the form key=value")
     return key, content
 
 
@@ -48,7 +49,7 @@ def positive(kind):
         except ValueError:
             number = 0
         if not 0 < number < float("inf"):
-            raise argparse.ArgumentTypeError(f"'{text}' is not a positive {'whole ' if kind is int else ''}number")
+            raise ArgumentTypeError(f"'{text}' is not a positive {'whole ' if kind is int else ''}number")
         return number
 
     return convert
@@ -57,7 +58,7 @@ def positive(kind):
 def seed(text):
     """Convert the text of a seed, 0 to 2^32 - 1; an argparse type."""
     if not text.isdecimal() or int(text) >= 2**32:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to 4294967295")
+        raise ArgumentTypeError(f"'{text}' is not a whole number from 0 to 4294967295")
     return int(text)
 
 
@@ -100,6 +101,41 @@ def check_integrator(name):
         raise UsageError(
             f"unknown integrator '{name}'; there are {', '.join(own_integrators())} and Mitsuba's {', '.join(builtin)}"
         ) from None
+
+
+def check_parameters(title, name, parameters):
+    """Raise UsageError if an integrator refuses parameters, or knows nothing of them; `title` is what it is called.
+    Nothing is said of integrators that cannot be created alone, as they need parts that only a scene gives them."""
+    properties = mi.Properties(name)
+    for key, content in parameters.items():
+        properties[key] = content
+    try:
+        mi.PluginManager.instance().create_object(properties)
+    except (RuntimeError, ValueError) as error:
+        if _can_be_created(name):
+            raise UsageError(f"{title}: {explain(error)}") from None
+        return
+    unknown = [key for key in parameters if not properties.was_queried(key)]
+    if unknown:
+        raise UsageError(f"{title}: the integrator '{name}' has no parameter '{unknown[0]}'")
+
+
+def _can_be_created(name):
+    try:
+        mi.PluginManager.instance().create_object(mi.Properties(name))
+    except (RuntimeError, ValueError):
+        return False
+    return True
+
+
+def make_folder(path):
+    """Make a folder, with those above it, and see whether it can be written to; raises UsageError if not."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise UsageError(f"cannot write to the folder '{path}': {error.strerror}") from None
 
 
 def aov_refusal(integrator, aov):

@@ -5,6 +5,7 @@ EXR files are OpenEXR's matter rather than Mitsuba's, whose writer waits for eve
 
 import json
 import os
+import re
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,6 +30,13 @@ def replacing(path):
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_abandoned(folder):
+    """Remove temporary files that killed processes left in a folder; nobody may be writing there."""
+    for file in Path(folder).iterdir():
+        if re.fullmatch(r"\..+\.\d+\.(exr|png|json|html)", file.name):
+            file.unlink()
 
 
 def write_exr(path, image, channels, metadata=None, half=False):
@@ -56,8 +64,17 @@ def read_exr(path):
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = sorted(file.channels())
         image = np.stack([file.channels()[name].pixels.astype(np.float32) for name in channels], axis=-1)
-        metadata = {key: value for key, value in file.header().items() if isinstance(value, int | float | str)}
-    return image, channels, metadata
+        return image, channels, _plain(file.header())
+
+
+def read_exr_metadata(path):
+    """Return the metadata of an EXR file without reading its pixels."""
+    with OpenEXR.File(str(path), header_only=True) as file:
+        return _plain(file.header())
+
+
+def _plain(header):
+    return {key: value for key, value in header.items() if isinstance(value, int | float | str)}
 
 
 def colour(image, channels, layer=""):
@@ -85,14 +102,24 @@ def tone_map(rgb, exposure):
     return (encoded * 255 + 0.5).astype(np.uint8)
 
 
+def logarithmic_position(values, ends):
+    """Return where values, (height, width), are on a logarithmic scale with the given ends: 0 to 1. What is below it,
+    such as zero, is at 0, what is above it or not a number at 1."""
+    low, high = np.log(ends)
+    position = (np.log(np.maximum(np.nan_to_num(values, nan=np.inf), ends[0])) - low) / (high - low)
+    return np.clip(position, 0, 1)
+
+
 def false_colours(values, ends=ERROR_RANGE):
     """Return the colours, (height, width, 3) uint8, of values, (height, width), on a logarithmic scale with the given
     ends, by default that of relative errors. What is below it, such as zero, has the lowest colour, what is above it or
     not a number the highest."""
-    low, high = np.log(ends)
-    position = (np.log(np.maximum(np.nan_to_num(values, nan=np.inf), ends[0])) - low) / (high - low)
-    position = np.clip(position, 0, 1) * (len(FALSE_COLOURS) - 1)
-    stops = np.arange(len(FALSE_COLOURS))
+    return palette(logarithmic_position(values, ends))
+
+
+def palette(position):
+    """Return the colours (..., 3) uint8 of positions (...) between 0 and 1 on the scale of false colours."""
+    stops = np.linspace(0, 1, len(FALSE_COLOURS))
     return np.stack([np.interp(position, stops, FALSE_COLOURS[:, i]) for i in range(3)], axis=-1).astype(np.uint8)
 
 
@@ -108,7 +135,15 @@ def logarithmic_ends(planes):
     return min(low, high / 2), high
 
 
-def write_png(path, pixels):
-    """Write (height, width, 3) uint8 sRGB values."""
+def read_png(path):
+    """Return the pixels, (height, width, 3) uint8, of a PNG file of colours."""
+    return np.array(mi.Bitmap(str(path)))
+
+
+def write_png(path, pixels, metadata=None):
+    """Write (height, width, 3) uint8 sRGB values, and metadata: a dict of text."""
+    bitmap = mi.Bitmap(np.ascontiguousarray(pixels))
+    for key, value in (metadata or {}).items():
+        bitmap.metadata()[key] = value
     with replacing(path) as temporary:
-        mi.Bitmap(np.ascontiguousarray(pixels)).write(str(temporary))
+        bitmap.write(str(temporary))

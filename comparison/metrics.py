@@ -1,14 +1,17 @@
-"""How far an image is from a reference. NumPy only; images are (height, width, 3), errors plain numbers.
+"""How far an image is from a reference; images are (height, width, 3), errors plain numbers.
 
 A path-traced reference has noise of its own. Where its standard error is known, the expected square of that noise is
 taken off every squared error, so that a perfect image scores zero on average; and an error that is smaller than the
 noise is named as such, because it can then no longer be told from zero.
 """
 
+import flip_evaluator
 import numpy as np
 
 EPSILON = 1e-2  # added to the square of the reference in relMSE, as a fraction of the square of its mean
 TRIMMED = 1e-3  # fraction of the pixels, those with the largest errors, that trimmed relMSE leaves out
+SQUARED = ("relmse", "relmse_trimmed")  # errors whose noise falls with the samples, not with their root
+NAMES = ("relative_l1", "rmse", "relmse", "relmse_trimmed")
 
 
 def compare(image, reference, standard_error=None):
@@ -67,6 +70,22 @@ def relative_error(image, reference):
     """Return |x - r| / (r + 1% of the mean r), (height, width), averaged over the channels: what error images show."""
     floor = EPSILON * reference.mean()
     return (np.abs(image - reference) / (np.abs(reference) + floor)).mean(axis=-1)
+
+
+def distance(image, reference):
+    """Return the Euclidean distance of the colours, (height, width)."""
+    return np.sqrt(np.square(np.asarray(image, np.float64) - reference).sum(axis=-1))
+
+
+def flip(image, reference):
+    """Return the map of HDR-FLIP, (height, width) from 0 to 1, its mean, and the settings it was made with (a dict).
+
+    How different the two look when flipped between, over the exposures at which the reference shows something; for 67
+    pixels per degree of the eye's view. Negative values and values that are not finite count as black.
+    """
+    shown = [np.maximum(np.nan_to_num(one, posinf=0, neginf=0), 0).astype(np.float32) for one in (reference, image)]
+    values, mean, settings = flip_evaluator.evaluate(*shown, "HDR", applyMagma=False)
+    return np.clip(values[..., 0], 0, 1), float(mean), settings
 
 
 def _all_but_largest(values, fraction):

@@ -8,23 +8,72 @@ can be given away (in half precision):
 """
 
 import argparse
+import hashlib
 import shlex
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
 from . import command_line, images
 from .rendering import Progressive, largest_pass, pass_seed
+from .runs import locked
 from .scene_files import SceneFile
 
 LAYERS = ["R", "G", "B", "se.R", "se.G", "se.B"]
 BATCHES = 32  # at least, for a standard error that is itself known to some 13%
 SEED = 2_718_281_828  # unlike any that people choose: a reference must not share its noise with what it judges
 SAVE_SECONDS = 20.0  # how much work an interruption may lose
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """The reference that somebody asks for: of `kind` "path" with `spp` samples per pixel, or, if that is None, with as
+    many as bring its noise to `fraction` of the smallest error; of kind "file" with a `file` or folder; or "vpl"."""
+
+    kind: str
+    spp: int | None = None
+    fraction: float | None = None
+    file: Path | None = None
+
+    def file_of(self, name):
+        """Return the file for the scene `name`, None for kinds other than "file"."""
+        return self.file / f"{name}.exr" if self.file and self.file.is_dir() else self.file
+
+
+AUTOMATIC_FRACTION = 0.2  # of which the square, 4%, is what the noise adds to a squared error before it is taken off
+
+
+def wanted(text):
+    """Read the text of --reference; an argparse type."""
+    form = f"'{text}' is not of the form path:SPP, path:auto or path:auto:FRACTION"
+    kind, _, detail = text.partition(":")
+    if text == "vpl":
+        return Wanted("vpl")
+    if kind == "path":
+        spp, _, fraction = detail.partition(":")
+        if spp == "auto":
+            return Wanted("path", fraction=_fraction(fraction, form) if ":" in detail else AUTOMATIC_FRACTION)
+        if not detail.isdecimal() or int(detail) == 0:
+            raise argparse.ArgumentTypeError(form)
+        return Wanted("path", spp=int(detail))
+    if not Path(text).exists():
+        raise argparse.ArgumentTypeError(f"'{text}' is neither a file, nor a folder, path:SPP, path:auto or vpl")
+    return Wanted("file", file=Path(text))
+
+
+def _fraction(text, form):
+    try:
+        fraction = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(form) from None
+    if not 0 < fraction < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a fraction between 0 and 1")
+    return fraction
 
 
 @dataclass
@@ -67,59 +116,74 @@ def default_cache():
 
 def path_traced(scene_file, spp, cache):
     """Return the path-traced reference of a `SceneFile` (which this consumes, and whose `max_depth` it keeps) with at
-    least `spp` samples per pixel: from the folder `cache` if it is there, begun or continued there if not."""
+    least `spp` samples per pixel: from the folder `cache` if it is there, begun or continued there if not.
+
+    It is found by all that it depends on: the scene with its parameters and files, and the version of Mitsuba. Who
+    comes while another process works on it waits for that. Raises ValueError for a file there that cannot be read.
+    """
     scene_file.set_integrator("path")
     _, parameters = scene_file.integrator
-    file = Path(cache) / f"{scene_file.name}-{scene_file.fingerprint()[:16]}.exr"
-    batches = Batches.read(file) if file.is_file() else None
-    if batches is None or batches.spp < spp:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        progressive = Progressive(scene_file.load(), SEED)
-        if batches is None:
-            batches = Batches(max(1, min(-(-spp // BATCHES), largest_pass(progressive.pixels))))
-        described = {"integrator": "path", "scene": scene_file.name, "seed": SEED, **parameters}
-        _continue(batches, progressive, spp, file, described)
+    key = hashlib.sha256(f"{scene_file.fingerprint()} {mi.__version__}".encode()).hexdigest()[:16]
+    file = Path(cache) / f"{scene_file.name}-{key}.exr"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with locked(file.with_suffix(".lock")):
+        batches = _read_batches(file)
+        if batches.spp < spp or batches.count < 2:
+            described = {"integrator": "path", "scene": scene_file.name, "seed": SEED, **parameters}
+            described["mitsuba"] = mi.__version__
+            _continue(batches, Progressive(scene_file.load(), SEED), spp, file, described)
     return read(file)
 
 
+def _read_batches(file):
+    if not file.is_file():
+        return Batches()
+    try:
+        return Batches.read(file)
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
+        raise ValueError(f"the kept reference '{file}' cannot be read ({error}); delete it to make it anew") from error
+
+
 def _continue(batches, progressive, spp, file, described):
-    """Render batches until there are `spp` samples per pixel (and at least two batches), saving them now and then."""
+    """Render batches until there are `spp` samples per pixel (and at least two batches), saving them now and then, and
+    when interrupted."""
     saved = time.monotonic()
-    with tqdm(total=spp, initial=batches.spp, desc="reference", unit="spp", disable=None) as bar:
-        while batches.spp < spp or batches.count < 2:
-            progressive.restart()
-            progressive.render(batches.batch_spp, pass_seed(progressive.seed, batches.count))
-            batches.add(images.colour(progressive.image, progressive.channels))
-            bar.update(batches.batch_spp)
-            if time.monotonic() - saved > SAVE_SECONDS:
-                batches.write(file, described)
-                saved = time.monotonic()
-    batches.write(file, described)
+    batch_spp = max(1, min(-(-(spp - batches.spp) // BATCHES), largest_pass(progressive.pixels)))
+    try:
+        with tqdm(total=spp, initial=batches.spp, desc="reference", unit="spp", disable=None, leave=False) as bar:
+            while batches.spp < spp or batches.count < 2:
+                progressive.restart()
+                progressive.render(batch_spp, pass_seed(progressive.seed, batches.count))
+                batches = batches.with_batch(images.colour(progressive.image, progressive.channels), batch_spp)
+                bar.update(batch_spp)
+                if time.monotonic() - saved > SAVE_SECONDS:
+                    batches.write(file, described)
+                    saved = time.monotonic()
+    finally:
+        batches.write(file, described)
 
 
+@dataclass(frozen=True)
 class Batches:
-    """The mean of batches of `batch_spp` samples per pixel and its standard error, added to one by one (Welford)."""
+    """The mean of batches of samples, (height, width, 3), and what its standard error follows from. Batches may differ
+    in size: each counts by its samples per pixel, to which its variance is inverse. (Welford's sums.)"""
 
-    def __init__(self, batch_spp, count=0, mean=0.0, standard_error=0.0):
-        self.batch_spp, self.count, self.mean = batch_spp, count, mean
-        self._squares = np.square(standard_error) * count * (count - 1)
+    spp: int = 0
+    count: int = 0
+    mean: np.ndarray | float = 0.0
+    squares: np.ndarray | float = 0.0  # sum of squared deviations, times the samples per pixel of each
 
-    @property
-    def spp(self):
-        return self.batch_spp * self.count
-
-    def add(self, image):
-        """Add the image of one more batch, (height, width, 3); pixels that are not finite count as black."""
+    def with_batch(self, image, spp):
+        """Return these and one more batch of `spp` samples per pixel; pixels that are not finite count as black."""
         image = np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0)
-        self.count += 1
-        difference = image - self.mean
-        self.mean = self.mean + difference / self.count
-        self._squares = self._squares + difference * (image - self.mean)
+        difference, total = image - self.mean, self.spp + spp
+        mean = self.mean + difference * (spp / total)
+        return Batches(total, self.count + 1, mean, self.squares + spp * difference * (image - mean))
 
     @property
     def standard_error(self):
         """Of the mean, (height, width, 3); needs two batches."""
-        return np.sqrt(self._squares / (self.count * (self.count - 1)))
+        return np.sqrt(self.squares / (self.spp * (self.count - 1)))
 
     def write(self, path, described):
         """Write mean and standard error to an EXR file that `read` reads; needs two batches."""
@@ -131,8 +195,8 @@ class Batches:
     def read(cls, path):
         image, channels, metadata = images.read_exr(path)
         mean, error = images.colour(image, channels), images.colour(image, channels, "se.")
-        count = metadata["batches"]
-        return cls(metadata["spp"] // count, count, mean.astype(np.float64), error.astype(np.float64))
+        spp, count = metadata["spp"], metadata["batches"]
+        return cls(spp, count, mean.astype(np.float64), np.square(error, dtype=np.float64) * spp * (count - 1))
 
 
 def main():

@@ -1,47 +1,73 @@
-"""Compare integrators on one scene: reference, renders in processes of their own, errors, pictures."""
+"""Compare integrators on one scene: reference, renders in processes of their own, errors, curves, pictures."""
 
+import math
 import traceback
 from pathlib import Path
 
 import numpy as np
 
-from . import images, metrics, references, worker
+from . import analysis, images, metrics, references, worker
 from .command_line import explain, own_integrators
-from .scene_files import SceneFile
+from .pictures import Pictures
+from .scene_files import SceneFile, short_name
+from .sweeps import order
+
+FIRST_SPP = 64  # of a reference that is continued until its noise is small enough
+GROWTH = (1.2, 4.0)  # least and largest factor by which it is continued at a time
 
 
 class SceneComparison:
-    """The comparison on one scene. `options` are those of compare.py's command line.
+    """The comparison on one scene: `settings` (label -> list of `sweeps.Setting`) with each of `options.seeds`.
 
-    `result` is the scene's part of `results.json` (see report.py); `pictures` maps titles ("reference", the labels of
-    the integrators, and those with ".error" added) to PNG files. Both fill up as `run` goes on.
+    `options` are those of compare.py's command line, `store` keeps finished runs (`runs.Runs`), `progress` is told what
+    is done (`progress.Progress`). `result` is the scene's part of `results.json`, complete after `finish`; `pictures`
+    are then those to show.
     """
 
-    def __init__(self, path, options):
-        self.path, self.options, self.pictures = path, options, {}
-        self._aovs = {}  # channel -> label -> values, (height, width)
-        self.result = {"scene": str(path), "name": Path(path).stem, "renders": []}
+    def __init__(self, path, settings, options, store, progress):
+        self.path, self.settings, self.options = path, settings, options
+        self._store, self._progress = store, progress
+        self._reference, self.pictures = None, None
+        self.result = {"scene": str(path), "name": short_name(path), "renders": []}
 
-    def run(self, integrators):
-        """Render all integrators (label -> name and parameters). What fails is recorded, and the others go on."""
+    def run(self):
+        """Make all runs. What fails is recorded, and the others go on."""
         try:
             file = self._parse()
-            self.result |= {"name": file.name, "hash": file.fingerprint()}
-            reference = self._reference(file)
-            exposure = self._show_reference(reference) if reference else None
+            self.result["hash"] = file.fingerprint()
+            self._reference = self._first_reference(file)
         except Exception as error:  # whatever it is, it must not lose the other scenes
-            self.result |= _failure(error)
+            self._fail(error)
             return
-        for label, (name, parameters) in integrators.items():
-            # Its width is the reference's, unless given: then a difference is an error.
-            width = self.options.width or (reference.size[0] if reference else None)
-            result = worker.run(self._job(label, name, parameters, width))
-            self.result["renders"].append(result)
-            if "error" not in result:
-                try:
-                    exposure = self._assess(result, reference, exposure)
-                except Exception as error:
-                    result |= _failure(error)
+        for setting, seed in order(self.settings, self.options.seeds):
+            self._render(setting, seed)
+        if self.options.reference.fraction:
+            try:
+                self._refine_reference()
+            except Exception as error:
+                self._fail(error)
+
+    def finish(self):
+        """Measure the errors of all runs that there are, and make curves and pictures."""
+        if "hash" not in self.result:
+            return
+        self.pictures = Pictures(self.options.out, self.result["name"])
+        if self._reference:
+            self._describe_reference()
+            self.pictures.show("reference", None, "reference", self._reference.image)
+        labels = list(self.settings)
+        for result in sorted(self._finished(), key=lambda result: labels.index(result["label"])):
+            try:
+                self._assess(result)
+            except Exception as error:
+                result |= _failure(error)
+        names = {setting.title: setting.file_name for of in self.settings.values() for setting in of}
+        if aovs := self.pictures.write_aovs(names):
+            self.result["aovs"] = aovs
+        self.result |= analysis.analyse(self.result["renders"], list(self.settings), self.options.metric)
+        self.result["pictures"] = {"exposure": self.pictures.exposure, "block": self.pictures.block}
+
+    # --- References ---
 
     def _parse(self):
         file = SceneFile(self.path, dict(self.options.define))
@@ -51,84 +77,120 @@ class SceneComparison:
             file.set_width(self.options.width)
         return file
 
-    def _reference(self, file):
+    def _first_reference(self, file):
         """Return the reference, or None if each image has one of its own."""
         wanted = self.options.reference
-        if wanted == "vpl":
+        if wanted.kind == "vpl":
             return None
-        if wanted.startswith("path:"):
-            return references.path_traced(self._parse(), int(wanted[5:]), self.options.cache)
-        reference = references.read(Path(wanted) / f"{file.name}.exr" if Path(wanted).is_dir() else wanted)
+        if wanted.kind == "path":
+            return self._path_traced(wanted.spp or FIRST_SPP)
+        reference = references.read(wanted.file_of(file.name))
         depth, known = file.integrator[1].get("max_depth", -1), reference.description.get("max_depth")
         if known not in (None, depth):
             raise ValueError(f"the reference has max_depth {known}, the scene {depth}; try --max-depth {known}")
         return reference
 
-    def _show_reference(self, reference):
-        """Tone-map the reference and describe it in the results; return its exposure, which all images share."""
-        exposure = images.automatic_exposure(reference.image)
-        self._picture("reference", images.tone_map(reference.image, exposure))
-        noise = None
-        if reference.standard_error is not None:
-            noise = metrics.compare(reference.image, reference.image, reference.standard_error)["noise"]
-        self.result["reference"] = reference.description | {"noise": noise}
-        return exposure
+    def _path_traced(self, spp):
+        with self._progress.paused():
+            return references.path_traced(self._parse(), spp, self.options.cache)
 
-    def _job(self, label, name, parameters, width):
-        options = self.options
+    def _refine_reference(self):
+        """Continue the reference until its noise is at most the wanted fraction of the smallest error of any run, or
+        the limit of samples is reached."""
+        wanted = self.options.reference
+        while True:
+            spp, share = self._reference.description["spp"], self._noise_share()
+            if share is None or share <= wanted.fraction or spp >= self.options.reference_limit:
+                self.result |= {"reference_share": share, "reference_fraction": wanted.fraction}
+                return
+            growth = np.clip((share / wanted.fraction) ** 2, *GROWTH)
+            self._reference = self._path_traced(min(self.options.reference_limit, math.ceil(spp * growth)))
+
+    def _noise_share(self):
+        """Return the largest share that the reference's noise has in the error of a run, None if there are no runs.
+        Shares of squared errors are given as those of their roots."""
+        metric, shares = self.options.metric, []
+        for result in self._finished():
+            errors = self._errors(images.colour(*images.read_exr(result["output"])[:2]), self._reference)
+            noise, error = errors["noise"][metric], errors[metric]
+            share = noise / error if error > 0 else np.inf
+            shares.append(float(np.sqrt(share) if metric in metrics.SQUARED else share))
+        return max(shares, default=None)
+
+    def _describe_reference(self):
+        noise = None
+        if self._reference.standard_error is not None:
+            noise = self._errors(self._reference.image, self._reference)["noise"]
+        self.result["reference"] = self._reference.description | {"noise": noise}
+
+    # --- Runs ---
+
+    def _render(self, setting, seed):
+        job = self._job(setting, seed)
+        job.run = self._store.key(job, self.result["hash"])
+        result = self._store.find(job) if self.options.resume else None
+        kept = result is not None
+        self._progress.begin(self.path, setting)
+        if not kept:
+            result = worker.run(job, self._progress.tick)
+            if "error" not in result:
+                self._store.save(result)
+        result |= {"setting": setting.name, "swept": setting.swept}
+        self._progress.end(kept)
+        self.result["renders"].append(result)
+
+    def _job(self, setting, seed):
+        options, name = self.options, self.result["name"]
         # Mitsuba's own integrators have no virtual lights to share.
-        with_vpl = options.reference == "vpl" and name in own_integrators()
+        with_vpl = options.reference.kind == "vpl" and setting.integrator in own_integrators()
+        file_name = setting.file_name + (f".seed{seed}" if len(options.seeds) > 1 else "")
         return worker.Job(
-            label=label,
-            integrator=name,
-            parameters=parameters,
+            label=setting.label,
+            integrator=setting.integrator,
+            parameters=setting.parameters,
             scene=str(self.path),
-            output=str(self._output(label, ".exr")),
-            vpl_output=str(self._output(label, ".vpl.exr")) if with_vpl else None,
+            output=str(options.out / f"{name}.{file_name}.exr"),
+            vpl_folder=str(options.out) if with_vpl else None,
             variant=options.mode,
             defines=dict(options.define),
-            width=width,
+            # Its width is the reference's, unless given: then a difference is an error.
+            width=options.width or (self._reference.size[0] if self._reference else None),
             max_depth=options.max_depth,
-            seed=options.seed,
-            budget=options.time,
-            spp=options.spp,
+            seed=seed,
+            budget=setting.time,
+            spp=setting.spp,
             pass_spp=options.pass_spp,
             threads=options.threads,
+            kernel_cache=str(self._store.kernels / f"{name}.{setting.label}"),
         )
 
-    def _assess(self, result, reference, exposure):
-        """Add the errors of a render to its result, and make its pictures; return the exposure that they have."""
+    def _finished(self):
+        return [result for result in self.result["renders"] if "error" not in result]
+
+    # --- Errors and pictures ---
+
+    def _assess(self, result):
+        """Add the errors of a run to its result; show the first seed's image."""
         planes, channels, _ = images.read_exr(result["output"])
-        image, label = images.colour(planes, channels).astype(np.float64), result["label"]
-        if result["vpl_output"]:
-            reference = references.read(result["vpl_output"])
-        exposure = exposure or images.automatic_exposure(image)
-        self._picture(label, images.tone_map(image, exposure))
+        image = images.colour(planes, channels).astype(np.float64)
+        reference = references.read(result["vpl_output"]) if result["vpl_output"] else self._reference
+        flip = None
         if reference:
-            result["errors"] = metrics.compare(image, reference.image, reference.standard_error)
-            self._picture(f"{label}.error", images.false_colours(metrics.relative_error(image, reference.image)))
-        self._show_aovs(label, planes, channels)
-        return exposure
+            result["errors"] = self._errors(image, reference)
+            flip, result["errors"]["flip"], result["errors"]["flip_settings"] = metrics.flip(image, reference.image)
+        if result["seed"] == self.options.seeds[0]:
+            title = f"{result['label']} {result['setting']}".strip()
+            file_name = Path(result["output"]).name[len(self.result["name"]) + 1 : -len(".exr")]
+            file_name = file_name.removesuffix(f".seed{result['seed']}")
+            self.pictures.show(title, result["label"], file_name, image, reference.image if reference else None, flip)
+            self.pictures.add_aovs(self.options.aovs, title, planes, channels)
 
-    def _show_aovs(self, label, planes, channels):
-        """Draw the AOV channels of a render, and those of earlier ones anew, as this one may widen their scale."""
-        for aov in self.options.aovs:
-            for index, channel in enumerate(channels):
-                if channel.partition(".")[0] == aov:  # "aov", or "aov.R" of one that is a colour
-                    self._aovs.setdefault(channel, {})[label] = planes[..., index].copy()
-        for channel, of in self._aovs.items():
-            ends, files = images.logarithmic_ends(of.values()), {}
-            for label, values in of.items():
-                files[label] = str(self._output(f"{label}.{channel}", ".png"))
-                images.write_png(files[label], images.false_colours(values, ends))
-            self.result.setdefault("aovs", {})[channel] = {"scale": ends, "files": files}
+    @staticmethod
+    def _errors(image, reference):
+        return metrics.compare(image, reference.image, reference.standard_error)
 
-    def _picture(self, title, pixels):
-        self.pictures[title] = self._output(title, ".png")
-        images.write_png(self.pictures[title], pixels)
-
-    def _output(self, title, suffix):
-        return self.options.out / f"{self.result['name']}.{title}{suffix}"
+    def _fail(self, error):
+        self.result |= _failure(error)
 
 
 def _failure(error):

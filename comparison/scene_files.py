@@ -15,6 +15,12 @@ import mitsuba as mi
 KEPT_PARAMETERS = ("max_depth", "rr_depth", "hide_emitters")
 
 
+def short_name(path):
+    """Return what a scene file is called for short: its name, or that of its folder where it is just `scene.xml`."""
+    path = Path(path)
+    return path.resolve().parent.name if path.stem == "scene" else path.stem
+
+
 class SceneFile:
     """A parsed scene file. A variant must be set.
 
@@ -31,8 +37,8 @@ class SceneFile:
 
     @property
     def name(self):
-        """A short name: that of the file, or of its folder where the file is just called `scene.xml`."""
-        return self.path.resolve().parent.name if self.path.stem == "scene" else self.path.stem
+        """See `short_name`."""
+        return short_name(self.path)
 
     @property
     def integrator(self):

@@ -4,6 +4,7 @@ In a fresh process with an empty kernel cache the first pass is honestly cold, t
 and a crash loses nothing else. The job is a JSON file (see `Job`), the result another (see `run`).
 """
 
+import hashlib
 import json
 import os
 import resource
@@ -11,20 +12,20 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from dataclasses import asdict, dataclass, field
 from itertools import count
 from pathlib import Path
 
-from tqdm import tqdm
-
-from . import images
+from . import images, machine
 from .command_line import explain, set_variant, versions
 from .rendering import Progressive, largest_pass, pass_seed, pass_sizes, total_statistics
 from .scene_files import SceneFile
 
 ROOT = Path(__file__).resolve().parent.parent
+TICK = 0.5  # seconds
 LONG_PASS = 60.0  # seconds; with given samples, a first pass longer than this is no longer rendered twice
 PASSES_IN_BUDGET = 5  # or about so many, unless even passes of one sample per pixel take longer
 UNUSED_PASSES = 2**31  # passes that are not in the image are numbered from here, so that they share no lights with it
@@ -33,8 +34,9 @@ UNUSED_PASSES = 2**31  # passes that are not in the image are numbered from here
 @dataclass
 class Job:
     """What to render: either for `budget` seconds or with `spp` samples per pixel, in passes of `pass_spp` (None
-    chooses). `output` is the EXR file to write;
-    `vpl_output`, if given, is where to write the same passes rendered by `vpl`, with the same virtual lights."""
+    chooses). `output` is the EXR file to write, which `run` is noted in. `vpl_folder`, if given, is where to keep the
+    same passes rendered by `vpl`, with the same virtual lights: once for all jobs that share them. `kernel_cache` is
+    the folder of compiled kernels, a fresh one if None."""
 
     label: str
     integrator: str
@@ -50,32 +52,57 @@ class Job:
     spp: int | None = None
     pass_spp: int | None = None
     threads: int | None = None
-    vpl_output: str | None = None
+    vpl_folder: str | None = None
+    kernel_cache: str | None = None
+    run: str | None = None
 
 
-def run(job):
+def run(job, tick=lambda: None):
     """Run a job in a new process and return its result: a dict with the keys of the job that identify it, and
 
-    `width`, `height`; `load_seconds`; `cold_seconds` (the first pass, compilation included); `warm_seconds` (mean of
-    the later passes that are in the image, None if there are none); `seconds`, `spp`, `passes` (of the image);
-    `pass_spp`; `cold_pass_kept`; `peak_memory_bytes`; `statistics` (the integrator's counters, added up, {} if it has
-    none); `rays_per_sample`, `bounds_per_sample`, `cut_size_per_sample` (per pixel sample, None if not counted).
+    `width`, `height`; `load_seconds`; `load_average` (before the run, see machine.load); `cold_seconds` (the first
+    pass, compilation included; None if the kernel cache was not empty); `warm_seconds` (mean of the later passes that
+    are in the image, None if there are none); `seconds`, `spp`, `passes` (of the image); `pass_spp`;
+    `cold_pass_kept`; `peak_memory_bytes`; `statistics` (the integrator's counters, added up, {} if it has none);
+    `rays_per_sample`, `bounds_per_sample`, `cut_size_per_sample` (per pixel sample, None if not counted); `vpl_output`
+    (the EXR file with what `vpl` made of the same passes, None if not asked for).
 
-    After a failure it holds `error` (one line) and `traceback` instead.
+    After a failure it holds `error` (one line) and `traceback` instead. `tick` is called every half second. The process
+    ends with this one, even if this one is killed.
     """
-    result = asdict(job)
+    result = asdict(job) | {"load_average": machine.load()}
     with tempfile.TemporaryDirectory(prefix="manylights-") as folder:
         job_file, result_file = Path(folder) / "job.json", Path(folder) / "result.json"
-        job_file.write_text(json.dumps(result))
-        environment = os.environ | {"DRJIT_CACHE_DIR": folder}
+        job_file.write_text(json.dumps(asdict(job)))
+        kernels = Path(job.kernel_cache or folder) / "kernels"
+        kernels.mkdir(parents=True, exist_ok=True)
+        is_cold = not any(kernels.iterdir())
+        environment = os.environ | {"DRJIT_CACHE_DIR": str(kernels)}
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
         command = [sys.executable, "-m", "comparison.worker", str(job_file), str(result_file)]
-        status = subprocess.run(command, env=environment).returncode
+        # In a session of its own, so that Ctrl-C is for this process alone, which then ends that one.
+        process = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, start_new_session=True)
+        status = _wait(process, tick)
         if result_file.exists():
-            return result | json.loads(result_file.read_text())
+            result |= json.loads(result_file.read_text())
+            return result if is_cold or "error" in result else result | {"cold_seconds": None}
     if status < 0:
         return result | {"error": f"the renderer was ended by {signal.Signals(-status).name}", "traceback": ""}
     return result | {"error": f"the renderer ended with status {status}", "traceback": ""}
+
+
+def _wait(process, tick):
+    """Return the status of a process when it has ended, which it also does if this one is interrupted."""
+    try:
+        while True:
+            try:
+                return process.wait(timeout=TICK)
+            except subprocess.TimeoutExpired:
+                tick()
+    finally:
+        process.kill()
+        process.wait()
+        process.stdin.close()
 
 
 def render(job):
@@ -87,8 +114,7 @@ def render(job):
     load_seconds = time.perf_counter() - begin
 
     progressive = Progressive(scene, job.seed)
-    with tqdm(total=job.budget or job.spp, desc=job.label, unit="s" if job.budget else "spp", disable=None) as bar:
-        cold, kept = _measure(progressive, job, bar)
+    cold, kept = _measure(progressive, job)
     passes, spp, pixels = progressive.passes, progressive.spp, progressive.pixels
     warm = [one.seconds for one in passes[1 if kept else 0 :]]
     statistics = total_statistics(passes)
@@ -110,12 +136,10 @@ def render(job):
     for key, counter in (("rays", "shadow_rays"), ("bounds", "bound_computations"), ("cut_size", "cut_size")):
         result[f"{key}_per_sample"] = statistics[counter] / (pixels * spp) if counter in statistics else None
 
-    described = {key: result[key] for key in ("parameters", "spp", "passes", "seconds", "cold_seconds")}
+    described = {key: result[key] for key in ("parameters", "spp", "passes", "seconds")}
     described |= {"integrator": job.integrator, "scene": job.scene, "seed": job.seed, **versions()}
-    images.write_exr(job.output, progressive.image, progressive.channels, described)
-    if job.vpl_output:
-        _render_vpl(job, passes, described)
-    return result
+    images.write_exr(job.output, progressive.image, progressive.channels, described | {"run": job.run or ""})
+    return result | {"vpl_output": _render_vpl(job, passes, described) if job.vpl_folder else None}
 
 
 def _parse(job):
@@ -129,7 +153,7 @@ def _parse(job):
     return file
 
 
-def _measure(progressive, job, bar):
+def _measure(progressive, job):
     """Render the passes of a job. Return the seconds of the first, cold pass, and whether it is in the image.
 
     It is not, so that times are warm, unless it alone took more than the budget (or `LONG_PASS`): compilation is then
@@ -144,13 +168,11 @@ def _measure(progressive, job, bar):
     if job.spp:
         for spp in sizes[len(progressive.passes) :]:
             progressive.render(spp)
-            bar.update(spp)
     elif not kept:
         spp = job.pass_spp or _samples_of_a_pass(progressive, job.budget / PASSES_IN_BUDGET, unused)
         progressive.restart()
         while not progressive.passes or progressive.seconds + progressive.passes[-1].seconds / 2 < job.budget:
-            one = progressive.render(spp)
-            bar.update(min(one.seconds, bar.total - bar.n))
+            progressive.render(spp)
     return cold, kept
 
 
@@ -175,14 +197,20 @@ def _samples_of_a_pass(progressive, seconds, seeds):
 
 def _render_vpl(job, passes, described):
     """Render the passes of another integrator (same seeds and parameters, so same lights and camera rays) by `vpl`, and
-    write the image, which is all that the other one approximates."""
+    write the image, which is all that the other one approximates. Return its file; one that is there already, of the
+    same passes with the same parameters, is left as it is."""
     file = _parse(job)
     file.set_integrator("vpl", {"aovs": ""}, keep=None)  # nobody asks for its channels, and it may not know them all
-    parameters, progressive = file.integrator[1], Progressive(file.load(job.threads), job.seed)
-    for one in tqdm(passes, desc=f"{job.label}: reference by vpl", unit="pass", disable=None):
-        progressive.render(one.spp, one.seed)
-    described |= {"integrator": "vpl", "parameters": parameters, "seconds": progressive.seconds}
-    images.write_exr(job.vpl_output, progressive.image, progressive.channels, described)
+    shared = [file.fingerprint(), versions(), [(one.spp, one.seed) for one in passes]]
+    key = hashlib.sha256(json.dumps(shared).encode()).hexdigest()[:16]
+    output = Path(job.vpl_folder) / f"{file.name}.vpl.{key}.exr"
+    if not output.is_file():
+        parameters, progressive = file.integrator[1], Progressive(file.load(job.threads), job.seed)
+        for one in passes:
+            progressive.render(one.spp, one.seed)
+        described |= {"integrator": "vpl", "parameters": parameters, "seconds": progressive.seconds}
+        images.write_exr(output, progressive.image, progressive.channels, described)
+    return str(output)
 
 
 def _peak_memory():
@@ -191,15 +219,21 @@ def _peak_memory():
     return peak if sys.platform == "darwin" else peak * 1024
 
 
+def _end_with_parent():
+    """End this process when the one that holds the other end of its standard input does."""
+    os.read(0, 1)
+    os._exit(1)
+
+
 def main():
     job_file, result_file = map(Path, sys.argv[1:])
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         result = render(Job(**json.loads(job_file.read_text())))
     except Exception as error:
         result = {"error": explain(error), "traceback": traceback.format_exc()}
-    except KeyboardInterrupt:
-        return 130  # said by the process that waits for this one
-    result_file.write_text(json.dumps(result))
+    with images.replacing(result_file) as temporary:
+        temporary.write_text(json.dumps(result))
     return 1 if "error" in result else 0
 
 

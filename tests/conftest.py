@@ -1,11 +1,19 @@
 """Fixtures shared by all tests: the variant, and small scenes built from dictionaries."""
 
+from pathlib import Path
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from scipy import stats
 
 VARIANT = "llvm_ad_rgb"
+CORNELL = str(Path(__file__).resolve().parent.parent / "scenes" / "cornell.xml")
+SWEEP = [
+    CORNELL, "-i", "path,lightcuts,vpl", "--width", "24", "--max-depth", "3", "--sweep", "path:spp=1,8", "--sweep",
+    "lightcuts:error=0.4,0.1", "--sweep", "vpl:vpl_count=2000", "-p", "lightcuts.vpl_count=2000", "--seeds", "2",
+    "--reference", "path:auto:0.9", "--spp", "1",
+]  # fmt: skip
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -22,6 +30,16 @@ def restore_variant():
     """For tests that change the variant."""
     yield
     mi.set_variant(VARIANT)
+
+
+@pytest.fixture(scope="session")
+def swept(tmp_path_factory, variant):
+    """The output folder of compare.py for `SWEEP`."""
+    import compare
+
+    out = tmp_path_factory.mktemp("sweep")
+    assert compare.main([*SWEEP, "-o", str(out), "--cache", str(out / "cache")]) == 0
+    return out
 
 
 def sensor(size=32, spp=4, **more):

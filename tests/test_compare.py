@@ -1,6 +1,8 @@
 """compare.py and what it is made of: scene files, passes, images, references, workers, reports."""
 
+import html
 import json
+import re
 from pathlib import Path
 
 import mitsuba as mi
@@ -191,16 +193,28 @@ def test_colour_of_luminance_and_of_nothing():
 
 def test_batches_are_mean_and_standard_error(tmp_path):
     samples = np.random.default_rng(0).random((9, 4, 4, 3))
-    batches = references.Batches(batch_spp=3)
+    batches = references.Batches()
     for image in samples[:5]:
-        batches.add(image)
+        batches = batches.with_batch(image, 3)
     batches.write(tmp_path / "a.exr", {"integrator": "path"})
     batches = references.Batches.read(tmp_path / "a.exr")
     for image in samples[5:]:
-        batches.add(image)
+        batches = batches.with_batch(image, 3)
     assert (batches.spp, batches.count) == (27, 9)
     np.testing.assert_allclose(batches.mean, samples.mean(axis=0), rtol=1e-6)
     np.testing.assert_allclose(batches.standard_error, samples.std(axis=0, ddof=1) / 3, rtol=1e-5)
+
+
+def test_batches_of_different_sizes_count_by_their_samples():
+    random, sizes = np.random.default_rng(0), (1, 3, 2, 16, 8, 1, 4)
+    samples = random.normal(5, 1, (sum(sizes), 40, 50, 3))
+    batches, first = references.Batches(), 0
+    for size in sizes:
+        batches = batches.with_batch(samples[first : first + size].mean(axis=0), size)
+        first += size
+    np.testing.assert_allclose(batches.mean, samples.mean(axis=0), rtol=1e-12)
+    # On average the variance of the mean is that of a sample over their number, whatever the batches.
+    assert np.square(batches.standard_error).mean() == pytest.approx(1 / sum(sizes), rel=0.03)
 
 
 def test_path_traced_references_are_kept_and_continued(tmp_path):
@@ -213,6 +227,31 @@ def test_path_traced_references_are_kept_and_continued(tmp_path):
     at_once = references.path_traced(cornell(), 128, tmp_path / "other")
     assert np.abs(more.image - at_once.image).sum() < 0.2 * at_once.image.sum()
     assert len(list(tmp_path.glob("*.exr"))) == 1
+
+
+def test_interrupted_reference_keeps_what_it_has(tmp_path, monkeypatch):
+    render, passes = rendering.Progressive.render, []
+
+    def interrupted(self, *arguments):
+        if len(passes) == 5:
+            raise KeyboardInterrupt
+        passes.append(render(self, *arguments))
+
+    monkeypatch.setattr(references.Progressive, "render", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        references.path_traced(cornell(), 64, tmp_path)
+    monkeypatch.undo()
+    (file,) = tmp_path.glob("*.exr")
+    assert references.read(file).description["batches"] == 5
+    assert references.path_traced(cornell(), 64, tmp_path).description["spp"] == 64
+
+
+def test_kept_reference_that_cannot_be_read_is_named(tmp_path):
+    references.path_traced(cornell(), 4, tmp_path)
+    (file,) = tmp_path.glob("*.exr")
+    file.write_bytes(file.read_bytes()[:500])
+    with pytest.raises(ValueError, match=f"the kept reference '{file}' cannot be read"):
+        references.path_traced(cornell(), 4, tmp_path)
 
 
 def test_shipped_reference_fits_the_shipped_hall():
@@ -259,7 +298,7 @@ def test_comparison_reports_results_and_failures(tmp_path, capsys):
     broken.write_text("<scene version='3.0.0'>")
     out = tmp_path / "out"
     status = compare.main([
-        str(CORNELL), str(broken), "-i", "path,direct,bad=path", "-p", "bad.bogus=1", "--spp", "4", "--width", "16",
+        str(CORNELL), str(broken), "-i", "path,direct,bad=stokes", "--spp", "4", "--width", "16",
         "--reference", "path:64", "--cache", str(tmp_path / "cache"), "-o", str(out), "--seed", "7",
     ])  # fmt: skip
     assert status == 1
@@ -267,30 +306,38 @@ def test_comparison_reports_results_and_failures(tmp_path, capsys):
     assert "bad: FAILED" in printed and "broken: FAILED" in printed
 
     results = json.loads((out / "results.json").read_text())
-    assert results["seed"] == 7 and results["versions"]["mitsuba"] and results["machine"]["cores"]
+    assert (
+        results["seeds"] == [7]
+        and results["complete"]
+        and results["versions"]["mitsuba"]
+        and results["machine"]["cores"]
+    )
     scene, failed = results["scenes"]
     assert "error" in failed and scene["hash"] and scene["reference"]["spp"] == 64
     path, direct, bad = scene["renders"]
-    assert "bogus" in bad["error"]
+    assert "integrator" in bad["error"]
     assert path["spp"] == 4 and path["errors"]["relmse"] > 0
     assert direct["errors"]["bias"] < -0.1
     for name in ("cornell.path.exr", "cornell.path.png", "cornell.direct.error.png", "cornell.reference.png"):
         assert (out / name).is_file()
     page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 5
-    assert "http" not in page and "bogus" in page
+    assert re.findall('"title": "([^"]*)"', page) == ["reference", "path", "direct"]
+    assert bad["error"] in html.unescape(page)
 
 
 def test_reference_by_vpl_shares_the_lights(tmp_path, capsys):
     status = compare.main([
-        str(CORNELL), "-i", "path,all=vpl", "-p", "all.vpl_count=300", "--spp", "1", "--width", "16",
-        "--max-depth", "3", "--reference", "vpl", "-o", str(tmp_path),
+        str(CORNELL), "-i", "path,all=vpl,cuts=lightcuts", "-p", "all.vpl_count=300", "-p", "cuts.vpl_count=300",
+        "-p", "cuts.error=0.3", "--spp", "1", "--width", "16", "--max-depth", "3", "--reference", "vpl", "-o",
+        str(tmp_path),
     ])  # fmt: skip
     assert status == 0, capsys.readouterr().out
-    path, every = json.loads((tmp_path / "results.json").read_text())["scenes"][0]["renders"]
+    path, every, cuts = json.loads((tmp_path / "results.json").read_text())["scenes"][0]["renders"]
     assert "errors" not in path
     assert every["errors"]["relative_l1"] < 1e-4
     assert every["rays_per_sample"] > 0
+    assert every["vpl_output"] == cuts["vpl_output"] and len(list(tmp_path.glob("*.vpl.*.exr"))) == 1
+    assert 1e-3 < cuts["errors"]["relative_l1"] < 0.2
 
 
 def test_aovs_are_asked_for_and_shown_on_one_scale(tmp_path, capsys):
@@ -313,7 +360,7 @@ def test_aovs_are_asked_for_and_shown_on_one_scale(tmp_path, capsys):
     assert pixels["many"].mean() > 2 * pixels["few"].mean() > 0
     assert np.all(np.array(mi.Bitmap(bounds["files"]["few"])) == images.FALSE_COLOURS[0])
     page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 3 + 2 + 4  # images, errors, channels
+    assert page.count("data:image/png;base64,") == 4  # channels
     assert f"<span>{low:g}</span><span>{high:g}</span>" in page
 
 
@@ -329,13 +376,27 @@ def test_aovs_that_not_all_know_are_asked_of_those_that_do(monkeypatch):
     [
         ([], "no scene given"),
         (["nosuch.xml"], "no scene file 'nosuch.xml'"),
+        ([str(CORNELL), str(CORNELL)], "would have files of the same name, 'cornell'"),
         ([str(CORNELL), "-i", "nosuch"], "unknown integrator 'nosuch'; there are"),
         ([str(CORNELL), "-i", "path,path"], "'path' is no name of its own"),
         ([str(CORNELL), "-p", "vpl.error=1"], "LABEL is path or lightcuts"),
         ([str(CORNELL), "--aovs", "shadow_rays,bogus"], 'a comma-separated list out of "shadow_rays", "upper_bounds"'),
         ([str(CORNELL), "-i", "path", "--aovs", "cut_size"], "have AOVs"),
+        ([str(CORNELL), "-i", ""], "'' is no name of its own"),
+        ([str(CORNELL), "-p", "lightcuts.bogus=1"], "lightcuts: the integrator 'lightcuts' has no parameter 'bogus'"),
+        ([str(CORNELL), "-p", "lightcuts.error=-1"], 'property "error" must be a number of at least 0, got -1'),
         ([str(CORNELL), "-r", "path:many"], "not of the form path:SPP"),
+        ([str(CORNELL), "-r", "path:auto:2"], "'2' is not a fraction"),
+        ([str(CORNELL), "--sweep", "lightcuts:error"], "not of the form LABEL:KEY=VALUE"),
+        ([str(CORNELL), "--sweep", "vpl:error=1"], "no such label; there are path, lightcuts"),
+        ([str(CORNELL), "--sweep", "path:spp=0"], "spp: '0' is not a positive whole number"),
+        ([str(CORNELL), "--sweep", "path:bogus=1,2"], "path bogus=1: the integrator 'path' has no parameter 'bogus'"),
+        ([str(CORNELL), "--sweep", "-o", "/dev/null/a"], "cannot write to the folder '/dev/null/a': Not a directory"),
+        ([str(CORNELL), "--sweep", "--check", "nosuch.json"], "'nosuch.json' cannot be read"),
+        ([str(CORNELL), "--check-share", "2"], "'2' is not a fraction from 0 to 1"),
+        ([str(CORNELL), "--seed", "4294967295", "--seeds", "2"], "too large for 2 seeds"),
         ([str(CORNELL), "-r", "nosuch.exr"], "neither a file"),
+        ([str(CORNELL), "-r", str(ROOT / "tests")], "/tests/cornell.exr' for the scene"),
         ([str(CORNELL), "--spp", "1", "--time", "1"], "not allowed with"),
         ([str(CORNELL), "-m", "bogus"], "unknown variant 'bogus'"),
     ],

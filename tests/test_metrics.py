@@ -94,3 +94,23 @@ def test_relative_error_image():
     assert error.shape == (2, 2)
     assert error[0, 1] == pytest.approx(0.5 / 1.01)
     assert error.sum() == error[0, 1]
+
+
+def test_distance_is_euclidean_over_channels():
+    reference = np.ones((2, 3, 3))
+    image = reference.copy()
+    image[1, 2] += (3, 0, 4)
+    distance = metrics.distance(image, reference)
+    assert distance.shape == (2, 3) and distance[1, 2] == 5 and distance.sum() == 5
+
+
+def test_flip_sees_differences_and_nothing_else(reference):
+    values, mean, settings = metrics.flip(reference, reference)
+    assert values.shape == reference.shape[:2] and mean == 0 and settings["ppd"] == pytest.approx(67, abs=0.1)
+    image = reference.copy()
+    image[20:30, 10:20] *= 3
+    values, mean, same = metrics.flip(image, reference)
+    assert same == settings  # they depend on the reference alone
+    assert values[20:30, 10:20].mean() > 10 * values[45:].mean() and mean == pytest.approx(values.mean(), rel=1e-3)
+    image[0, 0], image[1, 1] = np.nan, -1
+    assert np.isfinite(metrics.flip(image, reference)[0]).all()

@@ -1,0 +1,68 @@
+"""From the runs of a scene to the points, curves and comparisons that the report shows; see results.schema.json."""
+
+from . import curves
+
+COSTS = ("seconds", "rays")  # what errors are set against
+
+
+def points(renders, metric):
+    """Return a list of (cost, points), one entry for each of `COSTS`, from the results of runs (see worker.run) that
+    went well and have errors: points are `curves.Point`s, only of integrators that count the cost."""
+    found = {cost: {} for cost in COSTS}
+    for render in renders:
+        if "error" in render or "errors" not in render:
+            continue
+        errors, key = render["errors"], (render["label"], render["setting"])
+        for cost in COSTS:
+            value = cost_of(render, cost)
+            if value is not None:
+                point = found[cost].setdefault(key, curves.Point(*key, {}, {}, {}))
+                point.cost[render["seed"]] = value
+                point.error[render["seed"]] = errors[metric]
+                point.noise[render["seed"]] = errors["noise"][metric]
+    return [(cost, list(found[cost].values())) for cost in COSTS]
+
+
+def cost_of(render, cost):
+    """Return the seconds of a run's image, or its shadow rays per pixel (None if they are not counted)."""
+    if cost == "seconds":
+        return render["seconds"]
+    return None if render["rays_per_sample"] is None else render["rays_per_sample"] * render["spp"]
+
+
+def make_curves(of, labels):
+    """Return the `curves.Curve`s of points, in the order of the labels; labels without points have none."""
+    found = [curves.Curve(label, [point for point in of if point.label == label]) for label in labels]
+    return [curve for curve in found if curve.points]
+
+
+def analyse(renders, labels, metric):
+    """Return "points", "equal_errors" and "equal_costs" of a scene."""
+    described, at_errors, at_costs = [], {}, {}
+    for cost, of in points(renders, metric):
+        best = curves.pareto(of)
+        for point in of:
+            described.append(_describe(cost, point, (point.label, point.name) in best))
+        found = make_curves(of, labels)
+        if len(found) > 1:
+            at_errors[cost], at_costs[cost] = curves.equal_errors(found), curves.equal_costs(found)
+    return {"points": described, "equal_errors": at_errors, "equal_costs": at_costs}
+
+
+def spread_of(point):
+    """Return mean and interval of a point's cost and of its error, see `curves.spread`."""
+    return curves.spread(list(point.cost.values())), curves.spread(list(point.error.values()))
+
+
+def _describe(cost, point, is_best):
+    value, error = spread_of(point)
+    return {
+        "label": point.label,
+        "setting": point.name,
+        "cost": cost,
+        "value": value,
+        "error": error,
+        "seeds": sorted(point.cost),
+        "below_noise": point.mean() is None,
+        "pareto": is_best,
+    }

@@ -1,0 +1,63 @@
+"""`--check`: have integrators become slower, compared with each other, than in an earlier comparison?
+
+What is checked are the speed-ups at equal error of every integrator over the first, which, unlike seconds, carry over
+from machine to machine. They are read off the new curves at the errors for which the earlier comparison has them.
+"""
+
+import json
+from pathlib import Path
+
+from . import analysis, curves
+from .command_line import UsageError
+
+
+def read(path, metric, names):
+    """Return the content of a `results.json`. Raises UsageError if it is none, has no speed-ups to check, measures
+    another error than `metric`, or has none of the scenes of these names."""
+    try:
+        results = json.loads(Path(path).read_text())
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--check: '{path}' cannot be read: {error}") from None
+    if not isinstance(results, dict) or not list(_speed_ups(results)):
+        raise UsageError(f"--check: '{path}' has no speed-ups at equal error; make it with --sweep")
+    if results["metrics"]["compared"] != metric:
+        raise UsageError(f"--check: the errors of '{path}' are {results['metrics']['compared']}, not {metric}")
+    if not {scene for scene, *_ in _speed_ups(results)} & set(names):
+        raise UsageError(f"--check: '{path}' has none of these scenes")
+    return results
+
+
+def _speed_ups(results):
+    """Yield scene, first label, label, cost, error and speed-up of everything that can be checked."""
+    for scene in results.get("scenes", []):
+        for cost, entries in scene.get("equal_errors", {}).items():
+            for entry in entries:
+                base, *others = entry["costs"]
+                for label in others:
+                    if entry["costs"][label]["speed_up"] is not None:
+                        yield scene["name"], base, label, cost, entry["error"], entry["costs"][label]["speed_up"]
+
+
+def check(results, baseline, share):
+    """Return what has become worse, a list of lines: speed-ups that fell by more than a `share` (a fraction), or that
+    are not there any more. Scenes that only one of the two has are left out."""
+    metric = results["metrics"]["compared"]
+    found, lines = {scene["name"]: scene for scene in results["scenes"]}, []
+    for name, base, label, cost, error, before in _speed_ups(baseline):
+        if name not in found:
+            continue
+        now = _speed_up(found[name], base, label, cost, error, metric)
+        head = f"{name}: {label} over {base}, {cost} at error {error:.3g}: {before:.3g}× before, "
+        if now is None:
+            lines.append(f"{head}not reached now")
+        elif now < (1 - share) * before:
+            lines.append(f"{head}{now:.3g}× now, {1 - now / before:.0%} less")
+    return lines
+
+
+def _speed_up(scene, base, label, cost, error, metric):
+    of = dict(analysis.points(scene["renders"], metric))[cost]
+    pair = analysis.make_curves(of, [base, label])
+    if [curve.label for curve in pair] != [base, label]:
+        return None
+    return curves.equal_errors(pair, [error])[0]["costs"][label]["speed_up"]

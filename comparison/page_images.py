@@ -1,0 +1,57 @@
+"""Images in a form that the report's page can hold: small, and deep enough to change the exposure.
+
+A colour becomes a half-precision number without its sign and with `BITS_LEFT_OUT` fewer bits: 12 bits, 14 stops below
+the white of the pictures to 16 above it, in steps of 0.8%, which no eye sees. Neighbours are subtracted, planes of high
+and of low bytes follow each other, and zlib does the rest; viewer.js undoes it. Maps of errors have 8 bits.
+"""
+
+import base64
+import zlib
+
+import numpy as np
+
+BITS_LEFT_OUT = 3
+LARGEST = 2**20  # pixels; larger images are shown by the means of blocks
+
+
+def block_size(height, width):
+    """Return the side of the blocks of pixels that one pixel of the page shows: 1 up to `LARGEST` pixels."""
+    return max(1, int(np.ceil(np.sqrt(height * width / LARGEST))))
+
+
+def reduce(image):
+    """Return the means over blocks, (height, width, channels), of an image; those at the right and lower edges may be
+    smaller."""
+    block = block_size(*image.shape[:2])
+    if block == 1:
+        return image
+    rows, columns = np.arange(0, image.shape[0], block), np.arange(0, image.shape[1], block)
+    counts = np.minimum(block, image.shape[0] - rows)[:, None] * np.minimum(block, image.shape[1] - columns)
+    sums = np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1)
+    return sums / counts[..., None]
+
+
+def colours(rgb, scale):
+    """Encode linear colours, (height, width, 3), that a picture shows multiplied by `scale`; return a dict for
+    viewer.js. What is not finite or negative is black, what is too bright as bright as can be told."""
+    limit = float(np.finfo(np.float16).max)
+    scaled = np.clip(reduce(np.nan_to_num(rgb, posinf=0, neginf=0)) * scale, 0, limit)
+    half = scaled.astype(np.float16).view(np.uint16)
+    rounded = np.minimum(half + (1 << BITS_LEFT_OUT >> 1), 0x7BFF)
+    return _pack(rounded >> BITS_LEFT_OUT, 2)
+
+
+def plane(values):
+    """Encode values from 0 to 1, (height, width), in 8 bits; what is not a number counts as 1."""
+    values = reduce(np.nan_to_num(values, nan=1)[..., None])
+    return _pack((np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint16), 1)
+
+
+def _pack(codes, depth):
+    """Return "width", "height", "channels", "depth" (bytes of a code) and "data" of codes (height, width, channels)."""
+    differences = np.diff(codes, axis=1, prepend=0)  # modulo 65536
+    planes = np.moveaxis(differences, -1, 0)
+    content = [(planes >> shift & 255).astype(np.uint8).tobytes() for shift in (0, 8)[:depth]]
+    data = base64.b64encode(zlib.compress(b"".join(content), 9)).decode()
+    height, width, channels = codes.shape
+    return {"width": width, "height": height, "channels": channels, "depth": depth, "data": data}

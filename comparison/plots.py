@@ -1,0 +1,118 @@
+"""Plots of error against time and shadow rays, as SVG."""
+
+import io
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
+
+from . import analysis, tables
+
+# Told apart with any kind of colour vision (Okabe and Ito); more labels begin again, with the next marker.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+MARKERS = "osD^vP"
+AXES = {"seconds": "time of the image [s]", "rays": "shadow rays per pixel"}
+ERRORS = {"relmse": "relMSE", "relmse_trimmed": "relMSE, trimmed", "rmse": "RMSE", "relative_l1": "relative L1 error"}
+STYLE = {
+    "svg.fonttype": "none",  # text stays text
+    "svg.hashsalt": "comparison",  # the same results, the same file
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#888",
+    "grid.color": "#e4e4e4",
+}
+
+
+def colour(index):
+    """Return the colour of the label of an index."""
+    return COLOURS[index % len(COLOURS)]
+
+
+def error_against(cost, of, best, labels, metric):
+    """Return SVG text: error against a cost ("seconds" or "rays"), both logarithmic.
+
+    `of` are `curves.Point`s, `best` is the set of those (label, name) that no other beats, which get a ring. Bars are
+    intervals of the means; points below the reference's noise are hollow, and in no curve. Returns None without points.
+    """
+    if not of:
+        return None
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 4.4), layout="constrained")
+        FigureCanvasSVG(figure)
+        axes = figure.add_subplot(xscale="log", yscale="log", xlabel=AXES[cost], ylabel=ERRORS[metric])
+        axes.grid(True, which="major")
+        axes.set_axisbelow(True)
+        for index, label in enumerate(labels):
+            _draw(axes, index, label, [point for point in of if point.label == label], best)
+        for axis in (axes.xaxis, axes.yaxis):
+            _tick(axis)
+        _name(figure, axes, of, labels, best)
+        if best:
+            axes.plot([], [], "o", markersize=11, markerfacecolor="none", markeredgecolor="#777", label="Pareto front")
+        axes.legend(frameon=False, fontsize=9)
+        return _svg(figure)
+
+
+def _draw(axes, index, label, of, best):
+    style = {"color": colour(index), "marker": MARKERS[index // len(COLOURS) % len(MARKERS)], "linestyle": "none"}
+    for curve in analysis.make_curves(of, [label]):
+        axes.plot(*curve.front(), color=style["color"], linewidth=1.6, label=label)
+    for point in of:
+        x, y = analysis.spread_of(point)
+        if x["mean"] <= 0 or y["mean"] <= 0:
+            continue
+        shown = point.mean() is not None
+        axes.errorbar(
+            x["mean"], y["mean"], xerr=_bars(x), yerr=_bars(y), markersize=5, elinewidth=0.9, capsize=2,
+            markerfacecolor=style["color"] if shown else "white", **style,
+        )  # fmt: skip
+        if (point.label, point.name) in best:
+            axes.plot(x["mean"], y["mean"], "o", markersize=11, markerfacecolor="none", markeredgecolor="#777")
+
+
+def _name(figure, axes, of, labels, best):
+    """Write beside points which setting they are, those of the Pareto front first, where there is room for it."""
+    figure.draw_without_rendering()
+    taken = []
+    for point in sorted(of, key=lambda point: (point.label, point.name) not in best):
+        mean = point.mean()
+        if not point.name or mean is None:
+            continue
+        shown = axes.annotate(
+            point.name, mean, xytext=(7, 5), textcoords="offset points", fontsize=7.5,
+            color=colour(labels.index(point.label)),
+        )  # fmt: skip
+        box = shown.get_window_extent()
+        if any(box.overlaps(other) for other in taken):
+            shown.remove()
+        else:
+            taken.append(box)
+
+
+def _bars(spread):
+    if spread["low"] is None:
+        return None
+    return np.array([[spread["mean"] - spread["low"]], [spread["high"] - spread["mean"]]])
+
+
+def _tick(axis):
+    """Label powers of ten, and in short ranges their multiples."""
+    low, high = axis.get_view_interval()
+    if high / low < 100:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(lambda value, _: tables.number(value))
+    else:
+        axis.set_major_formatter(LogFormatterSciNotation())
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _svg(figure):
+    """Return a figure as an SVG element to put into a page."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
+    content = buffer.getvalue()
+    return content[content.index("<svg") :]

@@ -1,0 +1,80 @@
+"""How far a comparison is, and how long it still takes: a bar where somebody watches, nothing where output is piped."""
+
+import time
+from contextlib import contextmanager
+
+from tqdm import tqdm
+
+BAR = "{desc} |{bar}| {n_fmt}/{total_fmt} runs{postfix}"
+
+
+class Progress:
+    """A bar of the runs of several scenes (paths), each of which has the same ones, (setting, seed).
+
+    Time left is what the same settings took with other seeds; for settings that were not yet made it is the mean of
+    what the label took on the scene, or of all.
+    """
+
+    def __init__(self, scenes, runs):
+        self._planned = [(str(scene), setting.label, setting.name) for scene in scenes for setting, _ in runs]
+        self._bar = tqdm(total=len(self._planned), disable=None, bar_format=BAR)
+        self._took, self._running, self._began = {}, None, 0.0
+
+    def begin(self, scene, setting):
+        """A run begins."""
+        self._running, self._began = (str(scene), setting.label, setting.name), time.monotonic()
+        self._planned.remove(self._running)
+        self._bar.set_description_str(setting.title, refresh=False)
+        self.tick()
+
+    def end(self, kept):
+        """The run has ended; `kept`, if its result was there already."""
+        if not kept:
+            self._took.setdefault(self._running, []).append(time.monotonic() - self._began)
+        self._running = None
+        self._bar.update()
+        self.tick()
+
+    def skip(self, scene):
+        """What was planned for a scene and is not done will not be."""
+        left = [run for run in self._planned if run[0] != str(scene)]
+        self._bar.update(len(self._planned) - len(left))
+        self._planned = left
+
+    def tick(self):
+        """Show the time left as it is now."""
+        left = self.seconds_left()
+        self._bar.set_postfix_str("" if left is None else f"{tqdm.format_interval(left)} left", refresh=False)
+        self._bar.refresh()
+
+    def seconds_left(self):
+        """Return the seconds that the planned runs and the running one will take, None if that is not known."""
+        if not self._took:
+            return None
+        left = sum(self._expected(run) for run in self._planned)
+        if self._running is not None:
+            left += max(0.0, self._expected(self._running) - (time.monotonic() - self._began))
+        return left
+
+    def _expected(self, run):
+        for same in (3, 2, 0):  # the setting, the label on this scene, anything
+            durations = [one for key, of in self._took.items() if key[:same] == run[:same] for one in of]
+            if durations:
+                return sum(durations) / len(durations)
+        return 0.0
+
+    @contextmanager
+    def paused(self):
+        """Something else, with a bar of its own, goes on in the block."""
+        self._bar.clear()
+        yield
+        self._bar.refresh()
+
+    def write(self, text):
+        """Print text to the standard output, above the bar."""
+        self._bar.write(text)
+
+    def close(self):
+        """Remove the bar."""
+        self._bar.leave = False
+        self._bar.close()

@@ -1,0 +1,147 @@
+"""The tables of a comparison, as lists of rows of text: for the terminal and for the report."""
+
+from . import metrics
+
+COLUMNS = (
+    "integrator", "seeds", "time [s]", "cold [s]", "spp", "rel. L1", "RMSE", "relMSE", "trimmed", "95%", "FLIP", "bias",
+    "rays", "bounds", "memory", "load",
+)  # fmt: skip
+EXPLANATION = (
+    "Means over seeds. time: of the passes in the image, kernels being compiled; cold: the first pass of all with an "
+    "empty kernel cache, compilation included. rel. L1: sum |x - r| / sum r; "
+    f"relMSE: mean (x - r)² / (r² + {metrics.EPSILON:g} mean(r)²); trimmed: the same without the worst "
+    f"{metrics.TRIMMED:.1%} of the pixels; 95%: interval of the mean of the error that curves show (--metric); FLIP: "
+    "mean of HDR-FLIP at 67 pixels per degree; bias: of the mean. The reference's own noise is taken off squared "
+    "errors; < marks errors below that noise, and gives the noise. rays, bounds: shadow rays and upper bounds "
+    "computed, per pixel sample. memory: peak, MB. load: the machine's load average before the runs, the largest."
+)
+BUSY = 1.5  # load a core; what is measured makes up to one itself
+HEADS = {"seconds": "time [s]", "rays": "rays per pixel"}
+
+
+def text(rows):
+    """Lay rows out in columns, the first one to the left; lines without spaces at their ends."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def settings(scene):
+    """Return a dict from titles, such as "lightcuts error=0.02", to the results of their runs, in order of labels."""
+    labels = list(dict.fromkeys(render["label"] for render in scene["renders"]))
+    found = {}
+    for label in labels:
+        of_label = [render for render in scene["renders"] if render["label"] == label]
+        # Runs are made seed by seed, so the settings of the first seed come in their order.
+        for render in of_label:
+            found.setdefault(f"{label} {render['setting']}".strip(), []).append(render)
+    return found
+
+
+def rows(scene):
+    """Return the rows of a scene: as many cells as `COLUMNS`, or (title, message) for a failure."""
+    intervals, found = _intervals(scene), []
+    for title, renders in settings(scene).items():
+        good = [render for render in renders if "error" not in render]
+        if good:
+            found.append(_row(title, good, intervals.get(title, "")))
+        failures = {render["error"]: render["seed"] for render in renders if "error" in render}
+        found += [(title, message) for message in failures]
+    return found
+
+
+def _intervals(scene):
+    """Return the 95% intervals of errors as text, by title; none for single seeds."""
+    found = {}
+    for point in scene.get("points", []):
+        low, high = point["error"]["low"], point["error"]["high"]
+        if low is not None:
+            found[f"{point['label']} {point['setting']}".strip()] = f"{number(low)} to {number(high)}"
+    return found
+
+
+def _row(title, renders, interval):
+    errors = [render["errors"] for render in renders if "errors" in render]
+    bad = sum(one["bad_pixels"] for one in errors)
+    cold = [render["cold_seconds"] for render in renders if render["cold_seconds"] is not None]
+    return [
+        title + (f" ({bad} pixels not finite)" if bad else ""),
+        str(len(renders)),
+        f"{_mean(render['seconds'] for render in renders):.3g}",
+        f"{_mean(cold):.3g}" if cold else "",
+        f"{_mean(render['spp'] for render in renders):.4g}",
+        *(
+            _error(errors, *column)
+            for column in (("relative_l1", ".2%"), ("rmse", ".3g"), ("relmse", ".3g"), ("relmse_trimmed", ".3g"))
+        ),
+        interval,
+        f"{_mean(one['flip'] for one in errors):.4f}" if errors else "n/a",
+        f"{_mean(one['bias'] for one in errors):+.2%}" if errors else "n/a",
+        *(_count(renders, key) for key in ("rays_per_sample", "bounds_per_sample")),
+        f"{max(render['peak_memory_bytes'] for render in renders) / 1e6:.0f}",
+        f"{max(render['load_average'] for render in renders):.1f}",
+    ]
+
+
+def _mean(values):
+    values = list(values)
+    return sum(values) / len(values)
+
+
+def _count(renders, key):
+    return "n/a" if renders[0][key] is None else f"{_mean(render[key] for render in renders):.0f}"
+
+
+def _error(errors, name, style):
+    """Format an error, or "< noise" where it is below the reference's noise."""
+    if not errors:
+        return "n/a"
+    error, noise = _mean(one[name] for one in errors), _mean(one["noise"][name] for one in errors)
+    if all(name in one["below_noise"] for one in errors):
+        return f"< {noise:{style}}"
+    return f"{error:{style}}"
+
+
+def equal_errors(scene, cost):
+    """Return the table of what the same errors cost, with its head; [] if there is nothing to compare."""
+    return _comparison(scene.get("equal_errors", {}).get(cost, []), "error", "costs", "error")
+
+
+def equal_costs(scene, cost):
+    """Return the table of errors at the same cost, with its head; [] if there is nothing to compare."""
+    return _comparison(scene.get("equal_costs", {}).get(cost, []), "cost", "errors", HEADS[cost])
+
+
+def _comparison(entries, what, read, head):
+    if not entries:
+        return []
+    labels = list(entries[0][read])
+    return [
+        [head, *labels],
+        *([number(entry[what]), *(_reading(entry[read][label]) for label in labels)] for entry in entries),
+    ]
+
+
+def number(value):
+    """Write a number with three digits, or more before the point, never with an exponent down to 1e-4."""
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def _reading(reading):
+    if reading["at_most"] is not None:
+        least = reading["speed_up_at_least"]
+        return f"≤ {number(reading['at_most'])}" + (f" (≥ {least:.3g}×)" if least is not None and least > 1 else "")
+    if reading["value"] is None:
+        return "not reached"
+    cell = number(reading["value"])
+    if reading["speed_up_low"] is not None:
+        return f"{cell} ({reading['speed_up']:.3g}×, {reading['speed_up_low']:.3g} to {reading['speed_up_high']:.3g})"
+    return f"{cell} ({reading['speed_up']:.3g}×)" if reading["speed_up"] not in (None, 1) else cell
+
+
+def warnings(scene, cores):
+    """Return sentences about what makes a scene's numbers doubtful; [] if there is nothing."""
+    load = max((render["load_average"] for render in scene["renders"]), default=0)
+    if load > BUSY * cores:
+        return [f"The machine was busy with other things (load {load:.1f} on {cores} cores): do not trust the times."]
+    return []

@@ -1,0 +1,205 @@
+"""What a sweep writes, strips of pictures, and --check."""
+
+import json
+from pathlib import Path
+
+import jsonschema
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import compare
+from comparison import analysis, baseline, images, strip, tables
+from comparison.command_line import UsageError
+
+from .conftest import CORNELL, SWEEP
+
+ROOT = Path(__file__).resolve().parent.parent
+SCHEMA = json.loads((ROOT / "comparison" / "results.schema.json").read_text())
+
+
+def results_of(out):
+    results = json.loads((out / "results.json").read_text())
+    jsonschema.validate(results, SCHEMA, jsonschema.Draft202012Validator)
+    return results
+
+
+# --- results.json ---
+
+
+def test_sweep_has_points_with_intervals(swept):
+    results = results_of(swept)
+    (scene,) = results["scenes"]
+    assert (results["seeds"], results["complete"], len(scene["renders"])) == ([0, 1], True, 10)
+    points = {(point["label"], point["setting"]): point for point in scene["points"] if point["cost"] == "seconds"}
+    assert list(points) == [
+        ("path", "spp=1"), ("lightcuts", "error=0.4"), ("vpl", "vpl_count=2000"), ("path", "spp=8"),
+        ("lightcuts", "error=0.1"),
+    ]  # fmt: skip
+    assert points["path", "spp=8"]["error"]["mean"] < 0.3 * points["path", "spp=1"]["error"]["mean"]
+    for point in points.values():
+        assert point["seeds"] == [0, 1] and point["error"]["low"] < point["error"]["mean"] < point["error"]["high"]
+    assert {point["label"] for point in scene["points"] if point["cost"] == "rays"} == {"lightcuts", "vpl"}
+    assert any(point["pareto"] for point in scene["points"])
+    lightcuts, every = (points[key] for key in (("lightcuts", "error=0.1"), ("vpl", "vpl_count=2000")))
+    assert lightcuts["error"]["mean"] == pytest.approx(every["error"]["mean"], rel=0.3)
+
+
+def test_runs_share_lights_and_say_how_they_were_made(swept):
+    renders = results_of(swept)["scenes"][0]["renders"]
+    assert [render["seed"] for render in renders] == [0] * 5 + [1] * 5
+    lights = {
+        (render["seed"], json.dumps(render["statistics"]["lights"])) for render in renders if render["label"] != "path"
+    }
+    assert len(lights) == 2  # a set of lights a seed
+    # An empty kernel cache is found once by each label.
+    assert [render["label"] for render in renders if render["cold_seconds"] is not None] == ["path", "lightcuts", "vpl"]
+    assert all(render["load_average"] >= 0 and 0 <= render["errors"]["flip"] <= 1 for render in renders)
+    for render in renders:
+        assert images.read_exr_metadata(render["output"])["run"] == render["run"]
+    assert len({render["run"] for render in renders}) == 10
+
+
+def test_automatic_reference_is_good_enough(swept):
+    (scene,) = results_of(swept)["scenes"]
+    shares = [
+        np.sqrt(render["errors"]["noise"]["relmse_trimmed"] / render["errors"]["relmse_trimmed"])
+        for render in scene["renders"]
+    ]
+    assert scene["reference_share"] == pytest.approx(max(shares)) and max(shares) <= 0.9
+    assert scene["reference"]["spp"] >= 64
+
+
+def test_automatic_reference_is_continued_up_to_its_limit(tmp_path, swept, capsys):
+    few = [CORNELL, "-i", "path", "--width", "24", "--max-depth", "3", "--spp", "128", "-o", str(tmp_path)]
+    status = compare.main([*few, "-r", "path:auto:0.01", "--reference-limit", "100", "--cache", str(tmp_path)])
+    assert status == 0
+    scene = results_of(tmp_path)["scenes"][0]
+    assert scene["reference"]["spp"] == 100 and scene["reference_share"] > 0.01
+    assert "stopped at --reference-limit" in capsys.readouterr().out
+
+
+def test_tables_have_a_row_a_setting(swept):
+    (scene,) = results_of(swept)["scenes"]
+    rows = tables.rows(scene)
+    assert all(len(row) == len(tables.COLUMNS) for row in rows)
+    assert [row[0] for row in rows] == [
+        "path spp=1", "path spp=8", "lightcuts error=0.4", "lightcuts error=0.1", "vpl vpl_count=2000",
+    ]  # fmt: skip
+    cold = tables.COLUMNS.index("cold [s]")
+    assert [bool(row[cold]) for row in rows] == [True, False, True, False, True]
+    low, high = map(float, rows[0][tables.COLUMNS.index("95%")].split(" to "))
+    assert low < float(rows[0][tables.COLUMNS.index("trimmed")]) < high
+
+
+def reading(**given):
+    names = ("value", "at_most", "low", "high", "speed_up", "speed_up_low", "speed_up_high", "speed_up_at_least")
+    return dict.fromkeys(names) | given
+
+
+def test_readings_say_what_is_not_known():
+    costs = {
+        "a": reading(value=2.0, speed_up=1.0),
+        "b": reading(value=0.5, speed_up=4.0, speed_up_low=3.0, speed_up_high=5.333),
+        "c": reading(at_most=0.4, speed_up_at_least=5.0),
+        "d": reading(at_most=4000.0, speed_up_at_least=0.0005),
+        "e": reading(),
+    }
+    head, row = tables.equal_errors({"equal_errors": {"seconds": [{"error": 0.1, "costs": costs}]}}, "seconds")
+    assert head == ["error", "a", "b", "c", "d", "e"]
+    assert row == ["0.1", "2", "0.5 (4×, 3 to 5.33)", "≤ 0.4 (≥ 5×)", "≤ 4000", "not reached"]
+    assert tables.equal_costs({}, "seconds") == []
+
+
+def test_a_busy_machine_is_named():
+    scene = {"renders": [{"load_average": 1.0}, {"load_average": 3.5}]}
+    assert tables.warnings(scene, cores=4) == []
+    assert "load 3.5 on 2 cores" in tables.warnings(scene, cores=2)[0]
+
+
+# --- Strips ---
+
+
+def test_strip_of_pictures(swept, tmp_path, capsys):
+    output = tmp_path / "strip.png"
+    assert strip.main([str(swept), "--output", str(output)]) == 0
+    assert "made by: compare.py" in capsys.readouterr().out
+    pixels = images.read_png(output)
+    assert pixels.shape == (24 + 45, 11 * 28 - 4, 3)  # five settings, the reference, five errors
+    expected = images.read_png(swept / "cornell.path.spp=1.png")
+    np.testing.assert_array_equal(pixels[:24, :24], expected)
+    assert pixels[24:].min() < 128  # captions
+    assert "compare.py" in mi.Bitmap(str(output)).metadata()["command"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["--scene", "nosuch"], "there are cornell"), (["--output", "/no/folder.png"], "no folder")],
+)
+def test_strip_refuses(swept, tmp_path, capsys, arguments, message):
+    given = arguments if "--output" in arguments else [*arguments, "--output", str(tmp_path / "a.png")]
+    assert strip.main([str(swept), *given]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_strip_needs_a_comparison(tmp_path, capsys):
+    assert strip.main([str(tmp_path), "--output", str(tmp_path / "a.png")]) == 2
+    assert "no results.json in" in capsys.readouterr().err
+
+
+# --- --check ---
+
+
+def fake_results(speed_up):
+    """Results of two integrators whose errors are inverse to their time, the second of them so many times faster."""
+    renders = [
+        {
+            "label": label, "setting": f"spp={spp}", "seed": 0, "seconds": spp / factor, "rays_per_sample": None,
+            "spp": spp, "errors": {"relmse": 1 / spp, "noise": {"relmse": 0}},
+        }
+        for label, factor in (("path", 1.0), ("fast", speed_up)) for spp in (1, 4, 16)
+    ]  # fmt: skip
+    scene = {"name": "box", "renders": renders}
+    scene |= analysis.analyse(renders, ["path", "fast"], "relmse")
+    return {"metrics": {"compared": "relmse"}, "scenes": [scene]}
+
+
+def test_check_finds_speed_ups_that_fell():
+    before = fake_results(5)
+    assert baseline.check(fake_results(4.2), before, 0.2) == []
+    lines = baseline.check(fake_results(3.5), before, 0.2)
+    assert len(lines) == 4 and lines[0].startswith(
+        "box: fast over path, seconds at error 0.1: 5× before, 3.5× now, 30%"
+    )
+    assert baseline.check(fake_results(3.5), before, 0.5) == []
+
+
+def test_check_finds_errors_that_are_no_longer_reached():
+    now = fake_results(5)
+    now["scenes"][0]["renders"] = [one for one in now["scenes"][0]["renders"] if one["label"] != "fast"]
+    assert all(line.endswith("not reached now") for line in baseline.check(now, fake_results(5), 0.2))
+
+
+def test_check_refuses_what_cannot_be_compared(tmp_path):
+    file = tmp_path / "a.json"
+    file.write_text(json.dumps(fake_results(5)))
+    assert baseline.read(file, "relmse", ["box", "other"])["scenes"][0]["name"] == "box"
+    with pytest.raises(UsageError, match="none of these scenes"):
+        baseline.read(file, "relmse", ["other"])
+    with pytest.raises(UsageError, match="are relmse, not rmse"):
+        baseline.read(file, "rmse", ["box"])
+    file.write_text("{}")
+    with pytest.raises(UsageError, match="no speed-ups"):
+        baseline.read(file, "relmse", ["box"])
+
+
+def test_check_sets_the_exit_status(swept, tmp_path, capsys, monkeypatch):
+    """With everything finished, nothing is rendered again."""
+    monkeypatch.setattr("comparison.worker.run", lambda *_: pytest.fail("rendered again"))
+    results = results_of(swept)
+    entry = {"value": 1, "at_most": None, "low": None, "high": None, "speed_up": 1e9}
+    results["scenes"][0]["equal_errors"]["rays"] = [{"error": 0.05, "costs": {"lightcuts": entry, "vpl": entry}}]
+    (tmp_path / "baseline.json").write_text(json.dumps(results))
+    again = [*SWEEP, "-o", str(swept), "--cache", str(swept / "cache"), "--resume", "--check"]
+    assert compare.main([*again, str(tmp_path / "baseline.json")]) == 3
+    assert "vpl over lightcuts, rays at error 0.05: 1e+09× before" in capsys.readouterr().err

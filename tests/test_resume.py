@@ -1,0 +1,110 @@
+"""Comparisons that are interrupted, killed, and go on."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+import compare
+from comparison import worker
+
+from .conftest import CORNELL
+from .test_report import ROOT, SCHEMA
+
+
+def command(out):
+    return [
+        CORNELL, "-i", "path", "--width", "16", "--sweep", "path:time=0.2,0.4", "--seeds", "3", "--reference",
+        "path:16", "--cache", str(out / "cache"), "-o", str(out),
+    ]  # fmt: skip
+
+
+def finished(out):
+    return set((out / "runs").glob("*.json"))
+
+
+def start(out, *more):
+    """Start a comparison, and return its process when it has finished two runs."""
+    process = subprocess.Popen(
+        [sys.executable, str(ROOT / "compare.py"), *command(out), *more], stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    end = time.monotonic() + 120
+    while len(finished(out)) < 2:
+        assert process.poll() is None and time.monotonic() < end, process.communicate()
+        time.sleep(0.02)
+    return process
+
+
+def workers_of(out):
+    """The processes that render into a folder."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/environ"):
+        try:
+            if (
+                str(out).encode() in status.read_bytes()
+                and b"comparison.worker" in (status.parent / "cmdline").read_bytes()
+            ):
+                found.append(int(status.parent.name))
+        except OSError:
+            pass  # it has just ended, or is somebody else's
+    return found
+
+
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+def test_interruption_leaves_a_report_of_what_is_finished(tmp_path, signal_number):
+    process = start(tmp_path)
+    process.send_signal(signal_number)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert errors == f"\ncompare: interrupted; what was finished is in {tmp_path}; --resume goes on\n"
+    results = json.loads((tmp_path / "results.json").read_text())
+    jsonschema.validate(results, SCHEMA, jsonschema.Draft202012Validator)
+    renders = results["scenes"][0]["renders"]
+    assert not results["complete"] and len(renders) == len(finished(tmp_path)) >= 2
+    assert all("errors" in render for render in renders)
+    assert "interrupted" in (tmp_path / "report.html").read_text()
+    assert "path time=0.2" in output
+    assert not list(tmp_path.glob(".*.exr")) and not (tmp_path / "runs" / "kernels").exists()
+
+
+def test_killed_comparison_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    process = start(tmp_path)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    end = time.monotonic() + 30
+    while workers_of(tmp_path):  # they end with it
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    (tmp_path / ".cornell.path.123.exr").write_text("as if killed while writing")
+    before = {file: file.read_text() for file in finished(tmp_path)}
+
+    made, run = [], worker.run
+    monkeypatch.setattr(worker, "run", lambda job, tick: made.append(job) or run(job, tick))
+    assert compare.main([*command(tmp_path), "--resume"]) == 0
+    assert len(made) == 6 - len(before) and not (tmp_path / ".cornell.path.123.exr").exists()
+    assert len(finished(tmp_path)) == 6 and all(file.read_text() == text for file, text in before.items())
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["complete"] and len(results["scenes"][0]["renders"]) == 6
+
+    made.clear()
+    assert compare.main([*command(tmp_path), "--resume", "--max-depth", "2", "--seeds", "1"]) == 0
+    assert len(made) == 2  # other parameters, other runs
+    assert compare.main([*command(tmp_path), "--resume", "--seeds", "1"]) == 0
+    assert len(made) == 4  # whose images had taken the place of these
+
+
+def test_two_comparisons_do_not_share_a_folder(tmp_path, capsys):
+    process = start(tmp_path)
+    try:
+        assert compare.main(command(tmp_path)) == 2
+        assert "another comparison is writing to" in capsys.readouterr().err
+    finally:
+        process.kill()
+        process.communicate()
