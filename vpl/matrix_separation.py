@@ -49,7 +49,8 @@ class SeparationLimits:
 @dataclass
 class Separation:
     """``error``: Z, Float, in the layout of D.  Of every matrix, of NumPy: ``rank``, ``iterations``, ``failed`` (bool:
-    not finite, or much further from D than it was at first), ``residual``: ‖XY + Z − D‖ / ‖D‖ after each iteration, a list.
+    not finite, or much further from D than it was at first), ``residual``: ‖XY + Z − D‖ / ‖D‖ after each iteration, a
+    list.
     """
 
     error: object
