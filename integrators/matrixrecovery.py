@@ -207,9 +207,8 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
             low, high = np.searchsorted(columns.piece, (begin, end))
             if low < high:
                 block = MatrixBlock(entries, columns.select(np.arange(low, high)), begin, end)
-                found = recover(block, predictors, best, int(low), self.options(), derived_seed(seed, 1, begin))
-                dr.sync_thread()
-                work.lap("separation")
+                seed_of_block = derived_seed(seed, 1, begin)
+                found = recover(block, predictors, best, int(low), self.options(), seed_of_block, work.lap)
                 work.add("failed_slices", found.failed)
                 work.add("entries", int(block.counts.prod(1).sum()))
                 yield block, found
@@ -243,6 +242,7 @@ class Work:
         self.radiance, self.columns = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UInt32, count)
         dr.eval(self.radiance, self.columns)
         self.counts = {"slices": rows.slices, "rows": rows.count, "entries": 0, "failed_slices": 0}
+        self.counts |= {f"{stage}_rays": 0 for stage in ("columns", "prediction", "correction")}
 
     def add(self, name: str, number: int) -> None:
         """Count something."""
@@ -250,6 +250,7 @@ class Work:
 
     def lap(self, stage: str) -> None:
         """A stage has ended: its time, and its shadow rays."""
+        dr.sync_thread()
         self.clock.lap(stage)
         before = sum(number for name, number in self.counts.items() if name.endswith("_rays"))
         self.add(f"{stage}_rays", self.entries.rays - before)

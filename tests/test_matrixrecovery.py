@@ -237,7 +237,7 @@ def test_most_entries_are_predicted_and_the_image_is_that_of_all_lights(shadows)
     expected = render(shadows, "vpl", 4, **SMALL)
     image, found = rendered(shadows, 4, **SMALL)
     assert relative_error(image, expected) < 0.06
-    rays = sum(found[f"{stage}_rays"] for stage in ("columns", "prediction", "separation"))
+    rays = sum(found[f"{stage}_rays"] for stage in ("columns", "prediction", "correction"))
     assert rays < 0.3 * found["entries"]
     assert rays == pytest.approx(found["shadow_rays"], rel=1e-3)
 
@@ -254,10 +254,10 @@ def test_each_step_does_its_part(shadows):
     expected = render(shadows, "vpl", 1, **SMALL)
     everything, all_found = rendered(shadows, 1, **SMALL, density=0.1)
     without_correction, found = rendered(shadows, 1, **SMALL, correction=False)
-    assert found["separation_rays"] == 0 < all_found["separation_rays"]
+    assert found["correction_rays"] == 0 < all_found["correction_rays"]
     assert relative_error(everything, expected) < relative_error(without_correction, expected)
     plain, found = rendered(shadows, 1, **SMALL, separation=False)
-    assert found["separation_rays"] == 0 and not np.array_equal(plain, without_correction)
+    assert found["correction_rays"] == 0 and not np.array_equal(plain, without_correction)
     blind, found = rendered(shadows, 1, **SMALL, prediction=False, separation=False)
     # What is not predicted is taken to arrive
     assert found["prediction_rays"] == 0 and blind.mean() > 1.05 * expected.mean()
@@ -287,7 +287,7 @@ def test_a_slice_that_fails_is_traced_whole_and_counted(shadows, monkeypatch):
     monkeypatch.setattr(matrix_recovery, "separate", fails)
     settings = SMALL | {"correction": False}
     image, found = rendered(shadows, 1, **settings)
-    assert found["failed_slices"] > 0 and found["separation_rays"] > 0
+    assert found["failed_slices"] > 0 and found["correction_rays"] > 0
     monkeypatch.undo()
     # All rows of all columns that are not alike
     traced, _ = rendered(shadows, 1, **SMALL, sampling=1.0, separation=False)

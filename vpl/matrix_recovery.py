@@ -10,6 +10,7 @@ And what is recovered is D − Z, not XY, so that entries in which no error was 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -69,17 +70,25 @@ class Recovered:
 
 
 def recover(
-    block: MatrixBlock, predictors: Predictors, best: np.ndarray, first: int, options: RecoveryOptions, seed: int
-):
+    block: MatrixBlock, predictors: Predictors, best: np.ndarray, first: int, options: RecoveryOptions, seed: int,
+    lap: Callable[[str], None] = lambda stage: None,
+) -> Recovered:  # fmt: skip
     """Recover a block: see :class:`Recovered`.
 
     ``best``: the predictor of every column that has samples; those of the block are these from number ``first`` on.
+    ``lap``: called with the name of every stage as it ends.
     """
     predicted, traced = _predicted(block, predictors, best, first, options.prediction, seed)
+    lap("prediction")
     found = Recovered(block.unoccluded(), predicted, traced, mi.Float(predicted))
+    lap("shading")
     mixed = _mixed_columns(predictors.samples, first, block.columns.count) if options.separation else []
     if len(mixed):
-        _correct(found, block, mixed, options, seed)
+        wanted = _separate(found, block, mixed, options, seed)
+        lap("separation")
+        if len(wanted):
+            block.trace(found.visibility, wanted, dr.opaque(mi.UInt32, seed))
+        lap("correction")
     return found
 
 
@@ -89,8 +98,8 @@ def _mixed_columns(samples: VisibilitySamples, first: int, count: int) -> np.nda
     return np.flatnonzero((lit > _LEAST_ERROR) & (lit < number - _LEAST_ERROR))
 
 
-def _correct(found: Recovered, block: MatrixBlock, mixed: np.ndarray, options: RecoveryOptions, seed: int) -> None:
-    """Find errors in some columns by separation, and trace where they lie dense."""
+def _separate(found: Recovered, block: MatrixBlock, mixed: np.ndarray, options: RecoveryOptions, seed: int):
+    """Find and take off errors in some columns: the places where they lie dense, and of slices that failed, UInt32."""
     part = MatrixBlock(block.entries, block.columns.select(mixed), block.begin, block.begin + block.slices)
     source, present = _places(block, part, mixed)
     predicted = dr.gather(mi.Float, found.predicted, source, present)
@@ -111,9 +120,7 @@ def _correct(found: Recovered, block: MatrixBlock, mixed: np.ndarray, options: R
     if options.correction:
         found.density = _blurred(part, wrong)
         wanted |= found.density > options.density
-    chosen = dr.compress(wanted & free & (unoccluded > 0))
-    if len(chosen):
-        block.trace(found.visibility, dr.gather(mi.UInt32, source, chosen), dr.opaque(mi.UInt32, seed))
+    return dr.gather(mi.UInt32, source, dr.compress(wanted & free & (unoccluded > 0)))
 
 
 def _places(block: MatrixBlock, part: MatrixBlock, columns: np.ndarray):
