@@ -84,11 +84,11 @@ MATERIALS = {
 
 
 def _glow(shape, **more):
-    return {"lamp": {"type": shape, "emitter": {"type": "area", "radiance": rgb(3.0, 2.5, 2.0)}, **more}}
+    return {"lamp": {"type": shape, "emitter": {"type": "area", "radiance": rgb(6.0, 5.0, 4.0)}, **more}}
 
 
 def _above(scale=0.3):
-    return mi.ScalarTransform4f().translate([0.2, 1.5, 0.3]).rotate([1, 0, 0], 90).scale(scale)
+    return mi.ScalarTransform4f().translate([0.2, 2.1, 0.3]).rotate([1, 0, 0], 90).scale(scale)
 
 
 def _from_above():
@@ -108,9 +108,9 @@ EMITTERS = {
         }
     },
     "rectangle": lambda: _glow("rectangle", to_world=_above()),
-    "sphere": lambda: _glow("sphere", center=[0.3, 1.5, 0.5], radius=0.2),
+    "sphere": lambda: _glow("sphere", center=[0.3, 2.2, 0.5], radius=0.2),
     "disk": lambda: _glow("disk", to_world=_above()),
-    "cylinder": lambda: _glow("cylinder", p0=[-0.4, 1.4, 0.5], p1=[0.4, 1.5, 0.6], radius=0.1),
+    "cylinder": lambda: _glow("cylinder", p0=[-0.4, 2.2, 0.5], p1=[0.4, 2.3, 0.6], radius=0.1),
     "mesh": lambda: _glow("cube", to_world=_above(0.2)),
     "texturedarea": lambda: {
         "lamp": {
@@ -126,7 +126,6 @@ EMITTERS = {
     "sunsky": lambda: {"sky": {"type": "sunsky", "sun_direction": [0.3, 0.4, 0.8], "turbidity": 3.0}},
     "sky": lambda: {"sky": {"type": "sunsky", "sun_scale": 0.0, "sun_direction": [0.3, 0.4, 0.8]}},
     "sun": lambda: {"sky": {"type": "sunsky", "sky_scale": 0.0, "sun_direction": [0.3, 0.4, 0.8]}},
-    "timed_sunsky": lambda: {"sky": {"type": "timed_sunsky"}},
 }  # fmt: skip
 
 
@@ -160,3 +159,47 @@ def all_materials():
         center = [-1.2 + 0.48 * column, -0.7 + 0.45 * row, 0.3 - 0.3 * row]
         objects[f"ball_{name}"] = {"type": "sphere", "center": center, "radius": 0.2, "bsdf": material()}
     return objects
+
+
+def _on(film, kind, **more):
+    to_world = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    sampler = {"type": "independent", "sample_count": 4}
+    return {"type": kind, "film": film, "sampler": sampler, **({"to_world": to_world} | more)}
+
+
+def _two_cameras(film):
+    halves = film | {"width": film["width"] // 2}
+    first, second = (_on(halves, "perspective", fov=fov) for fov in (30, 50))
+    return {"type": "batch", "film": film, "sampler": first["sampler"], "first": first, "second": second}
+
+
+def _in_front_of(x):
+    return mi.ScalarTransform4f().look_at([x, 0, 4], [x, 0, 0], [0, 1, 0])
+
+
+# Sensors around a film; those that measure one number take one of a single pixel
+SENSORS = {
+    "perspective": lambda film: _on(film, "perspective", fov=45),
+    "shutter": lambda film: _on(film, "perspective", fov=45, shutter_open=0.0, shutter_close=1.0),
+    "thinlens": lambda film: _on(film, "thinlens", fov=45, aperture_radius=0.1, focus_distance=4.0),
+    "orthographic": lambda film: _on(film, "orthographic", to_world=_in_front_of(0).scale(1.5)),
+    "radiancemeter": lambda film: _on(film, "radiancemeter", to_world=_in_front_of(0.3)),
+    "distant": lambda film: _on(film, "distant", to_world=_from_above(), target=[0.2, -1.0, 0.5]),
+    "batch": _two_cameras,
+}
+ONE_PIXEL = ("radiancemeter", "distant")
+
+
+def film(width=16, height=16, **more):
+    """A film with a box filter."""
+    return {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}, **more}
+
+
+PIXELS = ("luminance", "luminance_alpha", "rgb", "rgba", "xyz", "xyza")
+FILMS = {
+    **{f"{pixel} {component}": {"pixel_format": pixel, "component_format": component}
+       for pixel in PIXELS for component in ("float16", "float32", "uint32")},
+    "crop": {"crop_offset_x": 3, "crop_offset_y": 5, "crop_width": 7, "crop_height": 4},
+    "border": {"sample_border": True, "rfilter": {"type": "tent"}},
+    "gaussian": {"rfilter": {"type": "gaussian"}},
+}  # fmt: skip
