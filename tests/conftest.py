@@ -1,11 +1,18 @@
 """Fixtures shared by all tests: the variant, and small scenes built from dictionaries."""
 
+import os
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from scipy import stats
 
 VARIANT = "llvm_ad_rgb"
+
+
+def examples(usual: int, most: int = 10_000) -> int:
+    """How many random examples a test of a property takes: a few, or as many as the stress run asks for."""
+    return min(max(usual, int(os.environ.get("MANYLIGHTS_EXAMPLES", "0"))), most)
 
 
 @pytest.fixture(scope="session", autouse=True)
