@@ -85,6 +85,11 @@ def test_every_plugin_with_every_material_alone(name, number, material):
 def test_every_way_of_direct_light_under_every_emitter(direct, emitter):
     """As virtual lights, and by adaptive sampling, with all materials in sight."""
     scene = mi.load_dict(stage(EMITTERS[emitter](), all_materials(), 16))
+    if direct == "vpl" and emitter in ("texturedspot", "projector", "directionalarea"):
+        with pytest.raises(RuntimeError) as error:
+            image_of(scene, "lightcuts", direct=direct)
+        assert 'cannot become virtual lights: use direct="nee"' in str(error.value.__cause__)
+        return
     image_of(scene, "lightcuts", max_depth=4, direct=direct, direct_count=300)
 
 

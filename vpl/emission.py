@@ -67,7 +67,7 @@ def bounding_sphere(scene):
     Raises a ValueError for a scene whose size is not a finite number.
     """
     sphere, box = scene.bbox().bounding_sphere(), scene.bbox()
-    if box.valid() and not np.isfinite(float(sphere.radius)):
+    if len(scene.shapes()) and not np.isfinite(float(sphere.radius)):
         raise ValueError(f"the scene reaches from {box.min} to {box.max}: its size must be finite")
     return sphere
 
