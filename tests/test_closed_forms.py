@@ -45,7 +45,7 @@ def facing_down(kind, height, radius, radiance):
 
 
 @pytest.mark.parametrize("name", all_plugins())
-@pytest.mark.parametrize("height", [1.01, 2.0, 5.0])
+@pytest.mark.parametrize("height", [1.01, pytest.param(2.0, marks=pytest.mark.stress), 5.0])
 def test_a_glowing_ball_over_a_plane(name, height):
     """Right below a ball of radius r at height h the irradiance is pi L (r / h)²."""
     ball = {
@@ -66,7 +66,7 @@ def test_a_disk_over_a_plane(name):
 
 
 @pytest.mark.parametrize("name", all_plugins(*DIRECT))
-@pytest.mark.parametrize("depth", [2, 4])
+@pytest.mark.parametrize("depth", [pytest.param(2, marks=pytest.mark.stress), 4])
 def test_light_between_two_disks(name, depth):
     """A glowing disk over another one, each reflecting half of what comes: radiosity of both by quadrature over rings.
 
@@ -86,7 +86,7 @@ def test_light_between_two_disks(name, depth):
 
 
 @pytest.mark.parametrize("name", all_plugins(*DIRECT))
-@pytest.mark.parametrize("depth", [2, 3, 5])
+@pytest.mark.parametrize("depth", [pytest.param(2, marks=pytest.mark.stress), 3, 5])
 def test_a_furnace_whose_walls_glow(name, depth):
     """Inside a closed box whose walls emit L and reflect a share a of it, n edges carry L (1 + a + ... + a^(n-1))."""
     glow = {"emitter": {"type": "area", "radiance": rgb(1.0)}}

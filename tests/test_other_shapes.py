@@ -43,7 +43,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])
 @pytest.mark.parametrize("other", OTHERS)
-@pytest.mark.parametrize("lamp", ["rectangle", "cylinder"])
+@pytest.mark.parametrize("lamp", [pytest.param("rectangle", marks=pytest.mark.stress), "cylinder"])
 def test_area_emitters_light_them_as_in_path(name, other, lamp, tmp_path):
     lamps = EMITTERS[lamp]() | {"second": {"type": "sphere", "center": [1, 1.2, 1], "radius": 0.1,
                                            "emitter": {"type": "area"}}}  # fmt: skip

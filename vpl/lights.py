@@ -299,8 +299,8 @@ def _read_environment(scene):
     if "data" in parameters:
         # Mitsuba puts a copy of the last column first.  Negative texels, which filters leave in maps, are black here
         texels = np.asarray(parameters["data"])[:, 1:]
-        bad = np.argwhere(~usable(np.abs(texels)).all(-1))
-        if len(bad):
+        if not usable(max(-texels.min(), texels.max())):
+            bad = np.argwhere(~usable(np.abs(texels)).all(-1))
             row, column = bad[0].tolist()
             raise ValueError(
                 f'the environment map "{environment.id()}" has {len(bad)} texel(s) that are not a number or above '
