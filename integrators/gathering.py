@@ -13,7 +13,7 @@ import numpy as np
 from vpl.adaptive_direct import PixelGrid
 from vpl.arrays import download
 from vpl.gather import CameraPaths, SceneTraits, follow_camera_rays, refuse_media, scene_traits
-from vpl.lights import Emitters, read_emitters
+from vpl.lights import Emitters, read_emitters, usable
 
 from . import properties
 
@@ -114,7 +114,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
             start = self.begin(scene, sampler, mi.Ray3f(ray), active)
             radiance, channels, found = self.light(scene, sampler, start)
             image, counters = self._assemble(start, radiance, channels, found)
-        finite = dr.all(dr.isfinite(image)) & (self.max_depth > 0)
+        finite = dr.all(usable(image)) & (self.max_depth > 0)
         return dr.select(finite, mi.Spectrum(image), 0), start.valid, counters
 
     def begin(self, scene, sampler, ray, active=True) -> Start:
@@ -155,7 +155,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         counters = [dr.zeros(mi.Float, dr.width(start.paths.valid)) for _ in self.aovs]
         if points.count:
             lit = points.weight * radiance
-            bad = ~dr.all(dr.isfinite(lit))
+            bad = ~dr.all(usable(lit))
             dr.scatter_add(image, dr.select(bad, 0, lit), points.ray)
             for name, counter in zip(self.aovs, counters, strict=True):
                 if name in channels:
@@ -165,7 +165,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         if bad_samples:
             mi.Log(mi.LogLevel.Warn, f"{bad_samples} sample(s) with values that are not finite were dropped.")
         self.statistics = {"gather_points": points.count, **found, "seconds": start.clock.seconds}
-        self.statistics["dropped"] = self.statistics.get("dropped", 0) + bad_samples
+        self.statistics["dropped"] = self.statistics.get("dropped", start.emitters.dropped) + bad_samples
         return image, counters
 
     def describe(self) -> dict:

@@ -67,6 +67,8 @@ lobes send on from the second surface (they would need another kind of light), a
     - Emitters: point, spot, directional, area on any shape, envmap, constant, sunsky; projectors and textured spots
       with ``direct="nee"``.
     - Shadow rays pass surfaces that do not scatter (masks, thin glass) with their transmission.
+    - Values that are negative, not a number or above 1e30 count as nothing, and are counted where a whole light or
+      sample is lost; a scene of no finite size, and an environment map that holds such values, are refused.
 """
 
 

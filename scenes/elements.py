@@ -17,7 +17,7 @@ HEADER = """<!-- Made by: python scenes/{command}
      {title}; scenes/{script} says what it is for. Metres; z is up. -->
 <scene version="3.0.0">
 <default name="integrator" value="path"/>
-<default name="max_depth" value="2"/>
+<default name="max_depth" value="{depth}"/>
 <default name="spp" value="64"/>
 <default name="resx" value="256"/>
 <default name="resy" value="192"/>
@@ -31,11 +31,18 @@ HEADER = """<!-- Made by: python scenes/{command}
 </sensor>"""
 
 
-def header(command, title, fov, origin, target):
-    """Return the opening of a scene: the scene parameters and the camera. `command` is the line that makes it."""
+def header(command, title, fov, origin, target, depth=2):
+    """Return the opening of a scene: the scene parameters and the camera. `command` is the line that makes it, `depth`
+    the usual `max_depth`."""
     script = command.split()[0]
     return HEADER.format(
-        command=command, script=script, title=title, fov=fov, origin=numbers(origin), target=numbers(target)
+        command=command,
+        script=script,
+        title=title,
+        fov=fov,
+        origin=numbers(origin),
+        target=numbers(target),
+        depth=depth,
     )
 
 
@@ -137,6 +144,30 @@ def write_image(path, image):
     attributes = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
     with OpenEXR.File(attributes, {"RGB": np.ascontiguousarray(image, np.float16)}) as file:
         file.write(str(path))
+
+
+def downlight(position, cutoff, intensity, colour, random):
+    """Return a spot that shines straight down, whose strength varies about `intensity`."""
+    below = numbers(np.subtract(position, (0, 0, 1)))
+    return (
+        f'<emitter type="spot"><transform name="to_world"><lookat origin="{numbers(position)}" target="{below}" '
+        f'up="1, 0, 0"/></transform><float name="cutoff_angle" value="{cutoff:g}"/>'
+        f"{spectrum('intensity', intensity, colour, random)}</emitter>"
+    )
+
+
+def write_scene(document, name, make, images=None, arguments=None):
+    """The command line of a generator: write `make(seed)` to the output, which is `name`.xml by default, and the
+    textures of `images` (name: texels) beside it."""
+    command_line = parser(document, f"{name}.xml")
+    options = command_line.parse_args(arguments)
+    output = options.output or Path(f"{name}.xml")
+    try:
+        output.write_text(make(options.seed))
+        for file, texels in (images or {}).items():
+            write_image(output.parent / file, texels)
+    except (ValueError, OSError) as error:
+        command_line.exit(2, f"{name}: {error}\n")
 
 
 def parser(document, name):

@@ -1,5 +1,6 @@
 """Fixtures shared by all tests: the variant, and small scenes built from dictionaries."""
 
+import os
 from pathlib import Path
 
 import mitsuba as mi
@@ -14,6 +15,11 @@ SWEEP = [
     "lightcuts:error=0.4,0.1", "--sweep", "vpl:vpl_count=2000", "-p", "lightcuts.vpl_count=2000", "--seeds", "2",
     "--reference", "path:auto:0.9", "--spp", "1",
 ]  # fmt: skip
+
+
+def examples(usual: int, most: int = 10_000) -> int:
+    """How many random examples a test of a property takes: a few, or as many as the stress run asks for."""
+    return min(max(usual, int(os.environ.get("MANYLIGHTS_EXAMPLES", "0"))), most)
 
 
 @pytest.fixture(scope="session", autouse=True)

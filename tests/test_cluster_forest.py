@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from vpl.cluster_forest import ClusterForest, build_cluster_forest
 
+from .conftest import examples
+
 DTYPES = {name: np.uint32 for name in ("escape", "first", "last", "depth", "roots", "leaf_order")}
 
 
@@ -183,7 +185,7 @@ def hostile_lights(draw):
 
 
 @given(hostile_lights())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 def test_every_invariant_holds_for_hostile_lights(lights):
     check_forest(build_cluster_forest(*lights), lights)
 
@@ -327,7 +329,7 @@ def greedy(center, radius):
 
 
 @given(st.integers(0, 2**32), st.integers(2, 100), st.sampled_from([0, 0.01, 0.1]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_small_trees_are_the_greedy_ones(seed, count, extent):
     rng = np.random.default_rng(seed)
     center, radius = rng.random((count, 3)), rng.uniform(0, extent, count)
@@ -400,7 +402,7 @@ def test_the_unit_and_the_origin_of_positions_do_not_matter(scale, shift, seed):
 
 
 @given(st.integers(0, 2**32), st.integers(2, 200))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 def test_the_order_of_the_lights_does_not_matter(seed, count):
     rng = np.random.default_rng(seed)
     lights = random_lights(rng, count, extent=0)

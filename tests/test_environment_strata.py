@@ -10,6 +10,8 @@ from hypothesis.extra import numpy as arrays
 
 from vpl.environment_strata import _assign, _cells, _components, _farthest_first, cones, stratify
 
+from .conftest import examples
+
 SUN, LAMP = (0.5, 0.3, 0.8), (-0.2, 0.9, -0.4)
 
 
@@ -58,7 +60,7 @@ maps = arrays.arrays(
 
 
 @given(radiance=maps, count=st.integers(1, 100))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 def test_every_cell_has_a_region_and_every_region_light(radiance, count):
     check(stratify(radiance, count), radiance, count)
 
@@ -205,7 +207,7 @@ def test_black_cells_join_the_nearest_lamp():
 
 
 @given(mask=arrays.arrays(bool, arrays.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=8)))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 def test_components_are_those_that_a_flood_reaches(mask):
     height, width = mask.shape
     expected = np.full(mask.shape, -1)
@@ -297,7 +299,7 @@ def least_cosines(labels, axis, steps):
         np.int64, arrays.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=6), elements=st.integers(0, 3)
     )
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 def test_cones_hold_their_cells_and_little_more(labels):
     axis, cosine = cones(labels)
     assert axis.dtype == cosine.dtype == np.float64

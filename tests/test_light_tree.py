@@ -21,6 +21,8 @@ from vpl.light_tree import (
     build_light_tree,
 )
 
+from .conftest import examples
+
 
 def random_unit(rng, count):
     vector = rng.normal(size=(count, 3))
@@ -157,7 +159,7 @@ def hostile_lights(draw):
 
 
 @given(hostile_lights())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 def test_every_invariant_holds_for_hostile_lights(lights):
     position, direction, flux, options = lights
     check_tree(build(position, direction, flux, **options), position, direction, flux)
@@ -350,7 +352,7 @@ def test_the_unit_of_length_does_not_matter(scale, seed):
 
 
 @given(st.integers(0, 2**32), st.integers(2, 200))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 def test_the_order_of_the_lights_does_not_matter(seed, count):
     rng = np.random.default_rng(seed)
     position, direction, flux = random_lights(rng, count)

@@ -22,6 +22,7 @@ from .conftest import (
     assert_property_is_refused,
     assert_same_mean_over_seeds,
     closed_box,
+    examples,
     relative_error,
     render,
     sensor,
@@ -57,7 +58,7 @@ def nodes_that_hold(tree, pixel):
     flat=st.booleans(),
     most=st.sampled_from([1, 3, 50]),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 def test_every_pixel_has_a_branch_of_its_own(seed, count, width, flat, most):
     rng = np.random.default_rng(seed)
     pixel = rng.integers(0, 40, count)

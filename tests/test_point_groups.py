@@ -11,6 +11,8 @@ from vpl.pixel_regions import representatives
 from vpl.point_groups import BLOCK, bound_groups, find_groups, find_sites, normal_class
 from vpl.sources import Nodes
 
+from .conftest import examples
+
 SEEDS = st.integers(0, 2**32 - 1)
 UP, DOWN = (0.0, 0, 1), (0.0, 0, -1)
 
@@ -138,7 +140,7 @@ def nearest_in_box(groups, group, p):
 @given(
     seed=SEEDS, solid_angle=st.sampled_from([0.0, 1e-3, 0.02, 0.3, 3.0, 7.0]), faint=st.sampled_from([0.0, 0.05, 1.0])
 )
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 def test_cuts_hold_every_source_that_lights_the_group_exactly_once(seed, solid_angle, faint):
     rng = np.random.default_rng(seed)
     nodes, groups = random_nodes(rng), random_groups(rng)
@@ -150,7 +152,7 @@ def test_cuts_hold_every_source_that_lights_the_group_exactly_once(seed, solid_a
 
 
 @given(seed=SEEDS, solid_angle=st.sampled_from([1e-3, 0.02, 0.3, 3.0, 6.0]))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 def test_cuts_are_fine_enough_from_every_point_and_no_finer(seed, solid_angle):
     rng = np.random.default_rng(seed)
     nodes, groups = random_nodes(rng), random_groups(rng)
@@ -197,7 +199,7 @@ def test_faint_clusters_are_coarser_and_all_others_as_fine_as_ever():
 
 
 @given(seed=SEEDS)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 def test_all_leaves_are_single_sources_even_where_they_coincide(seed):
     rng = np.random.default_rng(seed)
     nodes, groups = random_nodes(rng), random_groups(rng)
@@ -212,7 +214,7 @@ def test_all_leaves_are_single_sources_even_where_they_coincide(seed):
 
 
 @given(seed=SEEDS)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 def test_leaves_of_chosen_groups_are_those_among_all_groups(seed):
     rng = np.random.default_rng(seed)
     nodes, groups = random_nodes(rng), random_groups(rng)
@@ -358,7 +360,7 @@ def test_groups_of_a_plane_are_blocks_times_classes(width, height):
 
 
 @given(seed=SEEDS, width=st.integers(1, 40), count=st.integers(1, 400), scale=st.sampled_from([1e-6, 1.0, 1e6]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_groups_never_mix_blocks_or_classes(seed, width, count, scale):
     rng = np.random.default_rng(seed)
     pixel = rng.integers(0, 40 * width, count)
@@ -389,7 +391,7 @@ def test_a_step_much_smaller_than_the_group_does_not_divide_it():
 
 
 @given(seed=SEEDS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 def test_tilted_planes_are_not_divided(seed):
     rng = np.random.default_rng(seed)
     pixel, plane = pixels(8, 8, 16)
@@ -410,7 +412,7 @@ def test_coincident_points_are_one_group_and_one_point_is_a_group():
 
 
 @given(seed=SEEDS, count=st.integers(1, 300), groups=st.integers(1, 20), size=st.sampled_from([1, 10, 10**8]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_sites_are_the_pairs_of_group_and_pixel(seed, count, groups, size):
     rng = np.random.default_rng(seed)
     group = np.unique(rng.integers(0, groups, count), return_inverse=True)[1]
@@ -446,7 +448,7 @@ def bounds(group, position, normal, two_sided=None):
 
 
 @given(seed=SEEDS, count=st.integers(1, 200), spread=st.sampled_from([0.0, 1e-4, 0.5, 100.0]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_groups_contain_their_points_and_normals(seed, count, spread):
     rng = np.random.default_rng(seed)
     group = np.unique(rng.integers(0, 5, count), return_inverse=True)[1]
@@ -504,7 +506,7 @@ def check_representatives(standing, pixel, shape, normal):
 
 
 @given(seed=SEEDS, count=st.integers(1, 300), kinds=st.integers(1, 4), scale=st.sampled_from([1e-6, 1.0, 1e6]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_points_stand_only_for_their_like(seed, count, kinds, scale):
     rng = np.random.default_rng(seed)
     pixel = rng.integers(0, 10, count) + 40_000_000

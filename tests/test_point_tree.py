@@ -15,6 +15,8 @@ from vpl.arrays import download, upload
 from vpl.node_bounds import NodeBounds
 from vpl.point_tree import build_point_tree, point_codes
 
+from .conftest import examples
+
 
 def random_unit(rng, count):
     vector = rng.normal(size=(count, 3))
@@ -180,7 +182,7 @@ def hostile_points(draw):
 
 
 @given(hostile_points())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 def test_every_invariant_holds_for_hostile_points(points):
     build_checked(*points)
 

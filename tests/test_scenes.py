@@ -1,13 +1,17 @@
 """The shipped scenes and their generator."""
 
+import importlib
 import importlib.util
 import re
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from comparison.scene_files import SceneFile
+
+from .conftest import render
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared" / "scenes"
@@ -27,7 +31,7 @@ def kinds(text):
     return [len(re.findall(f'<emitter type="{kind}">', text)) for kind in ("point", "spot", "area")]
 
 
-@pytest.mark.parametrize("name", ["cornell", "glossy", "hall"])
+@pytest.mark.parametrize("name", ["cornell", "glossy", "hall", "banquet", "arcade", "corridor", "furnace"])
 def test_scene_takes_the_usual_parameters(name):
     defines = {"integrator": "direct", "max_depth": "3", "spp": "7", "resx": "16", "resy": "8"}
     file = SceneFile(ROOT / "scenes" / f"{name}.xml", defines)
@@ -45,6 +49,39 @@ def test_scene_takes_the_usual_parameters(name):
 def test_shipped_hall_is_what_the_generator_makes(generator, tmp_path):
     generator.main(["--lights", "1000", "--seed", "1", "--output", str(tmp_path / "hall.xml")])
     assert (tmp_path / "hall.xml").read_text() == (ROOT / "scenes" / "hall.xml").read_text()
+
+
+# Points, spots and areas of the scenes that have one number of them
+OTHERS = {"banquet": [0, 60, 66], "arcade": [0, 0, 0], "corridor": [0, 0, 32]}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_shipped_scenes_are_what_their_generators_make(name, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "scenes")
+    importlib.import_module(name).main(["--seed", "1", "--output", str(tmp_path / f"{name}.xml")])
+    text = (tmp_path / f"{name}.xml").read_text()
+    assert text == (ROOT / "scenes" / f"{name}.xml").read_text()
+    assert kinds(text) == OTHERS[name]
+    if name == "arcade":
+        made, shipped = (np.array(mi.Bitmap(str(f / "arcade_sky.exr"))) for f in (tmp_path, ROOT / "scenes"))
+        assert np.allclose(made, shipped, rtol=1e-2)
+
+
+@pytest.mark.parametrize("direct", ["nee", pytest.param("adaptive", marks=pytest.mark.stress)])
+def test_the_furnace_is_white(direct):
+    scene = SceneFile(ROOT / "scenes" / "furnace.xml", {"resx": "24", "resy": "18"})
+    scene.set_integrator("path")
+    loaded = scene.load()
+    images = [render(loaded, "lightcuts", 16, seed, clamping=0.0, vpl_count=5000, direct=direct) for seed in range(6)]
+    means = np.stack(images).mean((1, 2, 3))
+    assert abs(means.mean() - 1) < 5 * means.std(ddof=1) / len(means) ** 0.5 + 2e-3
+
+
+def test_every_scene_has_a_picture_and_a_line_in_the_list():
+    listed = (ROOT / "scenes" / "README.md").read_text()
+    for path in (ROOT / "scenes").glob("*.xml"):
+        assert path.with_suffix(".png").exists()
+        assert f"[{path.stem}]({path.stem}.png)" in listed
 
 
 @pytest.mark.parametrize("count", [1, 10, 37, 1000])

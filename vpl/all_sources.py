@@ -1,7 +1,8 @@
 """Direct light as the plain sum over all sources, one shadow ray each: the method to beat where they are few.
 
-The loop over the sources runs in step for all points of a group, so their rays stay close together.  Sources without
-extent are summed exactly; of the others every round takes one point each, and rounds go on until two halves agree.
+The loop over the sources runs in step for all points of a group, so their rays stay close together.  Where a site is
+one point and no source has an extent, one round is exact.  Elsewhere every round takes other points of the site and of
+the sources, and rounds go on until two halves agree.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ class SourceRounds:
             return
         size = download(table.size).astype(np.int64)
         extended = self.scenery.sources.nodes.extended[download(table.node)].any() or self.bsdf_share.any()
-        halves = 2 if extended else 1
+        noisy = (size > 0) & (extended | (self.sites.points > 1))
         active = np.flatnonzero(size)
-        for number in range(halves * self.options.max_samples):
+        for number in range(2 * self.options.max_samples):
             if len(active) == 0 or halted(number):
                 break
             half = number % 2
@@ -50,11 +51,11 @@ class SourceRounds:
             self.rays[active] += download(drawn.rays)
             self.seen[active] += download(drawn.seen)
             self.samples[active] += size[active]
-            if halves == 1:
-                break
+            if number == 0:
+                active = np.flatnonzero(noisy)
             if half == 1 and number + 1 >= 2 * _LEAST_ROUNDS:
                 affordable = self.samples + 2 * size <= self.options.max_samples
-                active = np.flatnonzero((size > 0) & affordable & self._unfinished()[self.sites.group])
+                active = np.flatnonzero(noisy & affordable & self._unfinished()[self.sites.group])
 
     def _round(self, active, half: int, size, seed: int) -> Drawn:
         bsdf = np.ceil(size[active] * self.bsdf_share[active])

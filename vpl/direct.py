@@ -49,7 +49,7 @@ class ExtendedEmitters:
         weight = dr.zeros(mi.UnpolarizedSpectrum, dr.width(si.p))
         if areas:
             here = active & (row < areas)
-            ds = self.emitters.area.shape(row, here).sample_direction(si, direction_sample, here)
+            ds = self.emitters.area.on_shape("sample_direction", row, si, direction_sample, here)
             facing = here & (dr.dot(ds.d, ds.n) < 0) & (ds.pdf > 0)
             weight = dr.select(facing, self.emitters.area.emitted_in_front(row, ds, facing) / ds.pdf, 0)
         for number, emitter in enumerate(self.single):
@@ -69,7 +69,7 @@ class ExtendedEmitters:
         if areas:
             row = self.emitters.area.row(hit, active & hit.is_valid())
             here = active & hit.is_valid() & (row > 0)
-            pdf = self.emitters.area.shape(row - 1, here).pdf_direction(si, ds, here)
+            pdf = self.emitters.area.on_shape("pdf_direction", row - 1, si, ds, here)
             density = dr.select(here, pdf * self.choice.probability(row - 1, here), 0)
         if self.emitters.environment is not None:
             here = active & ~hit.is_valid()

@@ -62,8 +62,14 @@ def other_power(emitter, bounding_sphere) -> float:
 
 
 def bounding_sphere(scene):
-    """Sphere around the scene's box: the same one that clamping distances are measured by."""
-    return scene.bbox().bounding_sphere()
+    """Sphere around the scene's box: the same one that clamping distances are measured by.
+
+    Raises a ValueError for a scene whose size is not a finite number.
+    """
+    sphere, box = scene.bbox().bounding_sphere(), scene.bbox()
+    if len(scene.shapes()) and not np.isfinite(float(sphere.radius)):
+        raise ValueError(f"the scene reaches from {box.min} to {box.max}: its size must be finite")
+    return sphere
 
 
 class OmniEmission:
@@ -104,7 +110,7 @@ class AreaEmission:
     def sample(self, stratified, position_sample, direction_sample):
         """Ray and weight (power per path)."""
         row = self._choice.row(stratified)
-        ps = self._area.shape(row).sample_position(0, position_sample)
+        ps = self._area.on_shape("sample_position", row, mi.Float(0), position_sample, mi.Bool(True))
         direction = mi.Frame3f(ps.n).to_world(mi.warp.square_to_cosine_hemisphere(direction_sample))
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(row))
         si.p, si.n = ps.p, ps.n

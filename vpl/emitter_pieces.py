@@ -117,7 +117,7 @@ class EmitterPieces:
         if SHAPE in self._kinds:
             whole = active & (kind == SHAPE)
             # By area, because texture coordinates come with positions only
-            ps = self._area.shape(row, whole).sample_position(interaction.time, sample, whole)
+            ps = self._area.on_shape("sample_position", row, interaction.time, sample, whole)
             other = PieceSample(ps.p, ps.n, ps.uv, _flat_density(interaction.p, ps.p, ps.n, size))
             found = select_record(whole, other, found)
         active = active & (found.pdf > 0)
@@ -274,6 +274,9 @@ def _pieces_of(shape, textured: bool) -> _Pieces:
     if name in ("Rectangle", "Disk", "Sphere"):
         matrix = matrix_of(parameters_of(shape, below=False)["to_world"])
     linear, origin = matrix[:3, :3], matrix[:3, 3]
+    if np.linalg.det(linear) == 0:
+        # Flattened shapes have no area for Mitsuba: never drawn, this only has to be numbers
+        return _one(PARALLELOGRAM, origin, np.zeros(3), np.zeros(3), (0, 0, 1))
     if name == "Rectangle":
         normal = np.linalg.inv(linear).T[:, 2] * (-1 if shape.has_flipped_normals() else 1)
         return _one(PARALLELOGRAM, origin - linear[:, 0] - linear[:, 1], 2 * linear[:, 0], 2 * linear[:, 1], normal)

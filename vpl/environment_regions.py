@@ -19,6 +19,8 @@ from .parameters import parameters_of
 from .sampling import find_interval, independent_sampler
 
 _EVALUATIONS = 2  # along each of both axes of a cell, at least
+# The same in cells of skies that are no image next to others that are this many times as bright: the sun has an edge
+_EDGE_EVALUATIONS, _EDGE_CONTRAST = 16, 2.0
 _STRATA_WIDTH = 256  # columns of the grid that regions are made of
 _DEFAULT_WIDTH, _LARGEST_WIDTH = 1024, 2048
 # Share of a region's light that is spread evenly over its cells: their table is made from few evaluations
@@ -118,11 +120,30 @@ def _image_width(environment) -> int:
 def _read(environment, width: int) -> np.ndarray:
     """Mean radiance of every cell, (width / 2, width) float64; values that are not finite count as black."""
     height = width // 2
-    count, across = width * height, max(_EVALUATIONS, -(-_image_width(environment) // width))
+    image_width = _image_width(environment)
+    across = max(_EVALUATIONS, -(-image_width // width))
+    radiance = _read_cells(environment, np.arange(width * height), width, across).reshape(height, width)
+    if not image_width:
+        edges = np.flatnonzero(_at_edges(radiance))
+        radiance.reshape(-1)[edges] = _read_cells(environment, edges, width, _EDGE_EVALUATIONS)
+    return radiance
+
+
+def _at_edges(radiance: np.ndarray) -> np.ndarray:
+    """Cells with a far brighter or a far darker one among their eight neighbours, (height, width) bool."""
+    padded = np.pad(np.pad(radiance, ((1, 1), (0, 0)), "edge"), ((0, 0), (1, 1)), "wrap")
+    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    return around.max((2, 3)) > _EDGE_CONTRAST * around.min((2, 3))
+
+
+def _read_cells(environment, cells: np.ndarray, width: int, across: int) -> np.ndarray:
+    """Mean radiance of some cells, from ``across`` times ``across`` evaluations in each."""
+    height, count = width // 2, len(cells)
+    if count == 0:
+        return np.zeros(0)
     sampler = independent_sampler(0, count)
-    cell = dr.arange(mi.UInt32, count)
     total = dr.zeros(mi.Float, count)
-    row, column = mi.Float(cell // width), mi.Float(cell % width)
+    row, column = upload(mi.Float, cells // width), upload(mi.Float, cells % width)
     for k in range(across**2):
         jitter = (mi.Point2f(k % across, k // across) + sampler.next_2d()) / across
         polar, azimuth = (row + jitter.x) * (np.pi / height), (column + jitter.y) * (2 * np.pi / width)
@@ -131,4 +152,4 @@ def _read(environment, width: int) -> np.ndarray:
         si.wi = -mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), cosine)
         total += channel_mean(finite_or_zero(mi.unpolarized_spectrum(environment.eval(si))))
         dr.eval(total, sampler)
-    return download(total).astype(np.float64).reshape(height, width) / across**2
+    return download(total).astype(np.float64) / across**2

@@ -22,6 +22,12 @@ from .parameters import matrix_of, numbers, parameters_of
 KINDS = ("point", "spot", "oriented", "directional", "environment")
 AT_INFINITY = ("directional", "environment")
 
+# Shapes, besides meshes, on which Mitsuba can sample a point; of others, such as curves, it does not know the area
+SAMPLED_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
+
+# Radiances and intensities above count as infinite: sums over lights and samples must stay in single precision's range
+LARGEST_VALUE = 1e30
+
 
 @dataclass
 class VirtualLights:
@@ -77,8 +83,9 @@ class VirtualLights:
         return VirtualLights(parts[0].kind, *joined)
 
     def without_bad(self) -> tuple[VirtualLights, int]:
-        """Drop lights that carry nothing, and those with a value that is not finite; returns how many of the latter."""
-        finite = np.isfinite(self.intensity).all(1) & np.isfinite(self.direction).all(1) & (self.intensity >= 0).all(1)
+        """Drop lights that carry nothing, and those with a value that is not finite (an intensity that is negative or
+        above ``LARGEST_VALUE``); returns how many of the latter."""
+        finite = usable(self.intensity).all(1) & np.isfinite(self.direction).all(1)
         if self.position is not None:
             finite &= np.isfinite(self.position).all(1)
         keep = finite & (self.intensity.sum(1, dtype=np.float64) > 0)
@@ -87,12 +94,16 @@ class VirtualLights:
 
 @dataclass
 class AreaEmitters:
-    """Area emitters as rows: the shape's registry index, radiance (RGB), area; textured ones keep their object."""
+    """Area emitters as rows: the shape's registry index, radiance (RGB), area; textured ones keep their object.
+
+    ``shapes``: the shapes one by one, for scenes in which some other shape cannot be sampled; see :meth:`on_shape`.
+    """
 
     shape_index: np.ndarray
     radiance: np.ndarray
     area: np.ndarray
     textured: list = field(default_factory=list)
+    shapes: list | None = None
 
     @property
     def count(self) -> int:
@@ -116,9 +127,16 @@ class AreaEmitters:
         index = dr.reinterpret_array(mi.UInt32, si.shape)
         return dr.gather(mi.UInt32, self._row_of_shape, index, active & (index < dr.width(self._row_of_shape)))
 
-    def shape(self, row, active=True):
-        """The shape of a row (counted from 0) as a pointer array."""
-        return dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self._shapes, row, active))
+    def on_shape(self, method: str, row, *arguments):
+        """Call a method of the shape of each row (counted from 0); the last argument is the mask of active lanes.
+
+        A call on pointers is recorded for all shapes of a scene at once, quickly however many they are, but fails if
+        one of them, such as a curve or an instance, does not have the method.  Then only emitters are called.
+        """
+        if self.shapes is not None:
+            return dr.switch(mi.UInt32(row), [getattr(shape, method) for shape in self.shapes], *arguments)
+        index = dr.gather(mi.UInt32, self._shapes, row, arguments[-1])
+        return getattr(dr.reinterpret_array(mi.ShapePtr, index), method)(*arguments)
 
     def emitted_in_front(self, row, sample, active=True):
         """Radiance that a position sample (or direction sample) on the emitter of ``row`` sends to its front."""
@@ -165,9 +183,15 @@ class Emitters:
         )  # fmt: skip
 
 
+def usable(value):
+    """Where a radiance, an intensity or a density is a number from 0 to ``LARGEST_VALUE``; NumPy or Dr.Jit."""
+    return (value >= 0) & (value <= LARGEST_VALUE)
+
+
 def finite_or_zero(spectrum):
-    """Replace values that are infinite or not a number, so that one bad texel cannot spoil an image."""
-    return dr.select(dr.isfinite(spectrum), spectrum, 0)
+    """Replace values that are infinite (see :func:`usable`), negative or not a number by 0, so that one bad texel
+    cannot spoil an image."""
+    return dr.select(usable(spectrum), spectrum, 0)
 
 
 def _constant_rgb(parameters, name):
@@ -203,6 +227,10 @@ def registered_shapes(scene) -> list:
     return [(int(index), shape) for index, shape in zip(registry, scene.shapes(), strict=True)]
 
 
+def _can_be_sampled(shape) -> bool:
+    return shape.is_mesh() or shape.class_name() in SAMPLED_SHAPES
+
+
 def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
     """Area emitters, the number of rows with values that are not finite, and emitters that only look like areas."""
     indices, radiances, textured, unusual = [], [], [], []
@@ -214,6 +242,11 @@ def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
         if emitter.class_name() != "AreaLight":
             unusual.append((emitter.class_name(), emitter))
             continue
+        if not _can_be_sampled(shape):
+            raise ValueError(
+                f'shape "{shape.id()}" ({shape.class_name()}): an area emitter on a shape of this kind is not '
+                f"supported, because no point on it can be sampled; one on a mesh, {', '.join(SAMPLED_SHAPES)} is"
+            )
         radiance = _constant_rgb(parameters_of(emitter), "radiance")
         if radiance is None and "MeshAttribute[" in str(emitter):
             raise ValueError(
@@ -226,14 +259,18 @@ def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
         indices.append(index)
         radiances.append(radiance)
     radiance = np.array(radiances, np.float32).reshape(-1, 3)
-    bad = ~np.isfinite(radiance).all(1)
+    bad = ~usable(radiance).all(1)
     radiance[bad] = 0
     shape_index = np.array(indices, np.uint32)
-    area = np.zeros(len(indices), np.float32)
-    if len(indices):
+    area, shapes = np.zeros(len(indices), np.float32), None
+    if len(indices) and all(_can_be_sampled(shape) for shape in scene.shapes()):
         pointers = dr.reinterpret_array(mi.ShapePtr, upload(mi.UInt32, shape_index))
         area = download(pointers.surface_area())
-    return AreaEmitters(shape_index, radiance, area, textured), int(bad.sum()), unusual
+    elif len(indices):
+        by_index = dict(glowing)
+        shapes = [by_index[index] for index in indices]
+        area = np.array([download(shape.surface_area())[0] for shape in shapes], np.float32)
+    return AreaEmitters(shape_index, radiance, area, textured, shapes), int(bad.sum()), unusual
 
 
 def _sorted_rows(rows: list, columns: int) -> np.ndarray:
@@ -242,10 +279,46 @@ def _sorted_rows(rows: list, columns: int) -> np.ndarray:
     return array[np.lexsort(array.T[::-1])]
 
 
+def _read_environment(scene):
+    """The environment, or None where there is none or it is one colour that is not usable, and how many were dropped.
+
+    Raises a ValueError that names a texel of an environment map that is not finite: Mitsuba cannot sample the map.
+    """
+    environment = scene.environment()
+    if environment is None:
+        return None, 0
+    if environment.class_name() == "TimedSunskyEmitter":
+        raise ValueError(
+            f'the emitter "{environment.id()}" ({environment.class_name()}) is not supported: Mitsuba\'s compiled '
+            "variants cannot evaluate it; sunsky is"
+        )
+    parameters = parameters_of(environment)
+    radiance = _constant_rgb(parameters, "radiance")
+    if radiance is not None and not usable(np.array(radiance)).all():
+        return None, 1
+    if "data" in parameters:
+        # Mitsuba puts a copy of the last column first.  Negative texels, which filters leave in maps, are black here
+        texels = np.asarray(parameters["data"])[:, 1:]
+        if not usable(max(-texels.min(), texels.max())):
+            bad = np.argwhere(~usable(np.abs(texels)).all(-1))
+            row, column = bad[0].tolist()
+            raise ValueError(
+                f'the environment map "{environment.id()}" has {len(bad)} texel(s) that are not a number or above '
+                f"{LARGEST_VALUE:g}, such as that in row {row} and column {column}"
+            )
+    return environment, 0
+
+
 def read_emitters(scene) -> Emitters:
-    """Read all emitters of ``scene``.  Lights with values that are not finite are dropped, counted and reported."""
+    """Read all emitters of ``scene``.
+
+    Lights with values that are not finite or negative are dropped, counted and reported; a ValueError names an
+    environment map with texels that are not finite, and emitters on shapes that cannot be sampled.
+    """
     points, spots, suns, others = [], [], [], []
-    area, dropped, others_on_shapes = _read_areas(scene)
+    environment, dropped = _read_environment(scene)
+    area, bad_areas, others_on_shapes = _read_areas(scene)
+    dropped += bad_areas
     for emitter in scene.emitters():
         name = emitter.class_name()
         if emitter.is_environment() or name == "AreaLight":
@@ -271,7 +344,7 @@ def read_emitters(scene) -> Emitters:
         dropped += bad
         kept.append(lights)
     if dropped:
-        mi.Log(mi.LogLevel.Warn, f"{dropped} emitter(s) with values that are not finite were dropped.")
+        mi.Log(mi.LogLevel.Warn, f"{dropped} emitter(s) with values that are negative or not finite were dropped.")
     others += others_on_shapes
     others.sort(key=lambda row: (row[0], row[1].id(), str(row[1])))
-    return Emitters(*kept, area, scene.environment(), others, dropped)
+    return Emitters(*kept, area, environment, others, dropped)

@@ -14,6 +14,7 @@ import mitsuba as mi
 from .arrays import rgb_to_spectrum
 from .bounds import Receiver
 from .gather import GatherPoints
+from .lights import finite_or_zero
 from .proxies import MaterialProxy
 
 
@@ -70,7 +71,7 @@ class ScatteringSurface(Surface):
         """(BSDF times cosine, density of :meth:`sample`) for light from a world space direction."""
         si = self.interaction
         value, density = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(to_light), active)
-        return mi.unpolarized_spectrum(value), density
+        return finite_or_zero(mi.unpolarized_spectrum(value)), finite_or_zero(density)
 
     def sample(self, sample1, sample2, active):
         """Draw a direction: (world space direction, BSDF times cosine over density, density per solid angle).
@@ -80,7 +81,8 @@ class ScatteringSurface(Surface):
         si = self.interaction
         sample, value = si.bsdf().sample(mi.BSDFContext(), si, sample1, sample2, active)
         smooth = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Smooth)
-        return si.to_world(sample.wo), mi.unpolarized_spectrum(value) & smooth, sample.pdf & smooth
+        weight, density = finite_or_zero(mi.unpolarized_spectrum(value)), finite_or_zero(sample.pdf)
+        return si.to_world(sample.wo), weight & smooth, density & smooth
 
 
 @dataclass

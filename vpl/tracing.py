@@ -136,6 +136,7 @@ def _shares(scene, groups, count: int, seed: int, limits: PathLimits) -> list[in
     flux, lights_per_path = np.zeros(len(groups)), np.zeros(len(groups))
     for number, group in enumerate(groups):
         lights, _ = _trace_group(scene, group, number, _PILOT_PATHS, derived_seed(seed, 1), limits)
+        lights, _ = lights.without_bad()
         flux[number] = lights.intensity.sum(dtype=np.float64)
         lights_per_path[number] = lights.count / _PILOT_PATHS
     wanted = np.full(len(groups), count / len(groups))

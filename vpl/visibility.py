@@ -10,7 +10,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .lights import AT_INFINITY
+from .lights import AT_INFINITY, finite_or_zero
 
 
 def shadow_ray(kind: str, interaction, light):
@@ -47,7 +47,7 @@ def _through_null_surfaces(scene, traits, ray, active):
         crossed = active & hit.is_valid() & traits.is_null(hit.shape)
         passed = dr.select(active & hit.is_valid() & ~crossed, 0, passed)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, crossed)
-        share = mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, crossed))
+        share = finite_or_zero(mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, crossed)))
         passed = dr.select(crossed, passed * share, passed)
         active = crossed & dr.any(passed > 0)
         onward = si.spawn_ray(ray.d)

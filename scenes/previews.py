@@ -1,0 +1,40 @@
+"""Render the small pictures beside the scenes, by `lightcuts` with adaptive direct light, the forest by direct light.
+
+./run -- python scenes/previews.py [NAME...]
+"""
+
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+
+FOLDER = Path(__file__).resolve().parent
+WIDTH, SAMPLES, FEW_SAMPLES, DEPTH = 192, 16, 4, 8
+DIRECT = ("forest_lights",)  # light paths among so many leaves would take minutes
+
+
+def preview(name):
+    """Write NAME.png beside NAME.xml, in the shape of the scene's own film."""
+    path = FOLDER / f"{name}.xml"
+    film = mi.load_file(str(path)).sensors()[0].film().size()
+    height = round(WIDTH * film[1] / film[0])
+    scene = mi.load_file(str(path), resx=str(WIDTH), resy=str(height))
+    if name in DIRECT:
+        integrator, samples = {"type": "adaptivedirect"}, FEW_SAMPLES
+    else:
+        integrator, samples = {"type": "lightcuts", "max_depth": DEPTH, "direct": "adaptive"}, SAMPLES
+    image = mi.render(scene, integrator=mi.load_dict(integrator), spp=samples)
+    mi.util.write_bitmap(str(FOLDER / f"{name}.png"), image, write_async=False)
+
+
+def main(names):
+    mi.set_variant("llvm_ad_rgb")
+    sys.path.insert(0, str(FOLDER.parent))
+    import integrators  # noqa: F401
+
+    for name in names or sorted(path.stem for path in FOLDER.glob("*.xml")):
+        preview(name)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
