@@ -66,6 +66,11 @@ class LightSliceIntegrator(ManyLightIntegrator):
        - Lights that are drawn for each cluster; the samples of a pixel take turns with them, and the pixels of blocks
          of 4 × 4. With 1 all points of a slice share one error, and slices show as blotches. (Default: 16)
 
+     * - candidates
+       - |int|
+       - Lights of a cluster, from as many sets, that are shaded at glossy points; one is drawn by what it would send,
+         and traced. So fewer pixels are far too bright. At most ``sets`` are used. (Default: 4)
+
      {common parameters}
 
     Ou and Pellacini 2011, "LightSlice: matrix slice sampling for the many-lights problem" [LS]. What every light sends
@@ -89,7 +94,8 @@ class LightSliceIntegrator(ManyLightIntegrator):
     of its column plus a share of its upper bound, and counts with its own colour: the image is that of all lights in
     expectation, and no light is lost because no row saw it. Rows of neighbours count less the farther away they are.
     Neighbouring pixels take different lights of a cluster (interleaved sampling), which makes noise of what would be
-    seams between slices; ``sets`` 1 is the paper's. See :mod:`vpl.slices`, :mod:`vpl.light_matrix`,
+    seams between slices; ``sets`` 1 is the paper's. At glossy points one of several lights of a cluster is traced
+    (``candidates``; resampled importance sampling). See :mod:`vpl.slices`, :mod:`vpl.light_matrix`,
     :mod:`vpl.slice_columns`. Lambertian points and all others are in slices of their own.
 
     .. tabs::
@@ -114,6 +120,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
         self.neighbours = properties.integer(props, "neighbours", 6, 1)
         self.unseen = properties.number(props, "unseen", 1.0, 1e-6)
         self.sets = properties.integer(props, "sets", 16, 1)
+        self.candidates = properties.integer(props, "candidates", 4, 1)
 
     def shade(self, job: Shading) -> Shaded:
         """Slices, the lights of each, and what these send to its points, for one batch."""
@@ -157,16 +164,18 @@ class LightSliceIntegrator(ManyLightIntegrator):
         """(Radiance, shadow rays, columns) of all points along the slices; ``entry``: the list of lights of each."""
         radiance = dr.zeros(mi.UnpolarizedSpectrum, clusters.count)
         traced, columns = dr.zeros(mi.UInt32, clusters.count), dr.zeros(mi.UInt32, clusters.count)
+        candidates = min(self.candidates, self.sets) if job.batch.proxy.glossy else 1
         for lights in chosen:
             first, last = (dr.gather(mi.UInt32, ends, entry) for ends in (lights.first, lights.last))
             columns += last - first
+            pick = lights.picker(entry, self.sets, candidates)
             dr.eval(first, last, columns)
             for _ in range(0, int(download(lights.last - lights.first).max()), _COLUMNS_PER_KERNEL):
                 if job.stopped():
                     break
                 end = dr.minimum(first + _COLUMNS_PER_KERNEL, last)
                 value, rays = sum_lights(
-                    job.scene, job.traits, job.lights, lights.group, clusters.batch.surfaces, first, end, lights.pick
+                    job.scene, job.traits, job.lights, lights.group, clusters.batch.surfaces, first, end, pick
                 )
                 radiance, traced, first = radiance + value, traced + rays, end
                 dr.eval(radiance, traced, first)
@@ -174,7 +183,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
 
     def describe(self):
         """All properties and their values."""
-        names = ("slices", "columns", "shared_columns", "neighbours", "unseen", "sets")
+        names = ("slices", "columns", "shared_columns", "neighbours", "unseen", "sets", "candidates")
         return super().describe() | {name: getattr(self, name) for name in names}
 
 

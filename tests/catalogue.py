@@ -14,6 +14,7 @@ PLUGINS = {
     "lightcuts": {"vpl_count": 200},
     "mdlightcuts": {"vpl_count": 200},
     "lightslice": {"vpl_count": 200, "slices": 20, "columns": 40},
+    "matrixrecovery": {"vpl_count": 200, "slice_rows": 100},
     "illuminationcut": {"vpl_count": 200},
     "illuminationcut-adaptive": {"vpl_count": 200, "visibility": "adaptive"},
     "adaptivedirect": {"max_samples": 300, "regions": 50},

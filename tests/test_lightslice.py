@@ -395,6 +395,13 @@ def test_samples_of_a_pixel_take_turns_with_the_lights_of_a_cluster():
     assert errors[1] < 0.5 * errors[0]
 
 
+def test_candidates_make_gloss_less_noisy():
+    scene, given = glossy_room(), {"vpl_count": 2000, "max_depth": 4, "direct": "none"}
+    expected = render(scene, "vpl", 4, **given)
+    few, many = (rendered(scene, 4, candidates=count, slices=30, columns=20, **given)[0] for count in (1, 8))
+    assert np.square(many - expected).mean() < 0.7 * np.square(few - expected).mean()
+
+
 @pytest.mark.parametrize(("samples", "sets"), [(1, 16), (4, 16), (4, 3), (16, 16), (1, 1)])
 def test_pixels_of_a_block_and_their_samples_take_all_sets(samples, sets):
     plugin = mi.load_dict({"type": NAME, "sets": sets})
@@ -480,6 +487,7 @@ BAD = [
     ("unseen", 0.0),
     ("unseen", -1.0),
     ("sets", 0),
+    ("candidates", 0),
     ("vpl_count", 0),
 ]
 
@@ -491,4 +499,5 @@ def test_bad_properties_are_named_with_their_value(name, value):
 
 def test_properties_are_shown():
     given = {"slices": 17, "columns": 23, "shared_columns": 99, "neighbours": 3, "unseen": 0.25, "sets": 2}
+    given["candidates"] = 3
     assert_properties_are_shown(NAME, given)

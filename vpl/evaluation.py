@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .arrays import download
+from .arrays import channel_mean, download, select_record
 from .emission import Choice
 from .gather import SceneTraits
 from .light_set import LightGroup, LightSet
@@ -32,6 +32,33 @@ def evaluate_pairs(scene, traits: SceneTraits, lights: LightSet, group: LightGro
     if seen is not None:
         passed = dr.select(seen, 1, passed)
     return dr.select(arrives, value * passed, 0), traced
+
+
+def evaluate_one_of(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface, candidates: list, number):
+    """Shade several lights that stand for the same cluster, and trace the ray of one, drawn by what they would send.
+
+    ``candidates``: (light, factor on its intensity) pairs, any of which alone would do; ``number``: UInt32 that differs
+    wherever a draw is to.  Their mean, in expectation, with the visibility of one: resampled importance sampling
+    [Talbot et al. 2005].  Returns as :func:`evaluate_pairs`.
+    """
+    (light, scale), *others = candidates
+    if not others:
+        return evaluate_pairs(scene, traits, lights, group, surface, light, scale)
+    value = unoccluded(lights, group, surface, light) * scale
+    strength = channel_mean(value)
+    total = mi.Float(strength)
+    for k, (other, scale) in enumerate(others):
+        new = unoccluded(lights, group, surface, other) * scale
+        new_strength = channel_mean(new)
+        total += new_strength
+        taken = mi.sample_tea_float32(number, mi.UInt32(k)) * total < new_strength
+        value, strength = dr.select(taken, new, value), dr.select(taken, new_strength, strength)
+        light = select_record(taken, other, light)
+    arrives = strength > 0
+    passed = _visibility(scene, traits, group, surface, light, arrives)
+    # The strength of the light that was drawn cancels, but for its colour
+    share = total / (strength * len(candidates))
+    return dr.select(arrives, value * passed * share, 0), arrives
 
 
 def probe_visibility(
@@ -61,14 +88,15 @@ def _visibility(scene, traits: SceneTraits, group: LightGroup, surface: Surface,
 def sum_lights(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface: Surface, first, last, pick):
     """Sum over the numbers first .. last - 1 of every surface, in step: (radiance, shadow rays per surface).
 
-    ``surface``: evaluated; ``pick``: function of a number to (a light of the group, the factor on its intensity).
+    ``surface``: evaluated; ``pick``: function of a number to the candidates of :func:`evaluate_one_of`.
     """
     count = dr.width(first)
+    lane = dr.arange(mi.UInt32, count)
     j, end = mi.UInt32(first), mi.UInt32(last)
     radiance, rays = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UInt32, count)
     while dr.hint(j < end, exclude=[traits, lights, group, surface, pick]):
-        light, scale = pick(j)
-        value, traced = evaluate_pairs(scene, traits, lights, group, surface, light, scale)
+        number, _ = mi.sample_tea_32(lane, j)
+        value, traced = evaluate_one_of(scene, traits, lights, group, surface, pick(j), number)
         radiance += value
         rays += dr.select(traced, 1, 0)
         j += 1

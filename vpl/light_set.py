@@ -50,8 +50,8 @@ class LightGroup:
         return self.lights.count
 
     def pick(self, index):
-        """Lights by their index, each standing for itself: (light, factor on its intensity)."""
-        return self.lights.gather(index), 1
+        """Lights by their index, each standing for itself: the candidates of :func:`vpl.evaluation.evaluate_one_of`."""
+        return [(self.lights.gather(index), 1)]
 
     def representatives(self, nodes, second=False):
         """The light that stands for each node (or its second one), and the factor from its intensity to the cluster's.

@@ -48,9 +48,28 @@ class SliceLights:
     light: object
     scale: object
 
-    def pick(self, j):
-        """The light in place j and its scale."""
-        return self.group.lights.gather(dr.gather(mi.UInt32, self.light, j)), dr.gather(mi.Float, self.scale, j)
+    def picker(self, entry, sets: int, count: int):
+        """A function from places to ``count`` candidates: the light in that place, and those that stand for the same
+        cluster in other ones of the ``sets``.
+
+        ``entry``: UInt32, the list of lights of each lane, r · slices + s.
+        """
+        slices, places = (dr.opaque(mi.UInt32, dr.width(values) // sets) for values in (self.first, self.light))
+        own, shifts = entry // slices, []
+        for k in range(1, count):
+            other = (own + dr.opaque(mi.UInt32, k * sets // count)) % dr.opaque(mi.UInt32, sets)
+            # Differences of places wrap around, as their sums do
+            shifts.append((other - own) * places)
+        dr.eval(shifts)
+
+        def candidates(j):
+            """Lights and their scales."""
+            return [
+                (self.group.lights.gather(dr.gather(mi.UInt32, self.light, at)), dr.gather(mi.Float, self.scale, at))
+                for at in [j, *(j + shift for shift in shifts)]
+            ]
+
+        return candidates
 
 
 def fine_forest(lights: LightSet, most: int) -> ColumnForest:
