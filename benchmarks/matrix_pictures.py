@@ -21,7 +21,8 @@ def draw_slice(plugin, job, number: int, file, note: dict) -> None:
     work = plugin.start(job)
     number = min(number, work.entries.rows.slices - 1)
     for block, found in plugin.recovered(job, work):
-        if block.begin <= number < block.begin + block.slices and found.part is not None:
+        inside = block.begin <= number < block.begin + block.slices
+        if inside and found.part is not None and found.part.counts[number - block.begin][0]:
             _draw(_panels(block, found, number), f"slice {number}", file, note | {"plugin": str(plugin)})
             return
     raise ValueError(f"slice {number} was left out: no light arrives there, or none of it is in question")

@@ -269,7 +269,7 @@ ODD_SCENES = {
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("integrator", ["vpl", "lightcuts", "mdlightcuts", "lightslice"])
+@pytest.mark.parametrize("integrator", ["vpl", "lightcuts", "mdlightcuts", "lightslice", "matrixrecovery"])
 @pytest.mark.parametrize("name", ODD_SCENES)
 def test_odd_scenes_render_without_nan(integrator, name):
     image = render(mi.load_dict(ODD_SCENES[name]()), integrator, 2, vpl_count=500, max_depth=4)
@@ -280,7 +280,7 @@ def test_odd_scenes_render_without_nan(integrator, name):
         assert image.max() > 0
 
 
-@pytest.mark.parametrize("integrator", ["lightcuts", "mdlightcuts", "lightslice"])
+@pytest.mark.parametrize("integrator", ["lightcuts", "mdlightcuts", "lightslice", "matrixrecovery"])
 def test_no_kernel_reads_or_writes_outside_of_an_array(integrator, capfd):
     """Dr.Jit's debug mode checks every index; a mirror and a pane give camera paths of several waves."""
     objects = {
@@ -288,7 +288,9 @@ def test_no_kernel_reads_or_writes_outside_of_an_array(integrator, capfd):
         "pane": wall([0.4, 0, 0.2], [0, 1, 0], 0, 0.3, bsdf={"type": "thindielectric"}),
     }
     scene = mi.load_dict(closed_box(LIGHTS["point"]() | LIGHTS["spot"]() | {"lamp": area_light()}, **objects))
-    coarse = {"columns": 20, "slices": 30, "shared_columns": 50} if integrator == "lightslice" else {"max_cut": 50}
+    coarse = {
+        "lightslice": {"columns": 20, "slices": 30, "shared_columns": 50}, "matrixrecovery": {"slice_rows": 100},
+    }.get(integrator, {"max_cut": 50})  # fmt: skip
     plugin = mi.load_dict({"type": integrator, "vpl_count": 300, "max_depth": 5, **coarse})
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, 1024)

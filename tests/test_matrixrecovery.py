@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from vpl import matrix_recovery
 from vpl.arrays import download, upload
 from vpl.matrix_separation import Separation, SeparationLimits, separate, sketch
+from vpl.point_clusters import PointClusters
 from vpl.reduced_columns import _nearby_largest
+from vpl.reduced_matrix import MatrixRows
 from vpl.slice_rows import build_row_slices, rows_of, tangent_places
 from vpl.visibility_samples import _golden_steps
 
@@ -25,7 +27,7 @@ from .conftest import (
     wall,
 )
 from .test_lightcuts import many_kinds
-from .test_pairs import glossy_room
+from .test_pairs import batch_of, glossy_room
 
 NAME = "matrixrecovery"
 SMALL = {"max_depth": 4, "vpl_count": 3000, "direct": "vpl"}
@@ -226,6 +228,12 @@ def test_with_a_column_for_every_light_and_every_row_traced_it_is_the_sum_of_all
     assert found["failed_slices"] == 0
 
 
+def dark_error(image, expected):
+    """Relative error of all but the brightest tenth of the values, where shadows are."""
+    dark = expected < np.quantile(expected, 0.9)
+    return relative_error(image[dark], expected[dark])
+
+
 @pytest.fixture(scope="module")
 def shadows():
     """A room with a plate below the lamp: half of it is in shadow."""
@@ -236,7 +244,7 @@ def shadows():
 def test_most_entries_are_predicted_and_the_image_is_that_of_all_lights(shadows):
     expected = render(shadows, "vpl", 4, **SMALL)
     image, found = rendered(shadows, 4, **SMALL)
-    assert relative_error(image, expected) < 0.06
+    assert dark_error(image, expected) < 0.15
     rays = sum(found[f"{stage}_rays"] for stage in ("columns", "prediction", "correction"))
     assert rays < 0.3 * found["entries"]
     assert rays == pytest.approx(found["shadow_rays"], rel=1e-3)
@@ -244,10 +252,21 @@ def test_most_entries_are_predicted_and_the_image_is_that_of_all_lights(shadows)
 
 def test_the_error_falls_with_alpha(shadows):
     expected = render(shadows, "vpl", 1, **SMALL)
-    errors = [
-        relative_error(rendered(shadows, 1, **SMALL, alpha=alpha)[0], expected) for alpha in (0.05, 0.005, 0.0005)
-    ]
+    errors = [dark_error(rendered(shadows, 1, **SMALL, alpha=alpha)[0], expected) for alpha in (0.05, 0.005, 0.0005)]
     assert errors[2] < 0.7 * errors[0] and errors[1] < errors[0]
+
+
+def test_the_bias_of_prediction_is_small_and_falls_with_sampling(shadows):
+    """With the same seeds, and so the same lights; clusters alone have none."""
+    expected = np.mean([render(shadows, "vpl", 1, seed, **SMALL) for seed in range(6)], axis=0)
+    dark = expected < np.quantile(expected, 0.9)
+
+    def bias(**more):
+        mean = np.mean([rendered(shadows, 1, seed, **SMALL, **more)[0] for seed in range(6)], axis=0)
+        return mean[dark].sum() / expected[dark].sum() - 1
+
+    assert abs(bias()) < 0.05
+    assert abs(bias(sampling=1.0, separation=False)) < 0.01
 
 
 def test_each_step_does_its_part(shadows):
@@ -255,12 +274,12 @@ def test_each_step_does_its_part(shadows):
     everything, all_found = rendered(shadows, 1, **SMALL, density=0.1)
     without_correction, found = rendered(shadows, 1, **SMALL, correction=False)
     assert found["correction_rays"] == 0 < all_found["correction_rays"]
-    assert relative_error(everything, expected) < relative_error(without_correction, expected)
+    assert dark_error(everything, expected) < 0.8 * dark_error(without_correction, expected)
     plain, found = rendered(shadows, 1, **SMALL, separation=False)
     assert found["correction_rays"] == 0 and not np.array_equal(plain, without_correction)
     blind, found = rendered(shadows, 1, **SMALL, prediction=False, separation=False)
     # What is not predicted is taken to arrive
-    assert found["prediction_rays"] == 0 and blind.mean() > 1.05 * expected.mean()
+    assert found["prediction_rays"] == found["nearest_columns"] == 0 and dark_error(blind, expected) > 1
 
 
 @pytest.mark.parametrize("kind", ["nearest", "linear", "bayes"])
@@ -268,15 +287,16 @@ def test_every_predictor_alone_sees_most_shadows(shadows, kind):
     expected = render(shadows, "vpl", 1, **SMALL)
     image, found = rendered(shadows, 1, **SMALL, predictors=kind, separation=False)
     blind, _ = rendered(shadows, 1, **SMALL, prediction=False, separation=False)
-    assert relative_error(image, expected) < 0.6 * relative_error(blind, expected)
+    assert dark_error(image, expected) < 0.3 * dark_error(blind, expected)
     others = {"nearest", "linear", "bayes"} - {kind}
     assert found[f"{kind}_columns"] > 0 and all(found[f"{other}_columns"] == 0 for other in others)
 
 
 def test_light_can_be_separated_as_in_the_paper(shadows):
-    image, _ = rendered(shadows, 1, **SMALL, recover="light")
-    assert np.isfinite(image).all() and (image >= 0).all()
-    assert relative_error(image, render(shadows, "vpl", 1, **SMALL)) < 0.25
+    image, found = rendered(shadows, 1, **SMALL, recover="light")
+    _, usual_found = rendered(shadows, 1, **SMALL)
+    assert found["correction_rays"] != usual_found["correction_rays"]
+    assert (image >= 0).all() and dark_error(image, render(shadows, "vpl", 1, **SMALL)) < 1
 
 
 def test_a_slice_that_fails_is_traced_whole_and_counted(shadows, monkeypatch):
@@ -322,18 +342,54 @@ def test_the_same_seed_gives_the_same_image(shadows):
 def test_blocks_of_slices_and_chunks_of_entries_change_nothing(shadows, monkeypatch):
     from integrators import matrixrecovery
 
-    expected, _ = rendered(shadows, 1, **SMALL, slice_rows=100, separation=False)
+    settings = SMALL | EXACT | {"slice_rows": 100, "separation": False, "vpl_count": 300}
+    expected, _ = rendered(shadows, 1, **settings)
     monkeypatch.setattr(matrixrecovery, "ENTRIES", 50_000)
-    image, _ = rendered(shadows, 1, **SMALL, slice_rows=100, separation=False)
-    assert relative_error(image, expected) < 0.02
+    assert np.array_equal(rendered(shadows, 1, **settings)[0], expected)
+    monkeypatch.setattr(matrixrecovery, "_SLICES", 5)
+    assert np.allclose(rendered(shadows, 1, **settings)[0], expected, rtol=1e-4)
+
+
+def test_slices_have_no_more_columns_than_allowed(shadows):
+    plugin = mi.load_dict({"type": NAME, **SMALL, "max_columns": 10, "aovs": "cut_size"})
+    image = render(shadows, plugin, 1)
+    assert 0 < image[..., -1].max() <= 10
+
+
+def test_a_render_stops_between_blocks_of_slices(monkeypatch, shadows):
+    from integrators import matrixrecovery
+
+    monkeypatch.setattr(matrixrecovery, "ENTRIES", 50_000)
+    plugin, asked = mi.load_dict({"type": NAME, **SMALL}), []
+    monkeypatch.setattr(type(plugin), "should_stop", lambda self: asked.append(1) or len(asked) > 2)
+    assert (render(shadows, plugin, 1) == 0).all(-1).any()
+
+
+def test_normals_that_are_no_numbers_do_not_spoil_their_slice():
+    position = np.random.default_rng(0).random((60, 3)).astype(np.float32)
+    normal = np.tile(np.float32([0, 0, 1]), (60, 1))
+    normal[7] = np.nan
+    clusters = PointClusters(batch_of(position, normal), lambda p, n: build_row_slices(np.arange(60), 100, p, n))
+    rows = MatrixRows(clusters, np.arange(60), 0)
+    assert all(np.isfinite(download(side)).all() for side in rows.places)
+
+
+def test_masks_are_predicted_on_average():
+    mask = {"type": "mask", "opacity": 0.3, "nested": {"type": "diffuse"}}
+    veil = wall([0, 0.4, 0], [1, 0, 0], -90, 0.55, bsdf=mask)
+    scene = mi.load_dict(closed_box({"lamp": area_light()}, size=24, veil=veil))
+    expected = render(scene, "vpl", 1, **SMALL)
+    for kind in ("nearest", "linear", "bayes"):
+        image, _ = rendered(scene, 1, **SMALL, predictors=kind, separation=False)
+        assert image.sum() == pytest.approx(expected.sum(), rel=0.03)
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("slice_rows", 0), ("initial_columns", 0), ("max_columns", 0), ("alpha", -0.1), ("sampling", 0.0),
-        ("prediction_error", -1.0), ("rounds", 0), ("predictors", "nearest,wrong"), ("predictors", ""),
-        ("prediction", 1), ("density", -0.5), ("recover", "both"), ("iterations", 0), ("rank", 0), ("rank", 2.5),
+        ("slice_rows", 0), ("slice_rows", 65537), ("initial_columns", 0), ("max_columns", 0), ("alpha", -0.1),
+        ("sampling", 0.0), ("prediction_error", -1.0), ("rounds", 0), ("predictors", "nearest,wrong"),
+        ("predictors", ""), ("prediction", 1), ("density", -0.5), ("recover", "both"), ("iterations", 0), ("rank", 0), ("rank", 2.5),
     ],
 )  # fmt: skip
 def test_bad_properties_are_refused(name, value):

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from vpl.arrays import download, upload
-from vpl.emission import Choice, emission_groups
+from vpl.emission import Choice, bounding_box, emission_groups
 from vpl.lights import read_emitters
 from vpl.sampling import derived_seed
 from vpl.tracing import PathLimits, trace_lights
 
-from .conftest import area_light, closed_box
+from .conftest import area_light, closed_box, wall
 
 
 def traced(scene, count=20_000, seed=0, deepest=math.inf, rr_depth=5, lobe_limit=1.0):
@@ -161,3 +161,12 @@ def test_derived_seeds_differ():
     assert len(seeds) == 400
     assert all(isinstance(seed, int) and 0 <= seed < 2**32 for seed in seeds)
     assert dr.width(mi.UInt32(derived_seed(1, 2, 3))) == 1
+
+
+def test_the_size_of_a_scene_counts_rectangles_that_were_merged():
+    """Mitsuba joins shapes of one material, and forgets how large they are."""
+    walls = {f"wall{k}": wall([0, 0, 2.5 * k], [0, 1, 0], 0, 3.0) for k in range(3)}
+    scene = mi.load_dict({"type": "scene", **walls})
+    assert len(scene.shapes()) == 1
+    box = bounding_box(scene)
+    assert np.allclose(box.min, [-3, -3, 0]) and np.allclose(box.max, [3, 3, 5])

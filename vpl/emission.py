@@ -12,6 +12,7 @@ import numpy as np
 
 from .arrays import download, rgb_to_spectrum, upload
 from .lights import Emitters, VirtualLights, finite_or_zero
+from .parameters import parameters_of
 from .sampling import independent_sampler
 from .shading import spot_falloff
 
@@ -61,12 +62,24 @@ def other_power(emitter, bounding_sphere) -> float:
     return float(download(finite_or_zero(weight)).mean(dtype=np.float64))
 
 
+def bounding_box(scene):
+    """The scene's box, with the shapes that Mitsuba 3.9.1 leaves out: rectangles that it merged have no box."""
+    box = scene.bbox()
+    for shape in scene.shapes():
+        if shape.is_mesh() and shape.vertex_count() and not shape.bbox().valid():
+            vertices = np.asarray(parameters_of(shape, below=False)["vertex_positions"]).reshape(-1, 3)
+            box.expand(mi.ScalarPoint3f(vertices.min(0)))
+            box.expand(mi.ScalarPoint3f(vertices.max(0)))
+    return box
+
+
 def bounding_sphere(scene):
     """Sphere around the scene's box: the same one that clamping distances are measured by.
 
     Raises a ValueError for a scene whose size is not a finite number.
     """
-    sphere, box = scene.bbox().bounding_sphere(), scene.bbox()
+    box = bounding_box(scene)
+    sphere = box.bounding_sphere()
     if len(scene.shapes()) and not np.isfinite(float(sphere.radius)):
         raise ValueError(f"the scene reaches from {box.min} to {box.max}: its size must be finite")
     return sphere

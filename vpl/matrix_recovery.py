@@ -40,7 +40,7 @@ class RecoveryOptions:
     prediction: bool = True
     separation: bool = True
     correction: bool = True
-    density: float = 0.2
+    density: float = 0.5
     recover: str = "visibility"
     limits: SeparationLimits = field(default_factory=SeparationLimits)
 
@@ -65,7 +65,7 @@ class Recovered:
 
     @property
     def failed(self) -> int:
-        """How many slices could not be separated, and were traced whole."""
+        """How many slices could not be separated, so that what was in question there is traced."""
         return int(self.separation.failed.sum()) if self.separation else 0
 
 
@@ -114,9 +114,9 @@ def _separate(found: Recovered, block: MatrixBlock, mixed: np.ndarray, options: 
     found.error = error
     wrong = dr.select(dr.abs(error) > _LEAST_ERROR, mi.Float(1), 0)
     dr.eval(found.error, wrong)
-    dr.scatter(found.visibility, dr.clip(predicted - error, 0, 1), source, present)
+    wanted = failed = _of_slices(part, found.separation.failed)
+    dr.scatter(found.visibility, dr.clip(predicted - error, 0, 1), source, present & ~failed)
     dr.eval(found.visibility)
-    wanted = _of_slices(part, found.separation.failed)
     if options.correction:
         found.density = _blurred(part, wrong)
         wanted |= found.density > options.density

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import drjit as dr
@@ -60,11 +61,13 @@ class Separation:
     residual: list
 
 
-def _each(work, numbers) -> list:
-    """Results of ``work`` for some numbers: one matrix to a core, rather than all cores to a matrix, which is too small
-    for that; and threads of BLAS that wait for each other cost tenfold on a machine that is busy otherwise."""
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(work, numbers))
+@contextmanager
+def _one_core_each():
+    """A function that does some work for each of some numbers: one matrix to a core, rather than all cores to a matrix,
+    which is too small for that.  Threads of BLAS that wait for each other cost tenfold on a busy machine."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(cores) as pool:
+        yield lambda work, numbers: list(pool.map(work, numbers))
 
 
 def sketch(matrix: np.ndarray, test: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -105,21 +108,22 @@ def separate(whole, free, weight, shape: tuple[int, int, int], limits: Separatio
         right[number] = left.T @ target[number]
         np.matmul(left, right[number], out=product[number])
 
-    _each(begin, active)
     iterations, residual, first, history = np.zeros(count, np.int64), np.zeros(count), np.zeros(count), []
-    for number in range(limits.iterations):
-        if not len(active):
-            break
-        target = state.target()
-        _each(fit, active)
-        iterations[active] += 1
-        before, residual = residual, residual.copy()
-        residual[active] = state.step(upload(mi.Float, product), active)[active] / norm[active]
-        if number == 0:
-            first, before = residual, np.full(count, np.inf)
-        history.append(residual)
-        falls = residual < (1 - limits.progress) * before
-        active = active[falls[active] & (residual[active] > limits.residual)]
+    with _one_core_each() as each:
+        each(begin, active)
+        for number in range(limits.iterations):
+            if not len(active):
+                break
+            target = state.target()
+            each(fit, active)
+            iterations[active] += 1
+            before, residual = residual, residual.copy()
+            residual[active] = state.step(upload(mi.Float, product), active)[active] / norm[active]
+            if number == 0:
+                first, before = residual, np.full(count, np.inf)
+            history.append(residual)
+            falls = residual < (1 - limits.progress) * before
+            active = active[falls[active] & (residual[active] > limits.residual)]
     failed = ~np.isfinite(norm + residual) | (residual > _DIVERGED * np.maximum(first, limits.residual))
     return Separation(state.error, rank, iterations, failed, history)
 

@@ -44,7 +44,7 @@ class PointClusters:
     """
 
     def __init__(self, batch: Batch, build: Callable | None = None):
-        normal = _directions(batch.normal)
+        normal = unit_or_up(batch.normal)
         self.tree: PointTree = (build or partial(_tree_by_place, batch))(download(batch.position), download(normal))
         self.order = upload(mi.UInt32, self.tree.order)
         self.batch = batch.select(self.order)
@@ -100,7 +100,7 @@ def _tree_by_place(batch: Batch, position: np.ndarray, normal: np.ndarray) -> Po
     return build_point_tree(position, normal, _GLOSSY_LEAF if batch.proxy.glossy else _LAMBERTIAN_LEAF, material)
 
 
-def _directions(vectors):
+def unit_or_up(vectors):
     """Unit vectors; those of broken meshes that are not become +z, so that they have a place."""
     vectors = mi.Vector3f(vectors)
     return dr.select(dr.abs(dr.squared_norm(vectors) - 1) < 1e-3, vectors, mi.Vector3f(0, 0, 1))
@@ -118,7 +118,7 @@ def _records(tree: PointTree, bounds: NodeBounds, position, normal, base):
 
 def _lobe_records(tree: PointTree, bounds: NodeBounds, proxy: MaterialProxy):
     """Per node: cone of the lobes' axes, largest peak, smallest exponent: 8 floats."""
-    axis, cosine = bounds.cones(_directions(proxy.axis))
+    axis, cosine = bounds.cones(unit_or_up(proxy.axis))
     peak = bounds.reduce(mi.Vector3f(proxy.peak), dr.maximum)
     return _interleaved(tree.size, [*axis, cosine, *peak, bounds.reduce(proxy.exponent, dr.minimum)])
 

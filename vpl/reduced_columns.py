@@ -27,7 +27,7 @@ from .visibility_samples import FirstSamples, VisibilitySamples
 
 # How far along the light tree, to either side, clusters lend their samples to each other
 _NEARBY = 2
-# Columns of a slice when it begins; its cuts are searched for from this fraction of the mean radiance on
+# Bounds that cuts of slices accept are searched for from this fraction of the mean radiance on
 _START = 1e-4
 
 

@@ -16,7 +16,7 @@ from .arrays import channel_mean, download, upload
 from .evaluation import probe_visibility, unoccluded
 from .gather import SceneTraits
 from .light_set import LightGroup, LightSet
-from .point_clusters import PointClusters
+from .point_clusters import PointClusters, unit_or_up
 from .slice_rows import rows_of, tangent_places
 
 
@@ -40,7 +40,8 @@ class MatrixRows:
         self._begin = upload(mi.UInt32, self.first)
         self._row = upload(mi.UInt32, np.repeat(np.arange(self.count), size))
         self._slice = upload(mi.UInt32, np.repeat(np.arange(self.slices), np.diff(self.first)))
-        position, normal = (download(values)[shown] for values in (clusters.batch.position, clusters.batch.normal))
+        surfaces = (clusters.batch.position, unit_or_up(clusters.batch.normal))
+        position, normal = (download(values)[shown] for values in surfaces)
         slice_of_row = np.repeat(np.arange(self.slices), np.diff(self.first))
         places = tangent_places(position, normal, self.first[:-1], slice_of_row)
         self.places = [upload(mi.Float, column) for column in places]
