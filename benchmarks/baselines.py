@@ -132,13 +132,16 @@ class Problem:
         rmse, absolute = np.sqrt((difference**2).mean()), np.abs(difference).mean()
         return Found(seconds, rmse / self.mean, absolute / self.mean, rays, cut, stages, counts)
 
-    def quality_for(self, method: str, wanted: float, measure: str = "absolute"):
-        """The value of a method's parameter that came nearest to a mean absolute error, or to so many ``rays``."""
+    def quality_for(self, method: str, wanted: float, measure: str = "absolute", **more):
+        """The value of a method's parameter that came nearest to a mean absolute error, or to so many ``rays``.
+
+        ``more``: other properties.
+        """
         quality = QUALITY[method]
         power = quality.power if measure == "absolute" else -np.sign(quality.power)
         value, tried = quality.rounded(quality.guess), []
         for _ in range(_TRIES):
-            reached = getattr(self.shade(self.plugin(method, **{quality.name: value})), measure)
+            reached = getattr(self.shade(self.plugin(method, **{quality.name: value}, **more)), measure)
             tried.append((abs(np.log(reached / wanted)), value))
             if tried[-1][0] < _NEAR:
                 break

@@ -389,7 +389,8 @@ def test_masks_are_predicted_on_average():
     [
         ("slice_rows", 0), ("slice_rows", 65537), ("initial_columns", 0), ("max_columns", 0), ("alpha", -0.1),
         ("sampling", 0.0), ("prediction_error", -1.0), ("rounds", 0), ("predictors", "nearest,wrong"),
-        ("predictors", ""), ("prediction", 1), ("density", -0.5), ("recover", "both"), ("iterations", 0), ("rank", 0), ("rank", 2.5),
+        ("predictors", ""), ("prediction", 1), ("density", -0.5), ("recover", "both"), ("iterations", 0), ("rank", 0),
+        ("rank", 2.5),
     ],
 )  # fmt: skip
 def test_bad_properties_are_refused(name, value):
