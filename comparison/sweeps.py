@@ -21,6 +21,7 @@ DEFAULTS = {
     "mdlightcuts": ("error", (0.08, 0.04, 0.02, 0.01)),
     "illuminationcut": ("error", (0.08, 0.04, 0.02, 0.01)),
     "lightslice": ("columns", (50, 100, 200, 400)),
+    "matrixrecovery": ("alpha", (0.008, 0.004, 0.002, 0.001)),
     "adaptivedirect": ("error", (0.12, 0.06, 0.03, 0.015)),
     "unoccludeddirect": ("error", (0.12, 0.06, 0.03, 0.015)),
 }
