@@ -41,7 +41,10 @@ def remove_abandoned(folder):
 
 def write_exr(path, image, channels, metadata=None, half=False):
     """Write an image, (height, width, channels), with the names of its channels; metadata that EXR attributes cannot
-    hold (lists, dicts, None, integers of more than 32 bits) become JSON text. `half` stores 16-bit numbers."""
+    hold (lists, dicts, None, integers of more than 32 bits) become JSON text. `half` stores 16-bit numbers; raises
+    ValueError if the image has some that are too large for that."""
+    if half and np.abs(image).max() > np.finfo(np.float16).max:
+        raise ValueError(f"{path}: brighter than the 65504 that half precision holds")
     header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
     for key, value in (metadata or {}).items():
         header[key] = value if _fits_attribute(value) else json.dumps(value)

@@ -40,14 +40,13 @@ def render(results, pictures, reference_text):
 def _scene(scene, pictures, results):
     """Return what the template shows of a scene."""
     metric = results["metrics"]["compared"]
-    shown = {"result": scene, "name": scene["name"], "error": scene.get("error"), "views": None}
-    if pictures is None:
-        return shown
     labels = list(dict.fromkeys(render["label"] for render in scene["renders"]))
+    views = pictures.views if pictures else []
+    shown = {"result": scene, "name": scene["name"], "error": scene.get("error"), "rows": tables.rows(scene)}
     # "</" would end the script element that holds it.
-    shown["views"] = json.dumps(pictures.views).replace("</", "<\\/") if pictures.views else None
-    shown["has_maps"] = any(view["maps"] for view in pictures.views)
-    shown |= {"block": pictures.block, "rows": tables.rows(scene), "plots": [], "comparisons": []}
+    shown["views"] = json.dumps(views).replace("</", "<\\/") if views else None
+    shown["has_maps"] = any(view["maps"] for view in views)
+    shown |= {"block": pictures.block if pictures else 1, "plots": [], "comparisons": []}
     for cost, of in analysis.points(scene["renders"], metric):
         if len(of) > 1:
             shown["plots"].append(plots.error_against(cost, of, pareto(of), labels, metric))

@@ -93,16 +93,17 @@ class Reference:
 
 def read(path):
     """Read a reference from an EXR file: colour channels and, where there are, layers `se.*` with its standard error.
-    Raises OSError or RuntimeError if it cannot be read, ValueError if it has no colour."""
+    Raises OSError or RuntimeError if it cannot be read, ValueError if it has no colour or if that is not finite."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"no reference '{path}'")
     image, channels, metadata = images.read_exr(path)
-    has_error = any(name.startswith("se.") for name in channels)
-    return Reference(
-        images.colour(image, channels).astype(np.float64),
-        images.colour(image, channels, "se.").astype(np.float64) if has_error else None,
-        {"file": str(path), **metadata},
-    )
+    colour, error = images.colour(image, channels).astype(np.float64), None
+    if any(name.startswith("se.") for name in channels):
+        error = images.colour(image, channels, "se.").astype(np.float64)
+    bad = sum(int((~np.isfinite(layer)).any(axis=-1).sum()) for layer in (colour, error) if layer is not None)
+    if bad:
+        raise ValueError(f"the reference '{path}' has {bad} pixels that are not finite")
+    return Reference(colour, error, {"file": str(path), **metadata})
 
 
 def write(path, image, standard_error, description, half=False):

@@ -56,9 +56,19 @@ def reference_text(scene):
     )
     if reference["noise"]:
         text += f" (noise: rel. L1 {reference['noise']['relative_l1']:.2%}, relMSE {reference['noise']['relmse']:.2g})"
-    if (scene.get("reference_share") or 0) > scene.get("reference_fraction", 1):
-        text += f"; stopped at --reference-limit, its noise being up to {scene['reference_share']:.0%} of an error"
-    return text or "an image of unknown origin"
+    return (text or "an image of unknown origin") + _limit_text(scene)
+
+
+def _limit_text(scene):
+    """Say where a reference was wanted that has less noise than it was allowed to get; empty where it has."""
+    if not any("errors" in render for render in scene["renders"]) or "reference_fraction" not in scene:
+        return ""
+    share = scene["reference_share"]
+    if share is None:
+        return "; stopped at --reference-limit, its noise being larger than an error"
+    if share > scene["reference_fraction"]:
+        return f"; stopped at --reference-limit, its noise being up to {share:.0%} of an error"
+    return ""
 
 
 def write(folder, results, pictures):

@@ -48,9 +48,16 @@ class SceneComparison:
                 self._fail(error)
 
     def finish(self):
-        """Measure the errors of all runs that there are, and make curves and pictures."""
+        """Measure the errors of all runs that there are, and make curves and pictures. What fails is recorded."""
         if "hash" not in self.result:
             return
+        try:
+            self._finish()
+        except Exception as error:
+            self.pictures = None
+            self._fail(error)
+
+    def _finish(self):
         self.pictures = Pictures(self.options.out, self.result["name"])
         if self._reference:
             self._describe_reference()
@@ -101,14 +108,15 @@ class SceneComparison:
         while True:
             spp, share = self._reference.description["spp"], self._noise_share()
             if share is None or share <= wanted.fraction or spp >= self.options.reference_limit:
-                self.result |= {"reference_share": share, "reference_fraction": wanted.fraction}
+                told = None if share == np.inf else share  # JSON has no infinity
+                self.result |= {"reference_share": told, "reference_fraction": wanted.fraction}
                 return
             growth = np.clip((share / wanted.fraction) ** 2, *GROWTH)
             self._reference = self._path_traced(min(self.options.reference_limit, math.ceil(spp * growth)))
 
     def _noise_share(self):
-        """Return the largest share that the reference's noise has in the error of a run, None if there are no runs.
-        Shares of squared errors are given as those of their roots."""
+        """Return the largest share that the reference's noise has in the error of a run, infinite where it hides one
+        altogether, None if there are no runs. Shares of squared errors are given as those of their roots."""
         metric, shares = self.options.metric, []
         for result in self._finished():
             errors = self._errors(images.colour(*images.read_exr(result["output"])[:2]), self._reference)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import compare
-from comparison import analysis, baseline, images, strip, tables
+from comparison import analysis, baseline, images, metrics, references, strip, tables
 from comparison.command_line import UsageError
 
 from .conftest import CORNELL, SWEEP
@@ -77,6 +77,31 @@ def test_automatic_reference_is_continued_up_to_its_limit(tmp_path, swept, capsy
     scene = results_of(tmp_path)["scenes"][0]
     assert scene["reference"]["spp"] == 100 and scene["reference_share"] > 0.01
     assert "stopped at --reference-limit" in capsys.readouterr().out
+
+
+def test_a_reference_that_hides_an_error_is_reported(tmp_path, capsys, monkeypatch):
+    """Errors of zero, of which the noise has an infinite share, are written all the same."""
+    compared = metrics.compare
+    monkeypatch.setattr(metrics, "compare", lambda *given: compared(*given) | {"relmse_trimmed": 0.0})
+    few = [CORNELL, "-i", "path", "--width", "16", "--spp", "1", "-o", str(tmp_path), "--cache", str(tmp_path)]
+    assert compare.main([*few, "-r", "path:auto", "--reference-limit", "64"]) == 0
+    assert results_of(tmp_path)["scenes"][0]["reference_share"] is None
+    assert "its noise being larger than an error" in capsys.readouterr().out
+
+
+def test_references_that_are_no_use_lose_nothing_else(tmp_path, capsys):
+    """A black reference, and one that is not finite: the runs are reported, and so are the other scenes."""
+    for name, value in (("black", 0.0), ("bright", np.inf), ("cornell", 1.0)):
+        (tmp_path / f"{name}.xml").write_text(Path(CORNELL).read_text())
+        references.write(tmp_path / f"{name}.exr", np.full((16, 16, 3), value), np.full((16, 16, 3), 0.1), {})
+    scenes = [str(tmp_path / f"{name}.xml") for name in ("black", "bright", "cornell")]
+    out = tmp_path / "out"
+    assert compare.main([*scenes, "-i", "path", "--spp", "1", "-r", str(tmp_path), "-o", str(out)]) == 1
+    black, bright, cornell = results_of(out)["scenes"]
+    assert black["error"] == "the reference is black" and black["renders"][0]["seconds"] > 0
+    assert "has 256 pixels that are not finite" in bright["error"] and bright["renders"] == []
+    assert "error" not in cornell and cornell["renders"][0]["errors"]["relmse"] > 0
+    assert "the reference is black" in (out / "report.html").read_text()
 
 
 def test_tables_have_a_row_a_setting(swept):
