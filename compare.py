@@ -226,11 +226,11 @@ def run(options, command):
         results = _compare(options, settings, command)
     print(tables.EXPLANATION, end="\n\n")
     print(f"report: {options.out / 'report.html'}")
-    if any("error" in part for scene in results["scenes"] for part in (scene, *scene["renders"])):
-        return 1
     worse = baseline.check(results, earlier, options.check_share) if earlier else []
     for line in worse:
         print(f"compare: {line}", file=sys.stderr)
+    if any("error" in part for scene in results["scenes"] for part in (scene, *scene["renders"])):
+        return 1
     return 3 if worse else 0
 
 

@@ -40,24 +40,39 @@ def _speed_ups(results):
 
 def check(results, baseline, share):
     """Return what has become worse, a list of lines: speed-ups that fell by more than a `share` (a fraction), or that
-    are not there any more. Scenes that only one of the two has are left out."""
+    can no longer be told. One that is known to be at least what it may fall to has not fallen, though the curves do not
+    overlap any more. Scenes that only one of the two has are left out."""
     metric = results["metrics"]["compared"]
     found, lines = {scene["name"]: scene for scene in results["scenes"]}, []
     for name, base, label, cost, error, before in _speed_ups(baseline):
         if name not in found:
             continue
-        now = _speed_up(found[name], base, label, cost, error, metric)
-        head = f"{name}: {label} over {base}, {cost} at error {error:.3g}: {before:.3g}× before, "
-        if now is None:
-            lines.append(f"{head}not reached now")
-        elif now < (1 - share) * before:
-            lines.append(f"{head}{now:.3g}× now, {1 - now / before:.0%} less")
+        readings = _readings(found[name], base, label, cost, error, metric)
+        message = _fall(*readings, before, share) if readings else "no such curves now"
+        if message:
+            lines.append(f"{name}: {label} over {base}, {cost} at error {error:.3g}: {before:.3g}× before, {message}")
     return lines
 
 
-def _speed_up(scene, base, label, cost, error, metric):
+def _fall(first, other, before, share):
+    """Say how a speed-up has fallen, None if it has not; `first` and `other` are the readings of the two labels."""
+    now, least = other["speed_up"], other["speed_up_at_least"]
+    if now is not None:
+        return f"{now:.3g}× now, {1 - now / before:.0%} less" if now < (1 - share) * before else None
+    if least is not None and least >= (1 - share) * before:
+        return None
+    if other["value"] is None and other["at_most"] is None:
+        return "not reached now"
+    if first["value"] is None and first["at_most"] is None:
+        return "not reached now by the first"
+    return "cannot be told now, the cheapest settings being better"
+
+
+def _readings(scene, base, label, cost, error, metric):
+    """Return the readings of two labels at an error, see `curves.equal_errors`; None if one of them has no curve."""
     of = dict(analysis.points(scene["renders"], metric))[cost]
     pair = analysis.make_curves(of, [base, label])
     if [curve.label for curve in pair] != [base, label]:
         return None
-    return curves.equal_errors(pair, [error])[0]["costs"][label]["speed_up"]
+    costs = curves.equal_errors(pair, [error])[0]["costs"]
+    return costs[base], costs[label]

@@ -199,10 +199,30 @@ def test_check_finds_speed_ups_that_fell():
     assert baseline.check(fake_results(3.5), before, 0.5) == []
 
 
+def without(results, *unwanted):
+    """The same results without the runs of some (label, setting)."""
+    for scene in results["scenes"]:
+        scene["renders"] = [one for one in scene["renders"] if (one["label"], one["setting"]) not in unwanted]
+    return results
+
+
 def test_check_finds_errors_that_are_no_longer_reached():
-    now = fake_results(5)
-    now["scenes"][0]["renders"] = [one for one in now["scenes"][0]["renders"] if one["label"] != "fast"]
-    assert all(line.endswith("not reached now") for line in baseline.check(now, fake_results(5), 0.2))
+    slow = [("fast", "spp=4"), ("fast", "spp=16")]
+    lines = baseline.check(without(fake_results(5), *slow), fake_results(5), 0.2)
+    assert len(lines) == 3 and all(line.endswith(": 5× before, not reached now") for line in lines)
+    lines = baseline.check(without(fake_results(5), *slow, ("fast", "spp=1")), fake_results(5), 0.2)
+    assert len(lines) == 4 and all(line.endswith("no such curves now") for line in lines)
+    lines = baseline.check(without(fake_results(5), ("path", "spp=4"), ("path", "spp=16")), fake_results(5), 0.2)
+    assert len(lines) == 3 and all(line.endswith("not reached now by the first") for line in lines)
+
+
+def test_check_lets_pass_what_is_better_than_it_can_tell():
+    """Where even the cheapest setting is better than the error, a bound has to do."""
+    cheap = [("fast", "spp=1"), ("fast", "spp=4")]
+    assert len(baseline.check(without(fake_results(5), *cheap), fake_results(5), 0.2)) == 4
+    assert baseline.check(without(fake_results(100), *cheap), fake_results(5), 0.2) == []
+    lines = baseline.check(without(fake_results(5), ("path", "spp=1"), ("path", "spp=4")), fake_results(5), 0.2)
+    assert lines and all("cannot be told now" in line for line in lines)
 
 
 def test_check_refuses_what_cannot_be_compared(tmp_path):
