@@ -1,6 +1,6 @@
 """From the runs of a scene to the points, curves and comparisons that the report shows; see results.schema.json."""
 
-from . import curves
+from . import curves, metrics
 
 COSTS = ("seconds", "rays")  # what errors are set against
 
@@ -19,7 +19,7 @@ def points(renders, metric):
                 point = found[cost].setdefault(key, curves.Point(*key, {}, {}, {}))
                 point.cost[render["seed"]] = value
                 point.error[render["seed"]] = errors[metric]
-                point.noise[render["seed"]] = errors["noise"][metric]
+                point.noise[render["seed"]] = float(metrics.least(metric, errors["noise"]))
     return [(cost, list(found[cost].values())) for cost in COSTS]
 
 

@@ -65,7 +65,7 @@ def _fall(first, other, before, share):
         return "not reached now"
     if first["value"] is None and first["at_most"] is None:
         return "not reached now by the first"
-    return "cannot be told now, the cheapest settings being better"
+    return "only known by bounds now"
 
 
 def _readings(scene, base, label, cost, error, metric):

@@ -1,8 +1,8 @@
 """Curves of error against time or shadow rays, and what is read off them. NumPy only.
 
 A point is a setting, its coordinates are means over seeds. An integrator's curve joins those of its points that no
-other of its points beats in both (its own front), by straight lines in logarithmic axes; errors that the reference's
-noise hides are no part of it. Nothing is read off beyond its ends.
+other of its points beats in both (its own front), by straight lines in logarithmic axes. Errors that the reference's
+noise hides are no part of it, but bounds: they are at most that noise. Nothing is read off beyond a curve's ends.
 
 Confidence intervals are at 95%: of means by Student's t on a logarithmic scale, of what is read off by the jackknife
 over seeds. Ratios of two integrators leave the same seed out of both, as they may share lights.
@@ -53,11 +53,19 @@ class Point:
     def mean(self, without=None):
         """Return the means of cost and error, with a seed left out; None if there is no other seed, or if the error
         cannot be told from the reference's noise."""
+        cost, error, noise = self._means(without)
+        return (cost, error) if error > noise and cost > 0 else None
+
+    def bound(self, without=None):
+        """Return the means of cost and noise where that hides the error, which is at most as large; None elsewhere."""
+        cost, error, noise = self._means(without)
+        return (cost, noise) if error <= noise and cost > 0 else None
+
+    def _means(self, without):
         seeds = [seed for seed in self.cost if seed != without]
         if not seeds:
-            return None
-        cost, error, noise = (np.mean([of[seed] for seed in seeds]) for of in (self.cost, self.error, self.noise))
-        return (float(cost), float(error)) if error > noise and cost > 0 else None
+            return np.nan, np.nan, np.nan
+        return tuple(float(np.mean([of[seed] for seed in seeds])) for of in (self.cost, self.error, self.noise))
 
 
 class Curve:
@@ -70,25 +78,22 @@ class Curve:
         """Return cost and error, arrays of the points of the curve in order of rising cost and falling error."""
         return front([mean for point in self.points if (mean := point.mean(without)) is not None])
 
+    def bounds(self, without=None):
+        """Return cost and noise, a list of pairs, of the points whose errors the noise hides."""
+        return [bound for point in self.points if (bound := point.bound(without)) is not None]
+
     def cost_at(self, error, without=None):
-        """Return the cost of an error as (cost, at most): the second where even the cheapest point is better than that,
-        (None, None) where the curve does not get there."""
+        """Return the cost of an error as (cost, at most): the second where a cheaper point is better than that, be it
+        the cheapest or one that the noise hides, (None, None) where the curve does not get there."""
         costs, errors = self.front(without)
-        if not costs.size or error < errors[-1]:
-            return None, None
-        if error > errors[0]:
-            return None, float(costs[0])
-        return _interpolate(error, errors[::-1], costs[::-1]), None
+        hidden = [cost for cost, noise in self.bounds(without) if noise <= error]
+        return _read_off(error, errors[::-1], costs[::-1], hidden)
 
     def error_at(self, cost, without=None):
-        """Return the error at a cost as (error, at most): the second where the dearest point costs less than that,
-        (None, None) where even the cheapest costs more."""
-        costs, errors = self.front(without)
-        if not costs.size or cost < costs[0]:
-            return None, None
-        if cost > costs[-1]:
-            return None, float(errors[-1])
-        return _interpolate(cost, costs, errors), None
+        """Return the error at a cost as (error, at most): the second where a point that costs less, be it the dearest
+        or one that the noise hides, is better, (None, None) where even the cheapest costs more."""
+        hidden = [noise for at, noise in self.bounds(without) if at <= cost]
+        return _read_off(cost, *self.front(without), hidden)
 
     @property
     def seeds(self):
@@ -104,8 +109,17 @@ def front(pairs):
     return tuple(np.array(kept, np.float64).reshape(-1, 2).T)
 
 
-def _interpolate(x, xs, ys):
-    return float(np.exp(np.interp(np.log(x), np.log(xs), np.log(ys))))
+def _read_off(x, xs, ys, bounds):
+    """Return the value at x of a falling curve through (xs, ys), xs rising, and None; or None and what it is at most,
+    beyond the end of the curve, or because one of `bounds` is lower; or None twice."""
+    value, at_most = None, min(bounds, default=np.inf)
+    if xs.size and x > xs[-1]:
+        at_most = min(at_most, float(ys[-1]))
+    elif xs.size and x >= xs[0]:
+        value = float(np.exp(np.interp(np.log(x), np.log(xs), np.log(ys))))
+    if value is not None and value <= at_most:
+        return value, None
+    return None, at_most if np.isfinite(at_most) else None
 
 
 def interval(value, seeds):
@@ -185,7 +199,9 @@ def _targets(ranges):
 
 
 def pareto(points):
-    """Return the set of (label, name) of those points of all curves that no point of any curve beats in both."""
+    """Return the set of (label, name) of those points of all curves that no point of any curve beats in both, be it one
+    that the noise hides."""
     means = {(point.label, point.name): mean for point in points if (mean := point.mean()) is not None}
-    kept = set(zip(*map(np.ndarray.tolist, front(means.values())), strict=True))
+    bounds = [bound for point in points if (bound := point.bound()) is not None]
+    kept = set(zip(*map(np.ndarray.tolist, front([*means.values(), *bounds])), strict=True))
     return {key for key, mean in means.items() if mean in kept}

@@ -23,7 +23,7 @@ def compare(image, reference, standard_error=None):
     relmse_trimmed  the same without the 0.1% of pixels where (x - r)² / (r² + ...) is largest
     bias            (mean x - mean r) / mean r
     noise           the same errors (but `bias`) that an exact image would show for the reference's noise alone
-    below_noise     names of errors that are smaller than the noise
+    below_noise     names of errors that cannot be told from the noise: smaller than `least`
     bad_pixels      number of pixels that are not finite; they count as black
 
     Without `standard_error` the noise is taken as zero and `below_noise` is empty. Raises ValueError if the shapes
@@ -49,21 +49,26 @@ def compare(image, reference, standard_error=None):
     }
     errors = {name: max(0.0, total - of_noise) for name, (total, of_noise) in totals.items()}
     noises = {name: of_noise for name, (_, of_noise) in totals.items()}
-    below = [name for name in totals if noises[name] > errors[name]]
     errors["rmse"], noises["rmse"] = np.sqrt(errors["rmse"]), np.sqrt(noises["rmse"])
-
     errors["relative_l1"] = np.abs(image - reference).sum() / reference.sum()
-    # The mean of |n| for a normal n; errors add to it in quadrature.
-    noises["relative_l1"] = np.sqrt(2 / np.pi * variance).sum() / reference.sum()
-    if errors["relative_l1"] < np.sqrt(2) * noises["relative_l1"]:
-        below.append("relative_l1")
+    noises["relative_l1"] = np.sqrt(2 / np.pi * variance).sum() / reference.sum()  # the mean of |n| for a normal n
+    below = [name for name in NAMES if errors[name] < least(name, noises)]
     errors["bias"] = (image.mean() - mean) / mean
     return {
         **{name: float(value) for name, value in errors.items()},
         "noise": {name: float(value) for name, value in noises.items()},
-        "below_noise": sorted(below),
+        "below_noise": below,
         "bad_pixels": int(bad.sum()),
     }
+
+
+def least(name, noise):
+    """Return the least error that can be told from the reference's noise, given that one's errors (a dict).
+
+    It is the noise itself; for relative_l1, from which that is not taken off, it is where an error adds as much to the
+    noise, in quadrature, as that has.
+    """
+    return noise[name] * (np.sqrt(2) if name == "relative_l1" else 1)
 
 
 def relative_error(image, reference):

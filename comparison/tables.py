@@ -1,5 +1,7 @@
 """The tables of a comparison, as lists of rows of text: for the terminal and for the report."""
 
+from collections import Counter
+
 from . import metrics
 
 COLUMNS = (
@@ -7,13 +9,14 @@ COLUMNS = (
     "rays", "bounds", "memory", "load",
 )  # fmt: skip
 EXPLANATION = (
-    "Means over seeds. time: of the passes in the image, kernels being compiled; cold: the first pass of all with an "
-    "empty kernel cache, compilation included. rel. L1: sum |x - r| / sum r; "
+    "Means over seeds. time: of the passes in the image, with kernels that are compiled already; cold: the first pass "
+    "of all with an empty kernel cache, compilation included. rel. L1: sum |x - r| / sum r; "
     f"relMSE: mean (x - r)² / (r² + {metrics.EPSILON:g} mean(r)²); trimmed: the same without the worst "
     f"{metrics.TRIMMED:.1%} of the pixels; 95%: interval of the mean of the error that curves show (--metric); FLIP: "
-    "mean of HDR-FLIP at 67 pixels per degree; bias: of the mean. The reference's own noise is taken off squared "
-    "errors; < marks errors below that noise, and gives the noise. rays, bounds: shadow rays and upper bounds "
-    "computed, per pixel sample. memory: peak, MB. load: the machine's load average before the runs, the largest."
+    "mean of HDR-FLIP at 67 pixels per degree; bias: of the mean. The reference's own noise is taken off RMSE and "
+    "relMSE; < marks errors that are smaller than that noise, and gives it (for rel. L1 √2 times it). rays, bounds: "
+    "shadow rays and upper bounds computed, per pixel sample. memory: peak, MB. load: the machine's load average "
+    "before the runs, the largest."
 )
 BUSY = 1.5  # load a core; what is measured makes up to one itself
 HEADS = {"seconds": "time [s]", "rays": "rays per pixel"}
@@ -45,8 +48,11 @@ def rows(scene):
         good = [render for render in renders if "error" not in render]
         if good:
             found.append(_row(title, good, intervals.get(title, "")))
-        failures = {render["error"]: render["seed"] for render in renders if "error" in render}
-        found += [(title, message) for message in failures]
+        failures = Counter(render["error"] for render in renders if "error" in render)
+        found += [
+            (title, message if len(renders) == 1 else f"{message} ({count} of {len(renders)} seeds)")
+            for message, count in failures.items()
+        ]
     return found
 
 
@@ -67,9 +73,9 @@ def _row(title, renders, interval):
     return [
         title + (f" ({bad} pixels not finite)" if bad else ""),
         str(len(renders)),
-        f"{_mean(render['seconds'] for render in renders):.3g}",
-        f"{_mean(cold):.3g}" if cold else "",
-        f"{_mean(render['spp'] for render in renders):.4g}",
+        number(_mean(render["seconds"] for render in renders)),
+        number(_mean(cold)) if cold else "",
+        number(_mean(render["spp"] for render in renders)),
         *(
             _error(errors, *column)
             for column in (("relative_l1", ".2%"), ("rmse", ".3g"), ("relmse", ".3g"), ("relmse_trimmed", ".3g"))
@@ -93,13 +99,11 @@ def _count(renders, key):
 
 
 def _error(errors, name, style):
-    """Format an error, or "< noise" where it is below the reference's noise."""
+    """Format the mean of an error, or "< noise" where curves, too, do not tell it from the reference's noise."""
     if not errors:
         return "n/a"
-    error, noise = _mean(one[name] for one in errors), _mean(one["noise"][name] for one in errors)
-    if all(name in one["below_noise"] for one in errors):
-        return f"< {noise:{style}}"
-    return f"{error:{style}}"
+    error, least = _mean(one[name] for one in errors), _mean(metrics.least(name, one["noise"]) for one in errors)
+    return f"< {least:{style}}" if error <= least and least > 0 else f"{error:{style}}"
 
 
 def equal_errors(scene, cost):
@@ -124,19 +128,20 @@ def _comparison(entries, what, read, head):
 
 def number(value):
     """Write a number with three digits, or more before the point, never with an exponent down to 1e-4."""
-    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return f"{value:.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
 
 
 def _reading(reading):
     if reading["at_most"] is not None:
         least = reading["speed_up_at_least"]
-        return f"≤ {number(reading['at_most'])}" + (f" (≥ {least:.3g}×)" if least is not None and least > 1 else "")
+        return f"≤ {number(reading['at_most'])}" + (f" (≥ {number(least)}×)" if least is not None and least > 1 else "")
     if reading["value"] is None:
         return "not reached"
     cell = number(reading["value"])
     if reading["speed_up_low"] is not None:
-        return f"{cell} ({reading['speed_up']:.3g}×, {reading['speed_up_low']:.3g} to {reading['speed_up_high']:.3g})"
-    return f"{cell} ({reading['speed_up']:.3g}×)" if reading["speed_up"] not in (None, 1) else cell
+        low, high = number(reading["speed_up_low"]), number(reading["speed_up_high"])
+        return f"{cell} ({number(reading['speed_up'])}×, {low} to {high})"
+    return f"{cell} ({number(reading['speed_up'])}×)" if reading["speed_up"] not in (None, 1) else cell
 
 
 def warnings(scene, cores):

@@ -83,8 +83,22 @@ def test_nothing_is_read_off_beyond_the_ends():
 def test_what_the_noise_hides_is_in_no_curve():
     curve = Curve("a", [point("a", "1", 1, 1.0), point("a", "2", 4, 0.25, noise=0.3)])
     assert curve.front()[0].tolist() == [1.0]
-    assert curve.cost_at(0.5) == (None, None)
     assert curves.pareto(curve.points) == {("a", "1")}
+
+
+def test_what_the_noise_hides_is_a_bound():
+    """Its error is at most the noise: an error above that is reached, one below it may be or not."""
+    curve = Curve("a", [point("a", "1", 1, 1.0), point("a", "2", 4, 0.25, noise=0.3), point("a", "3", 8, 0.5)])
+    assert curve.cost_at(0.7)[0] == pytest.approx(8 ** (np.log(0.7) / np.log(0.5)))
+    assert curve.cost_at(0.5) == (None, 4)  # not the 8 of the curve
+    assert curve.cost_at(0.3) == (None, 4) and curve.cost_at(0.29) == (None, None)
+    assert curve.error_at(2)[0] == pytest.approx(2 ** (np.log(0.5) / np.log(8)))
+    assert curve.error_at(4) == curve.error_at(20) == (None, 0.3)
+    assert curves.pareto(curve.points) == {("a", "1")}
+    hidden = Curve("b", [point("b", "1", 2, 0.0, noise=0.1)])
+    assert hidden.cost_at(0.2) == (None, 2) and hidden.error_at(1) == (None, None)
+    found = curves.equal_errors([power_law("c"), hidden], [0.125])[0]["costs"]["b"]
+    assert found["speed_up"] is None and found["speed_up_at_least"] == pytest.approx(4)
 
 
 def test_speed_up_at_equal_error():

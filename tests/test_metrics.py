@@ -68,6 +68,17 @@ def test_noise_of_the_reference_is_taken_off(reference):
     assert exact["relative_l1"] == pytest.approx(exact["noise"]["relative_l1"], rel=0.05)
 
 
+def test_relative_l1_of_exact_images_is_hidden_by_the_noise():
+    """Which it is not taken off from, so that it scatters about it."""
+    random, truth = np.random.default_rng(4), np.full((16, 16, 3), 2.0)
+    for _ in range(20):
+        result = metrics.compare(truth, truth + random.normal(size=truth.shape) * 0.1, np.full(truth.shape, 0.1))
+        assert "relative_l1" in result["below_noise"]
+        assert result["relative_l1"] < metrics.least("relative_l1", result["noise"])
+    image = truth + random.normal(size=truth.shape) * 0.2
+    assert metrics.compare(image, truth, np.full(truth.shape, 0.1))["below_noise"] == []
+
+
 def test_pixels_that_are_not_finite_count_as_black(reference):
     image = reference.copy()
     image[0, 0, 1] = np.nan
