@@ -9,7 +9,11 @@ from . import command_line
 
 ROOT = Path(__file__).resolve().parent.parent
 # What seconds and images depend on; the report may change without a run having to be made again.
-SOURCES = ("integrators/*.py", "vpl/*.py", "comparison/worker.py", "comparison/rendering.py")
+SOURCES = (
+    "integrators/*.py",
+    "vpl/*.py",
+    *(f"comparison/{name}.py" for name in ("worker", "rendering", "scene_files")),
+)
 
 
 def describe():

@@ -13,6 +13,7 @@ import mitsuba as mi
 
 # What a replaced integrator hands on to its successor: it says which light is to be shown, not how it is computed.
 KEPT_PARAMETERS = ("max_depth", "rr_depth", "hide_emitters")
+GIVEN_TO_RENDER = ("sample_count", "seed")  # instead of what the sampler says
 
 
 def short_name(path):
@@ -95,11 +96,15 @@ class SceneFile:
 
     def fingerprint(self):
         """Return a hash (hexadecimal) of everything that the image depends on, but for the samples per pixel and the
-        seed: variant, scene with all parameters, and the content of every file that it names."""
+        seed: variant, scene with all other parameters, and the content of every file that it names."""
         digest = hashlib.sha256(mi.variant().encode())
         for node in self._state.nodes:
             properties = mi.Properties(node.props)
-            digest.update(repr(properties).encode() if node.type != mi.ObjectType.Sampler else b"sampler")
+            if node.type == mi.ObjectType.Sampler:
+                for name in GIVEN_TO_RENDER:
+                    if name in properties:
+                        del properties[name]
+            digest.update(repr(properties).encode())
             for _, value in properties.items():
                 file = self.path.parent / value if isinstance(value, str) and value else None
                 if file is not None and file.is_file():

@@ -146,7 +146,13 @@ def _reading(reading):
 
 def warnings(scene, cores):
     """Return sentences about what makes a scene's numbers doubtful; [] if there is nothing."""
+    found = []
     load = max((render["load_average"] for render in scene["renders"]), default=0)
     if load > BUSY * cores:
-        return [f"The machine was busy with other things (load {load:.1f} on {cores} cores): do not trust the times."]
-    return []
+        found.append(
+            f"The machine was busy with other things (load {load:.1f} on {cores} cores): do not trust the times."
+        )
+    compiled = [render for render in scene["renders"] if render.get("cold_pass_kept") and render["cold_seconds"]]
+    for title in dict.fromkeys(f"{render['label']} {render['setting']}".strip() for render in compiled):
+        found.append(f"The time of {title} includes compilation: its first pass was too long to be rendered twice.")
+    return found

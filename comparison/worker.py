@@ -71,7 +71,10 @@ def run(job, tick=lambda: None):
     ends with this one, even if this one is killed.
     """
     result = asdict(job) | {"load_average": machine.load()}
-    with tempfile.TemporaryDirectory(prefix="manylights-") as folder:
+    if job.kernel_cache:
+        Path(job.kernel_cache).mkdir(parents=True, exist_ok=True)
+    # Where there is a folder of kernels, beside them: who removes that after a crash removes this too.
+    with tempfile.TemporaryDirectory(prefix="manylights-", dir=job.kernel_cache) as folder:
         job_file, result_file = Path(folder) / "job.json", Path(folder) / "result.json"
         job_file.write_text(json.dumps(asdict(job)))
         kernels = Path(job.kernel_cache or folder) / "kernels"
@@ -156,14 +159,16 @@ def _parse(job):
 def _measure(progressive, job):
     """Render the passes of a job. Return the seconds of the first, cold pass, and whether it is in the image.
 
-    It is not, so that times are warm, unless it alone took more than the budget (or `LONG_PASS`): compilation is then
-    small next to it.
+    It is not, so that times are warm, unless it alone took more than the budget (or `LONG_PASS`). Nor are those that
+    compile the kernels of a smaller last pass.
     """
     unused = (pass_seed(job.seed, index) for index in count(UNUSED_PASSES))
     sizes = pass_sizes(job.spp, progressive.pixels, job.pass_spp) if job.spp else [job.pass_spp or 1]
     cold = progressive.render(sizes[0], next(unused)).seconds
     kept = cold > (job.budget or LONG_PASS)
     if not kept:
+        for spp in {*sizes} - {sizes[0]}:
+            progressive.render(spp, next(unused))
         progressive.restart()
     if job.spp:
         for spp in sizes[len(progressive.passes) :]:
@@ -201,7 +206,7 @@ def _render_vpl(job, passes, described):
     same passes with the same parameters, is left as it is."""
     file = _parse(job)
     file.set_integrator("vpl", {"aovs": ""}, keep=None)  # nobody asks for its channels, and it may not know them all
-    shared = [file.fingerprint(), versions(), [(one.spp, one.seed) for one in passes]]
+    shared = [file.fingerprint(), machine.versions(), [(one.spp, one.seed) for one in passes]]
     key = hashlib.sha256(json.dumps(shared).encode()).hexdigest()[:16]
     output = Path(job.vpl_folder) / f"{file.name}.vpl.{key}.exr"
     if not output.is_file():

@@ -79,6 +79,9 @@ def test_fingerprint_follows_everything_that_matters(tmp_path):
     )
     before = SceneFile(scene).fingerprint()
     assert SceneFile(scene, {"spp": "9"}).fingerprint() == before
+    file = SceneFile(scene)
+    file.set_sampler("multijitter")
+    assert file.fingerprint() != before
     assert SceneFile(scene, {"depth": "9"}).fingerprint() != before
     bitmap.write_bytes(b"2")
     assert SceneFile(scene).fingerprint() != before
@@ -282,6 +285,32 @@ def test_worker_measures_within_a_time_budget(tmp_path):
     assert result["rays_per_sample"] is None
     image, _, metadata = images.read_exr(tmp_path / "a.exr")
     assert image.shape == (16, 16, 3) and metadata["integrator"] == "path"
+
+
+class Recorded:
+    """A render that takes as long as it is told, and remembers which passes were asked for."""
+
+    def __init__(self, first_seconds, pixels):
+        self.seconds_of_next, self.pixels, self.passes, self.seeds = [first_seconds], pixels, [], []
+
+    def render(self, spp, seed=None):
+        self.seeds.append((spp, seed is not None))
+        self.passes.append(rendering.Pass(seed or 0, spp, self.seconds_of_next.pop() if self.seconds_of_next else 0.1))
+        return self.passes[-1]
+
+    def restart(self):
+        self.passes = []
+
+
+def test_kernels_of_every_size_of_pass_are_compiled_before_the_clock_runs():
+    job = worker.Job("p", "path", "s.xml", "a.exr", spp=19)
+    progressive = Recorded(2.0, rendering.MAXIMUM_PASS_SAMPLES // 9)
+    assert worker._measure(progressive, job) == (2.0, False)
+    assert progressive.seeds == [(9, True), (1, True), (9, False), (9, False), (1, False)]
+    assert sum(one.spp for one in progressive.passes) == 19
+    progressive = Recorded(worker.LONG_PASS + 1, rendering.MAXIMUM_PASS_SAMPLES // 9)
+    assert worker._measure(progressive, job) == (worker.LONG_PASS + 1, True)  # too long to be rendered twice
+    assert progressive.seeds == [(9, True), (9, False), (1, False)]
 
 
 def test_worker_that_dies_is_an_error(tmp_path, monkeypatch):

@@ -173,6 +173,15 @@ def test_readings_say_what_is_not_known():
     assert tables.equal_costs({}, "seconds") == []
 
 
+def test_times_that_include_compilation_are_named():
+    renders = [
+        {"label": "a", "setting": "spp=4", "load_average": 0.0, "cold_pass_kept": kept, "cold_seconds": cold}
+        for kept, cold in ((True, 70.0), (True, None), (False, 2.0))
+    ]
+    assert tables.warnings({"renders": renders[1:]}, cores=2) == []
+    assert "The time of a spp=4 includes compilation" in tables.warnings({"renders": renders}, cores=2)[0]
+
+
 def test_a_busy_machine_is_named():
     scene = {"renders": [{"load_average": 1.0}, {"load_average": 3.5}]}
     assert tables.warnings(scene, cores=4) == []
