@@ -34,6 +34,7 @@ from pathlib import Path
 try:
     from comparison import baseline, command_line, machine, metrics, references, report, sweeps, tables
     from comparison.command_line import UsageError, parameter, positive
+    from comparison.pictures import REFERENCE
     from comparison.progress import Progress
     from comparison.runs import Runs, locked
     from comparison.scene_comparison import SceneComparison
@@ -159,7 +160,7 @@ def chosen_integrators(options):
     for entry in options.integrators.split(","):
         label, _, name = entry.strip().rpartition("=")
         label = label or name
-        if not re.fullmatch(r"[\w-]+", label) or label in chosen:
+        if not re.fullmatch(r"[\w-]+", label) or label in (*chosen, REFERENCE):
             raise UsageError(
                 f"--integrators: '{entry}' is no name of its own; two of a kind are a=lightcuts,b=lightcuts"
             )
@@ -201,8 +202,10 @@ def chosen_settings(options):
 
 
 def check_scenes(paths, reference):
-    """Raise UsageError for scenes or references that are not there, and for two scenes of the same name."""
+    """Raise UsageError for scenes or references that are not there or not enough, and for two scenes of one name."""
     names = {}
+    if len(paths) > 1 and reference.kind == "file" and not reference.file.is_dir():
+        raise UsageError(f"--reference: '{reference.file}' is of one scene; for several give a folder")
     for path in paths:
         command_line.check_scene(path)
         name = short_name(path)

@@ -32,10 +32,12 @@ def replacing(path):
         temporary.unlink(missing_ok=True)
 
 
-def remove_abandoned(folder):
-    """Remove temporary files that killed processes left in a folder; nobody may be writing there."""
+def remove_abandoned(folder, stem=None):
+    """Remove temporary files that killed processes left in a folder, of the files called `stem` if it is given; nobody
+    may be writing there, or those files."""
+    name = ".+" if stem is None else re.escape(stem)
     for file in Path(folder).iterdir():
-        if re.fullmatch(r"\..+\.\d+\.(exr|png|json|html)", file.name):
+        if re.fullmatch(rf"\.{name}\.\d+\.(exr|png|json|html)", file.name):
             file.unlink()
 
 

@@ -2,6 +2,7 @@
 
 from . import images, metrics, page_images
 
+REFERENCE = "reference"  # what its picture is called
 DISTANCE_FACTOR = 16  # of the images of Euclidean distance, as in the paper on IlluminationCut
 
 

@@ -128,6 +128,7 @@ def path_traced(scene_file, spp, cache):
     file = Path(cache) / f"{scene_file.name}-{key}.exr"
     file.parent.mkdir(parents=True, exist_ok=True)
     with locked(file.with_suffix(".lock")):
+        images.remove_abandoned(file.parent, file.stem)
         batches = _read_batches(file)
         if batches.spp < spp or batches.count < 2:
             described = {"integrator": "path", "scene": scene_file.name, "seed": SEED, **parameters}

@@ -8,7 +8,7 @@ import numpy as np
 
 from . import analysis, images, metrics, references, worker
 from .command_line import explain, own_integrators
-from .pictures import Pictures
+from .pictures import REFERENCE, Pictures
 from .scene_files import SceneFile, short_name
 from .sweeps import order
 
@@ -61,7 +61,7 @@ class SceneComparison:
         self.pictures = Pictures(self.options.out, self.result["name"])
         if self._reference:
             self._describe_reference()
-            self.pictures.show("reference", None, "reference", self._reference.image)
+            self.pictures.show(REFERENCE, None, REFERENCE, self._reference.image)
         labels = list(self.settings)
         for result in sorted(self._finished(), key=lambda result: labels.index(result["label"])):
             try:

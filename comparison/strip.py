@@ -3,7 +3,8 @@
     python compare.py scenes/hall.xml -i path,lightcuts --time 10 -r scenes/hall_reference.exr -o output/strip
     python -m comparison.strip output/strip --scene hall --output docs/equal_time.png
 
-One picture for every integrator, the reference, and the relative errors in false colours, with names and numbers below.
+One picture for every integrator (of the first seed), the reference if all share one, and the relative errors in false
+colours, with names and numbers below.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from matplotlib.figure import Figure
 
 from . import command_line, images, tables
 from .command_line import UsageError
+from .pictures import REFERENCE
 
 RESOLUTION = 100  # pixels per inch
 CAPTION = 0.45  # inches below the pictures
@@ -36,19 +38,20 @@ def panels(results, name):
         if "error" in first or "errors" not in first:
             continue
         file = Path(first["output"]).name.removesuffix(".exr").removesuffix(f".seed{first['seed']}")
-        found.append((file, title, f"{tables.number(first['seconds'])} s", first["errors"]["relmse_trimmed"]))
+        error = tables.error([first["errors"]], "relmse_trimmed", ".3g")
+        found.append((file, title, f"{tables.number(first['seconds'])} s", error))
     if not found:
         raise UsageError(f"'{name}' has no images with errors")
+    reference = [(f"{name}.{REFERENCE}", f"reference\n{_samples(scene['reference'])}")] if "reference" in scene else []
     return [
         *((file, f"{title}\n{seconds}") for file, title, seconds, _ in found),
-        (f"{name}.reference", f"reference\n{_samples(scene)}"),
-        *((f"{file}.error", f"error of {title}\nrelMSE {tables.number(error)}") for file, title, _, error in found),
+        *reference,  # there is none where each image is compared with one of its own
+        *((f"{file}.error", f"error of {title}\ntrimmed relMSE {error}") for file, title, _, error in found),
     ]
 
 
-def _samples(scene):
-    spp = scene.get("reference", {}).get("spp")
-    return f"path, {spp} samples a pixel" if spp else ""
+def _samples(reference):
+    return f"{reference.get('integrator', 'path')}, {reference['spp']} samples a pixel" if "spp" in reference else ""
 
 
 def draw(pictures, captions):

@@ -77,7 +77,7 @@ def _row(title, renders, interval):
         number(_mean(cold)) if cold else "",
         number(_mean(render["spp"] for render in renders)),
         *(
-            _error(errors, *column)
+            error(errors, *column)
             for column in (("relative_l1", ".2%"), ("rmse", ".3g"), ("relmse", ".3g"), ("relmse_trimmed", ".3g"))
         ),
         interval,
@@ -98,12 +98,12 @@ def _count(renders, key):
     return "n/a" if renders[0][key] is None else f"{_mean(render[key] for render in renders):.0f}"
 
 
-def _error(errors, name, style):
+def error(errors, name, style):
     """Format the mean of an error, or "< noise" where curves, too, do not tell it from the reference's noise."""
     if not errors:
         return "n/a"
-    error, least = _mean(one[name] for one in errors), _mean(metrics.least(name, one["noise"]) for one in errors)
-    return f"< {least:{style}}" if error <= least and least > 0 else f"{error:{style}}"
+    mean, least = _mean(one[name] for one in errors), _mean(metrics.least(name, one["noise"]) for one in errors)
+    return f"< {least:{style}}" if mean <= least and least > 0 else f"{mean:{style}}"
 
 
 def equal_errors(scene, cost):

@@ -203,6 +203,18 @@ def test_strip_of_pictures(swept, tmp_path, capsys):
     assert "compare.py" in mi.Bitmap(str(output)).metadata()["command"]
 
 
+def test_strips_without_a_common_reference(swept):
+    results = results_of(swept)
+    (scene,) = results["scenes"]
+    shown = [file for file, _ in strip.panels(results, None)]
+    assert len(shown) == 11 and all((swept / f"{file}.png").is_file() for file in shown)
+    del scene["reference"]
+    assert [file for file, _ in strip.panels(results, None)] == [file for file in shown if file != "cornell.reference"]
+    errors = scene["renders"][0]["errors"]
+    errors["relmse_trimmed"], errors["noise"]["relmse_trimmed"] = 0.1, 0.2
+    assert "error of path spp=1\ntrimmed relMSE < 0.2" in [caption for _, caption in strip.panels(results, None)]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [(["--scene", "nosuch"], "there are cornell"), (["--output", "/no/folder.png"], "no folder")],
