@@ -37,14 +37,15 @@ def make_curves(of, labels):
 
 
 def analyse(renders, labels, metric):
-    """Return "points", "equal_errors" and "equal_costs" of a scene."""
+    """Return "points", "equal_errors" and "equal_costs" of a scene; the latter two are empty where no label has more
+    than one point, and so no curve, or only one label has any."""
     described, at_errors, at_costs = [], {}, {}
     for cost, of in points(renders, metric):
         best = curves.pareto(of)
         for point in of:
             described.append(_describe(cost, point, (point.label, point.name) in best))
         found = make_curves(of, labels)
-        if len(found) > 1:
+        if len(found) > 1 and any(len(curve.points) > 1 for curve in found):
             at_errors[cost], at_costs[cost] = curves.equal_errors(found), curves.equal_costs(found)
     return {"points": described, "equal_errors": at_errors, "equal_costs": at_costs}
 

@@ -247,6 +247,16 @@ def fake_results(speed_up):
     return {"metrics": {"compared": "relmse"}, "scenes": [scene]}
 
 
+def test_single_points_are_not_compared_as_curves():
+    results = fake_results(5)
+    one, two = ([("path", f"spp={spp}"), ("fast", f"spp={spp}")] for spp in (4, 16))
+    (scene,) = without(results, *one, *two)["scenes"]
+    found = analysis.analyse(scene["renders"], ["path", "fast"], "relmse")
+    assert len(found["points"]) == 2 and found["equal_errors"] == found["equal_costs"] == {}
+    (scene,) = without(fake_results(5), *one, two[0])["scenes"]
+    assert analysis.analyse(scene["renders"], ["path", "fast"], "relmse")["equal_errors"]["seconds"]
+
+
 def test_check_finds_speed_ups_that_fell():
     before = fake_results(5)
     assert baseline.check(fake_results(4.2), before, 0.2) == []
