@@ -84,7 +84,8 @@ def parse(arguments):
 def _add_effort(parser):
     effort = parser.add_mutually_exclusive_group()
     effort.add_argument("--time", type=positive(float), metavar="SECONDS",
-                        help="time budget of each image (default: 20, unless --sweep)")  # fmt: skip
+                        help="time budget of each image, which a shorter last pass fills (default: 20, unless "
+                             "--sweep)")  # fmt: skip
     effort.add_argument("--spp", type=positive(int), metavar="N",
                         help="samples per pixel of each image (default of sweeps over other parameters: "
                              f"{sweeps.DEFAULT_SPP})")  # fmt: skip

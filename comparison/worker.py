@@ -27,6 +27,7 @@ from .scene_files import SceneFile
 ROOT = Path(__file__).resolve().parent.parent
 TICK = 0.5  # seconds
 LONG_PASS = 60.0  # seconds; with given samples, a first pass longer than this is no longer rendered twice
+WARM_SPP = 4  # Mitsuba compiles other kernels for passes of fewer samples per pixel
 PASSES_IN_BUDGET = 5  # or about so many, unless even passes of one sample per pixel take longer
 UNUSED_PASSES = 2**31  # passes that are not in the image are numbered from here, so that they share no lights with it
 
@@ -176,9 +177,24 @@ def _measure(progressive, job):
     elif not kept:
         spp = job.pass_spp or _samples_of_a_pass(progressive, job.budget / PASSES_IN_BUDGET, unused)
         progressive.restart()
-        while not progressive.passes or progressive.seconds + progressive.passes[-1].seconds / 2 < job.budget:
-            progressive.render(spp)
+        following = spp
+        while following:
+            progressive.render(following)
+            following = _samples_that_fit(progressive, spp, job.budget)
     return cold, kept
+
+
+def _samples_that_fit(progressive, spp, budget):
+    """Return the samples per pixel of the next pass, 0 if the budget is used up: `spp`, or in the last pass as many as
+    there is time for. Fewer than `WARM_SPP` are not worth one, unless `spp` is; whether that many are still rendered is
+    decided by what is nearer to the budget."""
+    if progressive.passes[-1].spp < spp:
+        return 0
+    each, least = progressive.seconds / progressive.spp, min(spp, WARM_SPP)
+    left = (budget - progressive.seconds) / each
+    if left >= least:
+        return min(spp, int(left))
+    return least if left > least / 2 else 0
 
 
 def _samples_of_a_pass(progressive, seconds, seeds):
@@ -188,10 +204,10 @@ def _samples_of_a_pass(progressive, seconds, seeds):
     matter.
     """
     largest = largest_pass(progressive.pixels)
-    if largest < 4 or progressive.render(1, next(seeds)).seconds > seconds / 2:
+    if largest < WARM_SPP or progressive.render(1, next(seeds)).seconds > seconds / 2:
         return 1
-    spp = 4
-    progressive.render(spp, next(seeds))  # Mitsuba compiles other kernels for four samples and more
+    spp = WARM_SPP
+    progressive.render(spp, next(seeds))
     while spp < largest:
         growth = seconds / progressive.render(spp, next(seeds)).seconds
         if growth < 1.5:

@@ -285,37 +285,57 @@ def test_worker_measures_within_a_time_budget(tmp_path):
     assert result["parameters"] == {"max_depth": 3}
     assert 0.25 < result["seconds"]
     assert result["cold_seconds"] > 0 and result["warm_seconds"] > 0
-    assert result["spp"] == result["passes"] * result["pass_spp"]
+    assert (result["passes"] - 1) * result["pass_spp"] < result["spp"] <= result["passes"] * result["pass_spp"]
     assert result["peak_memory_bytes"] > 1e7
     assert result["rays_per_sample"] is None
     image, _, metadata = images.read_exr(tmp_path / "a.exr")
     assert image.shape == (16, 16, 3) and metadata["integrator"] == "path"
 
 
-class Recorded:
-    """A render that takes as long as it is told, and remembers which passes were asked for."""
+class Recorded(rendering.Progressive):
+    """A render that takes as long as it is told, by default a second a sample, and remembers what it was asked for."""
 
-    def __init__(self, first_seconds, pixels):
-        self.seconds_of_next, self.pixels, self.passes, self.seeds = [first_seconds], pixels, [], []
+    def __init__(self, pixels, *seconds):
+        self._pixels, self._seconds, self.asked = pixels, list(seconds), []
+        self.restart()
+
+    pixels = property(lambda self: self._pixels)
 
     def render(self, spp, seed=None):
-        self.seeds.append((spp, seed is not None))
-        self.passes.append(rendering.Pass(seed or 0, spp, self.seconds_of_next.pop() if self.seconds_of_next else 0.1))
+        self.asked.append((spp, seed is not None))
+        self.passes.append(rendering.Pass(seed or 0, spp, self._seconds.pop(0) if self._seconds else float(spp)))
         return self.passes[-1]
-
-    def restart(self):
-        self.passes = []
 
 
 def test_kernels_of_every_size_of_pass_are_compiled_before_the_clock_runs():
     job = worker.Job("p", "path", "s.xml", "a.exr", spp=19)
-    progressive = Recorded(2.0, rendering.MAXIMUM_PASS_SAMPLES // 9)
+    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 9, 2.0)
     assert worker._measure(progressive, job) == (2.0, False)
-    assert progressive.seeds == [(9, True), (1, True), (9, False), (9, False), (1, False)]
+    assert progressive.asked == [(9, True), (1, True), (9, False), (9, False), (1, False)]
     assert sum(one.spp for one in progressive.passes) == 19
-    progressive = Recorded(worker.LONG_PASS + 1, rendering.MAXIMUM_PASS_SAMPLES // 9)
+    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 9, worker.LONG_PASS + 1)
     assert worker._measure(progressive, job) == (worker.LONG_PASS + 1, True)  # too long to be rendered twice
-    assert progressive.seeds == [(9, True), (9, False), (1, False)]
+    assert progressive.asked == [(9, True), (9, False), (1, False)]
+
+
+@pytest.mark.parametrize(
+    ("budget", "pass_spp", "passes"),
+    [
+        (35, 10, [10, 10, 10, 5]),
+        (30, 10, [10, 10, 10]),
+        (33, 10, [10, 10, 10, 4]),  # 4 are nearer to 3 than none
+        (31, 10, [10, 10, 10]),
+        (4.9, 2, [2, 2]),
+        (5.6, 2, [2, 2, 2]),
+        (3.4, 1, [1, 1, 1]),
+        (12, 10, [10]),
+    ],
+)
+def test_the_last_pass_fills_the_budget(budget, pass_spp, passes):
+    progressive = Recorded(100)
+    worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget, pass_spp=pass_spp))
+    assert [one.spp for one in progressive.passes] == passes
+    assert abs(progressive.seconds - budget) <= min(pass_spp, worker.WARM_SPP) / 2
 
 
 def test_worker_that_dies_is_an_error(tmp_path, monkeypatch):
