@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from comparison.scene_files import SceneFile
+
 VARIANT = "llvm_ad_rgb"
 CORNELL = str(Path(__file__).resolve().parent.parent / "scenes" / "cornell.xml")
 SWEEP = [
@@ -46,6 +48,13 @@ def swept(tmp_path_factory, variant):
     out = tmp_path_factory.mktemp("sweep")
     assert compare.main([*SWEEP, "-o", str(out), "--cache", str(out / "cache")]) == 0
     return out
+
+
+def cornell(width=16, **defines):
+    """The Cornell box as a scene file."""
+    file = SceneFile(CORNELL, defines)
+    file.set_width(width)
+    return file
 
 
 def sensor(size=32, spp=4, **more):

@@ -1,0 +1,67 @@
+"""EXR and PNG files, tone mapping, false colours."""
+
+import numpy as np
+import pytest
+
+from comparison import images
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_exr_files_keep_channels_and_metadata(tmp_path, half):
+    image = np.random.default_rng(0).random((5, 7, 4))
+    metadata = {"spp": 4, "seconds": 1.5, "name": "path", "seed": 2**32 - 1, "parameters": {"a": 1}, "flag": True}
+    images.write_exr(tmp_path / "a.exr", image, ["R", "G", "B", "dd.T"], metadata, half)
+    read, channels, found = images.read_exr(tmp_path / "a.exr")
+    assert channels == ["B", "G", "R", "dd.T"]
+    np.testing.assert_allclose(images.colour(read, channels), image[..., :3], rtol=1e-3 if half else 1e-6)
+    np.testing.assert_allclose(read[..., 3], image[..., 3], rtol=1e-3 if half else 1e-6)
+    assert {key: found[key] for key in metadata} == metadata | {
+        "seed": "4294967295", "parameters": '{"a": 1}', "flag": "true",
+    }  # fmt: skip
+    assert [file.name for file in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_failed_write_leaves_the_old_file(tmp_path):
+    (tmp_path / "a.png").write_text("old")
+    with pytest.raises(RuntimeError), images.replacing(tmp_path / "a.png") as temporary:
+        temporary.write_text("new, but")
+        raise RuntimeError("disk full")
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("a.png", "old")]
+
+
+def test_tone_mapping():
+    rgb = np.zeros((20, 20, 3))
+    rgb[:2], rgb[2:4], rgb[4:] = 4.0, np.inf, 2.0
+    exposure = images.automatic_exposure(rgb)
+    assert exposure == pytest.approx(0.2)
+    mapped = images.tone_map(rgb, exposure)
+    assert mapped.dtype == np.uint8
+    assert mapped[0, 0, 0] == round(255 * (1.055 * 0.8 ** (1 / 2.4) - 0.055))
+    assert images.automatic_exposure(np.zeros((4, 4, 3))) == 1
+
+
+def test_false_colours_get_brighter_with_the_error():
+    errors = np.array([[0.0, 0.01, 0.05, 0.2, 0.7, 1.0, 50.0, np.nan]])
+    brightness = images.false_colours(errors).astype(int).sum(axis=-1)[0]
+    assert np.all(np.diff(brightness) >= 0)
+    assert brightness[0] == brightness[1] < brightness[2] < brightness[3] < brightness[4] < brightness[5]
+
+
+def test_false_colours_of_other_channels_span_their_scale():
+    colours = images.false_colours(np.array([[0.0, -1.0, 30.0, 300.0, 3000.0, np.inf, np.nan]]), (30, 3000))[0]
+    assert np.all(colours[:3] == images.FALSE_COLOURS[0]) and np.all(colours[4:] == images.FALSE_COLOURS[-1])
+    np.testing.assert_allclose(colours[3], images.FALSE_COLOURS[2:4].mean(axis=0), atol=1)  # the middle of the scale
+
+
+def test_scale_of_several_images_holds_all_and_ignores_grazed_pixels():
+    few, many = np.linspace(101.0, 201, 1000).reshape(20, 50), np.full((20, 50), 4000.0)
+    few[0, :5], few[1, :10], many[0, 0] = 1e-3, 0, np.inf
+    assert images.logarithmic_ends([few, many]) == (100, 4000)
+    assert images.logarithmic_ends([many, np.zeros((2, 2))]) == (2000, 4000)
+    assert images.logarithmic_ends([np.zeros((2, 2))]) == (1, 2)
+
+
+def test_colour_of_luminance_and_of_nothing():
+    assert images.colour(np.ones((2, 2, 1)), ["Y"]).shape == (2, 2, 3)
+    with pytest.raises(ValueError, match="no colour channels among depth"):
+        images.colour(np.ones((2, 2, 1)), ["depth"])
