@@ -107,7 +107,7 @@ def render(scene, options):
                 one = None
             if one is None:
                 return progressive, True
-            bar.update(size)
+            bar.update(one.spp)
     return progressive, False
 
 

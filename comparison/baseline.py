@@ -9,16 +9,19 @@ from pathlib import Path
 
 from . import analysis, curves
 from .command_line import UsageError
+from .report import FORMAT
 
 
 def read(path, metric, names):
-    """Return the content of a `results.json`. Raises UsageError if it is none, has no speed-ups to check, measures
-    another error than `metric`, or has none of the scenes of these names."""
+    """Return the content of a `results.json`. Raises UsageError if it is none, or of another format, has no speed-ups
+    to check, measures another error than `metric`, or has none of the scenes of these names."""
     try:
         results = json.loads(Path(path).read_text())
     except (OSError, ValueError) as error:
         raise UsageError(f"--check: '{path}' cannot be read: {error}") from None
-    if not isinstance(results, dict) or not list(_speed_ups(results)):
+    if not isinstance(results, dict) or results.get("format") != FORMAT:
+        raise UsageError(f"--check: '{path}' is no results.json of format {FORMAT}")
+    if not list(_speed_ups(results)):
         raise UsageError(f"--check: '{path}' has no speed-ups at equal error; make it with --sweep")
     if results["metrics"]["compared"] != metric:
         raise UsageError(f"--check: the errors of '{path}' are {results['metrics']['compared']}, not {metric}")

@@ -67,8 +67,10 @@ class Progress:
     def paused(self):
         """Something else, with a bar of its own, goes on in the block."""
         self._bar.clear()
-        yield
-        self._bar.refresh()
+        try:
+            yield
+        finally:
+            self._bar.refresh()
 
     def write(self, text):
         """Print text to the standard output, above the bar."""

@@ -156,8 +156,8 @@ def _continue(batches, progressive, spp, file, described):
             while batches.spp < spp or batches.count < 2:
                 progressive.restart()
                 progressive.render(batch_spp, pass_seed(progressive.seed, batches.count))
-                batches = batches.with_batch(images.colour(progressive.image, progressive.channels), batch_spp)
-                bar.update(batch_spp)
+                batches = batches.with_batch(images.colour(progressive.image, progressive.channels), progressive.spp)
+                bar.update(progressive.spp)
                 if time.monotonic() - saved > SAVE_SECONDS:
                     batches.write(file, described)
                     saved = time.monotonic()

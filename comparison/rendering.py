@@ -59,8 +59,9 @@ class Progressive:
     def render(self, spp, seed=None, accept=lambda: True):
         """Render one more pass of `spp` samples per pixel and return it (a `Pass`).
 
-        Its seed is `pass_seed(seed of the render, number of the pass)` unless `seed` is given. A pass that raises
-        leaves the average as it was, and so does one that `accept` refuses when it is finished (None is returned).
+        Samplers with strata round the samples up: the pass says how many they were. Its seed is `pass_seed(seed of the
+        render, number of the pass)` unless `seed` is given. A pass that raises leaves the average as it was, and so
+        does one that `accept` refuses when it is finished (None is returned).
         """
         seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
         begin = time.perf_counter()
@@ -68,6 +69,7 @@ class Progressive:
         dr.eval(image)
         dr.sync_thread()
         seconds = time.perf_counter() - begin
+        spp = self._sensor.sampler().sample_count()
         if not accept():
             return None
         # Not the image that `mi.render` returned: it lacks channels of nested integrators, and names.

@@ -113,6 +113,18 @@ def test_progressive_is_the_weighted_mean_of_its_passes():
     assert progressive.seconds > 0
 
 
+def test_passes_count_the_samples_that_were_taken():
+    """Mitsuba rounds them up for samplers that have strata, and says so in its log."""
+    file = cornell(max_depth="2")
+    file.set_sampler("ldsampler")
+    file.set_integrator("vpl", {"vpl_count": 10, "direct": "vpl"})
+    progressive = rendering.Progressive(file.load(), seed=0)
+    one, nine = progressive.render(1), progressive.render(9)
+    assert (one.spp, nine.spp, progressive.spp) == (4, 16, 20)
+    rays = nine.statistics["shadow_rays"] / one.statistics["shadow_rays"]
+    assert rays == pytest.approx(4, rel=0.05)  # as many more as samples
+
+
 def test_statistics_add_up():
     statistics = [
         {"shadow_rays": 3, "seconds": {"trace": 1.0}, "lights": {"omni": 7}},

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import compare
-from comparison import analysis, baseline, images, metrics, references, strip, tables
+from comparison import analysis, baseline, images, metrics, references, report, strip, tables
 from comparison.command_line import UsageError
 
 from .conftest import CORNELL, SWEEP
@@ -244,7 +244,7 @@ def fake_results(speed_up):
     ]  # fmt: skip
     scene = {"name": "box", "renders": renders}
     scene |= analysis.analyse(renders, ["path", "fast"], "relmse")
-    return {"metrics": {"compared": "relmse"}, "scenes": [scene]}
+    return {"format": report.FORMAT, "metrics": {"compared": "relmse"}, "scenes": [scene]}
 
 
 def test_single_points_are_not_compared_as_curves():
@@ -301,7 +301,11 @@ def test_check_refuses_what_cannot_be_compared(tmp_path):
         baseline.read(file, "relmse", ["other"])
     with pytest.raises(UsageError, match="are relmse, not rmse"):
         baseline.read(file, "rmse", ["box"])
-    file.write_text("{}")
+    for content in ("{}", "[]", '{"format": 1}'):
+        file.write_text(content)
+        with pytest.raises(UsageError, match=r"is no results\.json of format 2"):
+            baseline.read(file, "relmse", ["box"])
+    file.write_text(json.dumps(fake_results(5) | {"scenes": []}))
     with pytest.raises(UsageError, match="no speed-ups"):
         baseline.read(file, "relmse", ["box"])
 
