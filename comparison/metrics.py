@@ -86,11 +86,16 @@ def flip(image, reference):
     """Return the map of HDR-FLIP, (height, width) from 0 to 1, its mean, and the settings it was made with (a dict).
 
     How different the two look when flipped between, over the exposures at which the reference shows something; for 67
-    pixels per degree of the eye's view. Negative values and values that are not finite count as black.
+    pixels per degree of the eye's view. Negative values and values that are not finite count as black. The reference
+    must not be black.
     """
-    shown = [np.maximum(np.nan_to_num(one, posinf=0, neginf=0), 0).astype(np.float32) for one in (reference, image)]
+    # Of images that are as dark as 1e-7 FLIP finds no exposures, and ends the process; it does not depend on the scale.
+    scale = 1 / np.mean(reference, dtype=np.float64)
+    shown = [np.nan_to_num(scale * np.asarray(one, np.float64), posinf=0, neginf=0) for one in (reference, image)]
+    shown = [np.clip(one, 0, np.finfo(np.float32).max).astype(np.float32) for one in shown]
     values, mean, settings = flip_evaluator.evaluate(*shown, "HDR", applyMagma=False)
-    return np.clip(values[..., 0], 0, 1), float(mean), settings
+    stops = {key: settings[key] + float(np.log2(scale)) for key in ("startExposure", "stopExposure")}
+    return np.clip(values[..., 0], 0, 1), float(mean), settings | stops
 
 
 def _all_but_largest(values, fraction):

@@ -250,12 +250,13 @@ def main():
     job_file, result_file = map(Path, sys.argv[1:])
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        result = render(Job(**json.loads(job_file.read_text())))
+        result = json.dumps(render(Job(**json.loads(job_file.read_text()))), allow_nan=False)
+        status = 0
     except Exception as error:
-        result = {"error": explain(error), "traceback": traceback.format_exc()}
+        result, status = json.dumps({"error": explain(error), "traceback": traceback.format_exc()}), 1
     with images.replacing(result_file) as temporary:
-        temporary.write_text(json.dumps(result))
-    return 1 if "error" in result else 0
+        temporary.write_text(result)
+    return status
 
 
 if __name__ == "__main__":

@@ -125,3 +125,13 @@ def test_flip_sees_differences_and_nothing_else(reference):
     assert values[20:30, 10:20].mean() > 10 * values[45:].mean() and mean == pytest.approx(values.mean(), rel=1e-3)
     image[0, 0], image[1, 1] = np.nan, -1
     assert np.isfinite(metrics.flip(image, reference)[0]).all()
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-8, 1.0, 1e12])
+def test_flip_does_not_depend_on_the_scale(reference, scale):
+    image = 1.2 * reference
+    _, mean, settings = metrics.flip(image, reference)
+    _, scaled, exposures = metrics.flip(scale * image, scale * reference)
+    assert scaled == pytest.approx(mean, rel=1e-3) and mean > 0.01
+    assert exposures["startExposure"] == pytest.approx(settings["startExposure"] - np.log2(scale), abs=1e-3)
+    assert exposures["stopExposure"] == pytest.approx(settings["stopExposure"] - np.log2(scale), abs=1e-3)
