@@ -14,8 +14,8 @@ With --sweep every integrator is rendered with several values of its quality par
 report then has curves of error against time and against shadow rays, and what the same error costs.
 
 Times are wall-clock seconds of rendering alone. The first pass of each process is in no image, unless it alone takes
-longer than the budget. The first of all of an integrator begins with an empty kernel cache: it is the cold one, and
-reported apart. Runs of integrators take turns.
+longer than the budget, or a minute where samples are given. The first of all of an integrator begins with an empty
+kernel cache: it is the cold one, and reported apart. Runs of integrators take turns.
 comparison/metrics.py defines the errors.
 
 Ctrl-C leaves a report of what was finished; --resume goes on from there, also after a crash.
