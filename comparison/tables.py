@@ -57,11 +57,12 @@ def rows(scene):
 
 
 def _intervals(scene):
-    """Return the 95% intervals of errors as text, by title; none for single seeds."""
+    """Return the 95% intervals of errors as text, by title; none for single seeds, and for errors that the reference's
+    noise hides, as what is left of them says nothing."""
     found = {}
     for point in scene.get("points", []):
         low, high = point["error"]["low"], point["error"]["high"]
-        if low is not None:
+        if low is not None and not point["below_noise"]:
             found[f"{point['label']} {point['setting']}".strip()] = f"{number(low)} to {number(high)}"
     return found
 

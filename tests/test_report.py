@@ -129,7 +129,9 @@ def test_table_and_curves_agree_on_what_the_noise_hides():
                  "below_noise": []}}
             for seed, error in enumerate(errors)
         ]  # fmt: skip
-        (row,), (_, (point,)) = tables.rows({"renders": renders}), analysis.points(renders, metric)[0]
+        (row,) = tables.rows({"renders": renders} | analysis.analyse(renders, ["a"], metric))
+        ((_, (point,)), _) = analysis.points(renders, metric)
+        assert (row[tables.COLUMNS.index("95%")] == "") == (point.mean() is None)
         return row, point
 
     row, point = row_and_points("relmse", 1.0, 0.5, 1.4)
