@@ -61,7 +61,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
      * - sampling
        - |float|
        - How many rows are traced for each column in every round, of those where light would arrive: this fraction of
-         the rows of the largest slice. (Default: 0.01)
+         the rows that slices have on average. (Default: 0.01)
 
      * - prediction_error
        - |float|
@@ -191,7 +191,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
             slices = (begin, min(begin + _SLICES, rows.slices))
             part = columns.select(np.arange(*np.searchsorted(columns.piece, slices)))
             seed = derived_seed(job.seed, number)
-            count = min(math.ceil(self.sampling * rows.most), rows.most)
+            count = min(math.ceil(self.sampling * rows.count / rows.slices), rows.most)
             part, first = split_columns(work.entries, part, self.alpha, self.max_columns, count, seed)
             work.lap("columns")
             if part.count:
