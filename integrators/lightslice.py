@@ -68,9 +68,8 @@ class LightSliceIntegrator(ManyLightIntegrator):
 
      * - candidates
        - |int|
-       - Lights of a cluster, from as many sets, that are shaded at glossy points, and half as many at others; one is
-         drawn by what it would send, and traced. So fewer pixels are far too bright. At most ``sets`` are used.
-         (Default: 4)
+       - Lights of a cluster, from as many sets, that are shaded at glossy points; one is drawn by what it would send,
+         and traced. So fewer pixels are far too bright. At most ``sets`` are used. (Default: 4)
 
      {common parameters}
 
@@ -95,8 +94,8 @@ class LightSliceIntegrator(ManyLightIntegrator):
     of its column plus a share of its upper bound, and counts with its own colour: the image is that of all lights in
     expectation, and no light is lost because no row saw it. Rows of neighbours count less the farther away they are.
     Neighbouring pixels take different lights of a cluster (interleaved sampling), which makes noise of what would be
-    seams between slices; ``sets`` 1 is the paper's. Of several lights of a cluster one is traced (``candidates``;
-    resampled importance sampling). See :mod:`vpl.slices`, :mod:`vpl.light_matrix`,
+    seams between slices; ``sets`` 1 is the paper's. At glossy points one of several lights of a cluster is traced
+    (``candidates``; resampled importance sampling); at matt ones that gained less than it cost. See :mod:`vpl.slices`, :mod:`vpl.light_matrix`,
     :mod:`vpl.slice_columns`. Lambertian points and all others are in slices of their own.
 
     .. tabs::
@@ -165,7 +164,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
         """(Radiance, shadow rays, columns) of all points along the slices; ``entry``: the list of lights of each."""
         radiance = dr.zeros(mi.UnpolarizedSpectrum, clusters.count)
         traced, columns = dr.zeros(mi.UInt32, clusters.count), dr.zeros(mi.UInt32, clusters.count)
-        candidates = self.candidates if job.batch.proxy.glossy else max(self.candidates // 2, 1)
+        candidates = self.candidates if job.batch.proxy.glossy else 1
         for lights in chosen:
             first, last = (dr.gather(mi.UInt32, ends, entry) for ends in (lights.first, lights.last))
             columns += last - first
