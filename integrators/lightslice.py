@@ -96,7 +96,8 @@ class LightSliceIntegrator(ManyLightIntegrator):
     Neighbouring pixels take different lights of a cluster (interleaved sampling), which makes noise of what would be
     seams between slices; ``sets`` 1 is the paper's. At glossy points one of several lights of a cluster is traced
     (``candidates``; resampled importance sampling); at matt ones that gained less than it cost. See
-    :mod:`vpl.slices`, :mod:`vpl.light_matrix`, :mod:`vpl.slice_columns`. Lambertian points and all others are in slices of their own.
+    :mod:`vpl.slices`, :mod:`vpl.light_matrix`, :mod:`vpl.slice_columns`. Lambertian points and all others are in
+    slices of their own.
 
     .. tabs::
         .. code-tab:: xml
