@@ -109,6 +109,18 @@ def render(scene, integrator, spp=4, seed=0, **more):
     return np.array(mi.render(scene, integrator=plugin, spp=spp, seed=seed), dtype=np.float64)
 
 
+def render_with_statistics(name, scene, spp=1, seed=0, **more):
+    """An image by the plugin of a name, and the statistics of its render."""
+    plugin = mi.load_dict({"type": name, **more})
+    return render(scene, plugin, spp, seed), plugin.statistics
+
+
+def unit_vectors(rng, count):
+    """Directions all around, (count, 3) float32."""
+    vectors = rng.normal(size=(count, 3))
+    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+
+
 def relative_error(image, expected):
     """Sum of absolute differences over the sum of what is expected."""
     return np.abs(image - expected).sum() / expected.sum()

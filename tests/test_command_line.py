@@ -150,8 +150,16 @@ def test_message_of_an_integrator_is_not_hidden(capsys):
     assert "too many lights to count" in capsys.readouterr().err
 
 
+@pytest.fixture
+def interruptible():
+    """Ctrl-C is heard, also where the tests were started in the background of a script, which has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize(("interruptions", "passes"), [([3], 2), ([3, 3], 2), ([1], 0)])
-def test_interruption_writes_what_is_there(tmp_path, monkeypatch, capsys, interruptions, passes):
+def test_interruption_writes_what_is_there(tmp_path, monkeypatch, capsys, interruptible, interruptions, passes):
     """Ctrl-C comes during the pass of that number, once or twice."""
     calls, original = [], mi.render
 

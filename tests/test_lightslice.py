@@ -1,5 +1,6 @@
 """The integrator ``lightslice``: slices, columns of the light matrix and their costs, and images against ``vpl``."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import drjit as dr
@@ -26,6 +27,8 @@ from .conftest import (
     closed_box,
     relative_error,
     render,
+    render_with_statistics,
+    unit_vectors,
     wall,
 )
 from .test_lightcuts import many_kinds, prepared
@@ -33,16 +36,7 @@ from .test_pairs import batch_of, glossy_room
 
 NAME = "lightslice"
 
-
-def rendered(scene, spp=1, seed=0, **more):
-    """An image and the statistics of its render."""
-    plugin = mi.load_dict({"type": NAME, **more})
-    return render(scene, plugin, spp, seed), plugin.statistics
-
-
-def unit(rng, count):
-    vectors = rng.normal(size=(count, 3))
-    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+rendered = partial(render_with_statistics, NAME)
 
 
 # ---- Slices
@@ -58,7 +52,7 @@ def unit(rng, count):
 @settings(max_examples=80, deadline=None)
 def test_every_point_is_in_one_slice_and_there_are_as_many_as_asked_for(seed, count, slices, shape, scale):
     rng = np.random.default_rng(seed)
-    position, normal = rng.random((count, 3)), unit(rng, count)
+    position, normal = rng.random((count, 3)), unit_vectors(rng, count)
     if shape in ("one place", "two places"):
         position = np.zeros((count, 3)) + (shape == "two places") * rng.integers(0, 2, (count, 1))
         normal[:] = normal[0]
@@ -93,7 +87,7 @@ def test_slices_do_not_mix_what_faces_away_from_each_other():
 def test_points_of_a_slice_can_be_ranked():
     rng = np.random.default_rng(0)
     rank = rng.integers(0, 4, 500)
-    tree = build_slices(rng.random((500, 3)).astype(np.float32), unit(rng, 500), 9, rank=rank)
+    tree = build_slices(rng.random((500, 3)).astype(np.float32), unit_vectors(rng, 500), 9, rank=rank)
     assert all((np.diff(rank[tree.order[tree.leaf == leaf]]) >= 0).all() for leaf in tree.leaves)
 
 

@@ -1,5 +1,7 @@
 """The integrator ``matrixrecovery``: slices, columns, predictors, separation, and images against ``vpl``."""
 
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -23,7 +25,9 @@ from .conftest import (
     closed_box,
     relative_error,
     render,
+    render_with_statistics,
     sensor,
+    unit_vectors,
     wall,
 )
 from .test_lightcuts import many_kinds
@@ -34,16 +38,7 @@ SMALL = {"max_depth": 4, "vpl_count": 3000, "direct": "vpl"}
 # Every light a column of its own, every row traced
 EXACT = {"alpha": 0.0, "max_columns": 100_000, "sampling": 9.0}
 
-
-def rendered(scene, spp=1, seed=0, **more):
-    """An image and the statistics of its render."""
-    plugin = mi.load_dict({"type": NAME, **more})
-    return render(scene, plugin, spp, seed), plugin.statistics
-
-
-def unit(rng, count):
-    vectors = rng.normal(size=(count, 3))
-    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+rendered = partial(render_with_statistics, NAME)
 
 
 # ---- Slices of rows
@@ -60,7 +55,7 @@ def unit(rng, count):
 def test_every_point_is_in_one_slice_whose_rows_are_few_enough_and_whole(seed, pixels, samples, most, shape):
     rng = np.random.default_rng(seed)
     pixel = rng.permutation(np.repeat(np.arange(pixels), samples))
-    position, normal = rng.random((len(pixel), 3)).astype(np.float32), unit(rng, len(pixel))
+    position, normal = rng.random((len(pixel), 3)).astype(np.float32), unit_vectors(rng, len(pixel))
     if shape == "one place":
         position[:], normal[:] = position[0], normal[0]
     elif shape == "line":
