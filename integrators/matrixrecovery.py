@@ -85,7 +85,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
 
      * - density
        - |float|
-       - Share of errors around an entry, weighted by a Gaussian, from which on it is traced. (Default: 0.5)
+       - Share of errors around an entry, weighted by a Gaussian, from which on it is traced. (Default: 0.65)
 
      * - recover
        - |string|
@@ -117,7 +117,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
     channels, and every gather point is shaded exactly. Slices are halved at medians by the number of points
     (:mod:`vpl.slice_rows`). Clusters are split in rounds, and lend their samples to those beside them along the light
     tree (:mod:`vpl.reduced_columns`); ``alpha`` is a tenth of the paper's, with which slices have 200 columns here
-    rather than its 700; ``density`` is 0.5 instead of 0.2, for errors lie denser here. Rows that are traced follow each
+    rather than its 700; ``density`` is 0.65 instead of 0.2, for errors lie denser here. Rows that are traced follow each
     other by golden sections instead of being drawn at random (:mod:`vpl.visibility_samples`). Nearest rows are found by
     looking at all samples of a column, and the line of the linear predictor lies in the slice's plane
     (:mod:`vpl.visibility_prediction`). Where the separation of a slice fails, all entries of the columns in question
@@ -150,7 +150,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
         self.prediction = properties.boolean(props, "prediction", True)
         self.separation = properties.boolean(props, "separation", True)
         self.correction = properties.boolean(props, "correction", True)
-        self.density = properties.number(props, "density", 0.5, 0)
+        self.density = properties.number(props, "density", 0.65, 0)
         self.recover = properties.choice(props, "recover", "visibility", ("visibility", "light"))
         self.iterations = properties.integer(props, "iterations", 20, 1)
         self.rank = properties.integer(props, "rank", 32, 1)

@@ -40,7 +40,7 @@ class RecoveryOptions:
     prediction: bool = True
     separation: bool = True
     correction: bool = True
-    density: float = 0.5
+    density: float = 0.65
     recover: str = "visibility"
     limits: SeparationLimits = field(default_factory=SeparationLimits)
 
