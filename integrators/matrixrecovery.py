@@ -117,9 +117,9 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
     channels, and every gather point is shaded exactly. Slices are halved at medians by the number of points
     (:mod:`vpl.slice_rows`). Clusters are split in rounds, and lend their samples to those beside them along the light
     tree (:mod:`vpl.reduced_columns`); ``alpha`` is a tenth of the paper's, with which slices have 200 columns here
-    rather than its 700; ``density`` is 0.65 instead of 0.2, for errors lie denser here. Rows that are traced follow each
-    other by golden sections instead of being drawn at random (:mod:`vpl.visibility_samples`). Nearest rows are found by
-    looking at all samples of a column, and the line of the linear predictor lies in the slice's plane
+    rather than its 700; ``density`` is 0.65 instead of 0.2, for errors lie denser here. Rows that are traced follow
+    each other by golden sections instead of being drawn at random (:mod:`vpl.visibility_samples`). Nearest rows are
+    found by looking at all samples of a column, and the line of the linear predictor lies in the slice's plane
     (:mod:`vpl.visibility_prediction`). Where the separation of a slice fails, all entries of the columns in question
     are traced, and the slice is counted. Lambertian points and all others are in slices of their own.
 
