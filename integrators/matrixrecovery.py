@@ -101,9 +101,9 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
     lights of a slice send to its pixels is a matrix, most entries of which differ from those beside them only by smooth
     factors that need no shadow ray. So visibility is traced for a few percent of the entries and predicted for the
     others; what a predictor got wrong is found as that which does not fit a matrix of low rank, and traced as well.
-    It takes a tenth to a third of the shadow rays that tracing all entries would, which pays where these are dear:
-    dense meshes, masks, instances. Where they are cheap, :ref:`lightslice <integrator-lightslice>` and
-    :ref:`mdlightcuts <integrator-mdlightcuts>` are faster at the same error.
+    It takes about a tenth of the shadow rays that tracing all entries would. Predicting an entry costs as much as a few
+    rays in scenes of moderate size, though: unless a ray takes microseconds, :ref:`lightslice <integrator-lightslice>`
+    and :ref:`mdlightcuts <integrator-mdlightcuts>` are faster at the same error.
 
     {what is estimated}
 
