@@ -4,7 +4,7 @@ First every entry that was not traced is predicted, column by column; then the m
 rank and sparse errors; and where errors lie dense, entries are traced after all.
 
 Departure from the paper: what is separated is visibility, V, rather than light, E V (``recover`` says which).  E needs
-no recovering, and makes the rank higher: separated light errs more than what was predicted (benchmarks/matrixrecovery.py).
+no recovering, and makes the rank higher: separated light errs more than predictions (benchmarks/matrixrecovery.py).
 And what is recovered is D − Z, not XY, so that entries in which no error was found stay what they are.
 """
 
