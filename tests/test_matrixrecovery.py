@@ -15,8 +15,7 @@ from vpl.matrix_separation import Separation, SeparationLimits, separate, sketch
 from vpl.point_clusters import PointClusters
 from vpl.reduced_columns import _nearby_largest
 from vpl.reduced_matrix import MatrixRows
-from vpl.slice_rows import build_row_slices, rows_of, tangent_places
-from vpl.visibility_samples import _golden_steps
+from vpl.slice_rows import build_row_slices, golden_steps, rows_of, tangent_places
 
 from .conftest import (
     area_light,
@@ -102,7 +101,7 @@ def test_places_in_the_plane_of_a_slice_keep_distances():
 
 def test_steps_of_samples_visit_every_row_once():
     counts = np.arange(1, 1100)
-    steps = _golden_steps(counts)
+    steps = golden_steps(counts)
     for count, step in zip(counts, steps, strict=True):
         assert len(np.unique(np.arange(count) * step % count)) == count
 

@@ -31,12 +31,9 @@ class MatrixBlock:
         self.counts = np.stack([number, rows], axis=1)
         self.shape = (self.slices, max(int(number.max()), 1), int(rows.max()))
         self.slot = piece * self.shape[1] + np.arange(columns.count) - self._first[piece]
-        trees, scale = [group.tree for group in entries.lights.groups], np.zeros(columns.count)
+        scale = np.zeros(columns.count)
         for group, index in entries.by_group(columns):
-            node, light = (upload(mi.UInt32, values[index]) for values in (columns.node, columns.light))
-            whole, own = trees[columns.group[index[0]]].summed_intensity(node), group.lights.gather(light).intensity
-            ratio = whole / channel_mean(own)
-            scale[index] = download(ratio)
+            scale[index] = download(group.representatives(upload(mi.UInt32, columns.node[index]))[1])
         self.scale, self.light = upload(mi.Float, scale), upload(mi.UInt32, columns.light)
 
     @property
@@ -71,7 +68,7 @@ class MatrixBlock:
         return matrix
 
     def trace(self, visibility, wanted, number) -> None:
-        """Replace V of the entries in ``wanted`` (UInt32, sorted places) by what a ray finds, where any light arrives.
+        """Replace V of the entries in ``wanted`` (UInt32, places) by what a ray finds, where any light arrives.
 
         ``visibility``: Float, of all entries; ``number``: draws the points of rows.
         """

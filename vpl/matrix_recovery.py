@@ -21,7 +21,6 @@ from .arrays import download, upload
 from .matrix_block import MatrixBlock
 from .matrix_separation import Separation, SeparationLimits, separate
 from .visibility_prediction import Predictors
-from .visibility_samples import VisibilitySamples
 
 # The Gaussian of the density of errors: 7 × 7 entries [MSR 6.2]
 _TAPS, _SIGMA = 7, 1.5
@@ -82,7 +81,7 @@ def recover(
     lap("prediction")
     found = Recovered(block.unoccluded(), predicted, traced, mi.Float(predicted))
     lap("shading")
-    mixed = _mixed_columns(predictors.samples, first, block.columns.count) if options.separation else []
+    mixed = _mixed_columns(predictors, first, block.columns.count) if options.separation else []
     if len(mixed):
         wanted = _separate(found, block, mixed, options, seed)
         lap("separation")
@@ -92,10 +91,10 @@ def recover(
     return found
 
 
-def _mixed_columns(samples: VisibilitySamples, first: int, count: int) -> np.ndarray:
+def _mixed_columns(predictors: Predictors, first: int, count: int) -> np.ndarray:
     """Which of ``count`` columns have samples that differ: the others have nothing that could be told apart."""
-    lit, number = (download(values)[first : first + count] for values in samples.totals())
-    return np.flatnonzero((lit > _LEAST_ERROR) & (lit < number - _LEAST_ERROR))
+    sums = (download(values)[first : first + count] for values in (predictors.in_light, predictors.in_shadow))
+    return np.flatnonzero(np.minimum(*sums) > _LEAST_ERROR)
 
 
 def _separate(found: Recovered, block: MatrixBlock, mixed: np.ndarray, options: RecoveryOptions, seed: int):

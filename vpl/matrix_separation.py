@@ -133,19 +133,19 @@ class _State:
 
     def __init__(self, whole, free, weight, shape):
         self._whole, self._free, self._weight, self._shape = whole, free, weight, shape
-        count, n, m = shape
-        size = count * n * m
-        self.error, self._multiplier, self._target = (dr.zeros(mi.Float, size) for _ in range(3))
-        mean = dr.block_sum(dr.abs(whole), m)
-        entries = dr.block_sum(dr.select(weight > 0, mi.Float(1), 0), m)
-        loose = dr.block_sum(dr.select(self._loose(), mi.Float(1), 0), m)
-        dr.eval(self.error, self._multiplier, mean, entries, loose)
-        mean, entries, self._number = (
-            download(x).reshape(count, n).sum(1, dtype=np.float64) for x in (mean, entries, loose)
-        )
+        self.error, self._multiplier = (dr.zeros(mi.Float, dr.width(whole)) for _ in range(2))
+        dr.eval(self.error, self._multiplier)
+        ones = [dr.select(mask, mi.Float(1), 0) for mask in (weight > 0, self._loose())]
+        rows = [dr.block_sum(values, shape[2]) for values in (dr.abs(whole), *ones)]
+        dr.eval(rows)
+        total, entries, self._number = (self._per_matrix(sums) for sums in rows)
         # The penalty makes entries shrink by the mean entry [SWZ]
-        self._threshold = np.divide(mean, entries, out=np.zeros(count), where=entries > 0)
+        self._threshold = np.divide(total, entries, out=np.zeros(len(total)), where=entries > 0)
         self._target = mi.Float(whole)
+
+    def _per_matrix(self, sums) -> np.ndarray:
+        """Sums over each matrix, (s,) float64, from those over its rows."""
+        return download(sums).reshape(self._shape[:2]).sum(1, dtype=np.float64)
 
     def _loose(self):
         return self._free & (self._weight > 0)
@@ -162,9 +162,7 @@ class _State:
         lane = dr.arange(mi.UInt32, count * n * m) // dr.opaque(mi.UInt32, n * m)
         threshold, live = (dr.gather(mi.Float, upload(mi.Float, x), lane) for x in (self._threshold, live))
         normalized = self._normalized(product, threshold)
-        squares = dr.block_sum(dr.select(self._loose(), dr.square(normalized), 0), m)
-        dr.eval(squares)
-        squares = download(squares).reshape(count, n).sum(1, dtype=np.float64)
+        squares = self._per_matrix(dr.block_sum(dr.select(self._loose(), dr.square(normalized), 0), m))
         # On the sphere of equation 12
         scale = np.sqrt(np.divide(self._number, squares, out=np.ones(count), where=squares > 0))
         scale = dr.gather(mi.Float, upload(mi.Float, scale), lane)
@@ -179,7 +177,7 @@ class _State:
         self._target = self._whole - self.error - self._multiplier
         left = dr.block_sum(dr.square(rest), m)
         dr.eval(self.error, self._multiplier, self._target, left)
-        return np.sqrt(download(left).reshape(count, n).sum(1, dtype=np.float64))
+        return np.sqrt(self._per_matrix(left))
 
     def _sign(self):
         """An entry that was taken to arrive is too large if it is wrong, the others too small."""

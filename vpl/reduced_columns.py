@@ -75,18 +75,17 @@ def split_columns(
 
     ``count``: samples of every column.  Returns the columns whose representatives may send anything, and their samples.
     """
-    trees = [group.tree.records() for group in entries.lights.groups]
     largest, samples = entries.largest(columns), VisibilitySamples.first(entries, columns, count, seed)
     while True:
-        gamma = _largest_contributions(columns, trees, largest, samples.values)
-        split = _to_split(columns, trees, gamma, alpha, most)
+        records = _records(entries, columns)
+        gamma = _largest_contributions(columns, records[:, INTENSITY], largest, samples.values)
+        inner = records.view(np.uint32)[:, ESCAPE] > columns.node + 1
+        split = _to_split(columns, inner, gamma, alpha, most)
         if not len(split):
             lit = np.flatnonzero(largest > 0)
             return columns.select(lit), samples.select(lit)
-        kept, (children, parents) = (
-            np.delete(np.arange(columns.count), split),
-            _children(entries, columns, trees, split),
-        )
+        kept = np.delete(np.arange(columns.count), split)
+        children, parents = _children(entries, columns, split)
         # What was found out about a light holds for the child that keeps it
         other = np.flatnonzero(children.light != columns.light[parents])
         source = np.concatenate([kept, parents])
@@ -98,10 +97,19 @@ def split_columns(
         largest, samples = largest[order], samples.select(order)
 
 
-def _children(entries: MatrixEntries, columns: Columns, trees: list, split: np.ndarray):
+def _records(entries: MatrixEntries, columns: Columns) -> np.ndarray:
+    """The records of the nodes of all columns: see :class:`vpl.light_tree.LightTree`."""
+    found = np.zeros((columns.count, entries.records[0].shape[1]), np.float32)
+    for number, records in enumerate(entries.records):
+        inside = columns.group == number
+        found[inside] = records[columns.node[inside]]
+    return found
+
+
+def _children(entries: MatrixEntries, columns: Columns, split: np.ndarray):
     """The two children of every cluster to be split, and its number among the columns."""
     parts, parents = [], []
-    for number, records in enumerate(trees):
+    for number, records in enumerate(entries.records):
         inside = split[columns.group[split] == number]
         first = columns.node[inside] + 1
         second = records.view(np.uint32)[first, ESCAPE].astype(np.int64)
@@ -111,15 +119,11 @@ def _children(entries: MatrixEntries, columns: Columns, trees: list, split: np.n
     return reduce(Columns.joined, parts), np.concatenate(parents)
 
 
-def _largest_contributions(columns: Columns, trees: list, largest: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _largest_contributions(columns: Columns, intensity: np.ndarray, largest: np.ndarray, values: np.ndarray):
     """Γ of every column [MSR equation 7], (c,) float64."""
-    intensity = np.zeros(columns.count)
-    for number, records in enumerate(trees):
-        inside = columns.group == number
-        intensity[inside] = records[columns.node[inside], INTENSITY]
     known = values >= 0
     seen = np.where(known, values, 0).max(1).astype(np.float64)
-    segment = columns.piece * len(trees) + columns.group
+    segment = columns.segment
     near_seen = _nearby_largest(seen, segment)
     # Where no sample says anything, all may arrive
     near_seen[_nearby_largest(known.any(1).astype(np.float64), segment) == 0] = 1
@@ -136,13 +140,11 @@ def _nearby_largest(values: np.ndarray, segment: np.ndarray) -> np.ndarray:
     return result
 
 
-def _to_split(columns: Columns, trees: list, gamma: np.ndarray, alpha: float, most: int) -> np.ndarray:
-    """Which columns are too large [MSR equation 8], and can be split without having more than ``most`` in a slice."""
-    inner = np.zeros(columns.count, bool)
-    for number, records in enumerate(trees):
-        inside = np.flatnonzero(columns.group == number)
-        node = columns.node[inside]
-        inner[inside] = records.view(np.uint32)[node, ESCAPE] > node + 1
+def _to_split(columns: Columns, inner: np.ndarray, gamma: np.ndarray, alpha: float, most: int) -> np.ndarray:
+    """Which columns are too large [MSR equation 8], and can be split without having more than ``most`` in a slice.
+
+    ``inner``: which of them are of several lights.
+    """
     threshold = alpha * np.bincount(columns.piece, gamma)
     over = np.flatnonzero(inner & (gamma > threshold[columns.piece]))
     room = most - np.bincount(columns.piece)

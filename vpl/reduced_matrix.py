@@ -17,7 +17,7 @@ from .evaluation import probe_visibility, unoccluded
 from .gather import SceneTraits
 from .light_set import LightGroup, LightSet
 from .point_clusters import PointClusters, unit_or_up
-from .slice_rows import rows_of, tangent_places
+from .slice_rows import golden_steps, rows_of, tangent_places
 
 
 class MatrixRows:
@@ -39,10 +39,11 @@ class MatrixRows:
         self.points, self.shown = upload(mi.UInt32, begin), upload(mi.UInt32, shown)
         self._begin = upload(mi.UInt32, self.first)
         self._row = upload(mi.UInt32, np.repeat(np.arange(self.count), size))
-        self._slice = upload(mi.UInt32, np.repeat(np.arange(self.slices), np.diff(self.first)))
+        slice_of_row = np.repeat(np.arange(self.slices), np.diff(self.first))
+        self._slice = upload(mi.UInt32, slice_of_row)
+        self._step = upload(mi.UInt32, golden_steps(np.diff(self.first)))
         surfaces = (clusters.batch.position, unit_or_up(clusters.batch.normal))
         position, normal = (download(values)[shown] for values in surfaces)
-        slice_of_row = np.repeat(np.arange(self.slices), np.diff(self.first))
         places = tangent_places(position, normal, self.first[:-1], slice_of_row)
         self.places = [upload(mi.Float, column) for column in places]
 
@@ -55,6 +56,10 @@ class MatrixRows:
         """(First row, number of rows) of slices."""
         first = dr.gather(mi.UInt32, self._begin, piece)
         return first, dr.gather(mi.UInt32, self._begin, piece + 1) - first
+
+    def step(self, piece):
+        """By how many rows, around the end, the samples of a column of slices follow each other."""
+        return dr.gather(mi.UInt32, self._step, piece)
 
     def row_of(self, point):
         """The row of points along the tree."""
@@ -97,6 +102,11 @@ class Columns:
         """Number of columns."""
         return len(self.piece)
 
+    @property
+    def segment(self) -> np.ndarray:
+        """A number for every slice and group, (c,): columns that have the same follow each other along one tree."""
+        return self.piece * (self.group.max(initial=0) + 1) + self.group
+
     def select(self, index: np.ndarray) -> Columns:
         """Some of the columns."""
         return Columns(*(column[index] for column in (self.piece, self.group, self.node, self.light)))
@@ -122,6 +132,8 @@ class MatrixEntries:
 
     def __init__(self, scene, traits: SceneTraits, lights: LightSet, rows: MatrixRows):
         self._scene, self._traits, self.lights, self.rows, self.rays = scene, traits, lights, rows, 0
+        # Of the light trees, of NumPy
+        self.records = [group.tree.records() for group in lights.groups]
 
     def columns_of(self, piece, group: int, node) -> Columns:
         """Columns with the representatives of some nodes."""

@@ -104,3 +104,11 @@ def tangent_places(position, normal, first: np.ndarray, number: np.ndarray) -> n
     places -= np.minimum.reduceat(places, first, axis=1)[:, number]
     extent = np.maximum.reduceat(places, first, axis=1).max(0)
     return places / np.where(extent > 0, extent, 1)[number]
+
+
+def golden_steps(counts: np.ndarray) -> np.ndarray:
+    """For each count the number nearest below its golden section that has no divisor in common with it."""
+    steps = np.maximum(np.round(counts * (0.5 * (5**0.5 - 1))).astype(np.int64), 1)
+    while (common := np.gcd(steps, counts) > 1).any():
+        steps[common] -= 1
+    return steps

@@ -31,21 +31,22 @@ _RIDGE = 1e-3
 class Predictors:
     """The three predictors of some columns, as their samples are now.
 
-    ``kinds``: which of them may be used.
+    ``kinds``: which of them may be used; ``in_light``, ``in_shadow``: Float, the sums of V and 1 − V over the samples
+    of each column.
     """
 
     def __init__(self, samples: VisibilitySamples, kinds: tuple[int, ...] = (NEAREST, LINEAR, BAYES)):
         self.samples, self.kinds = samples, kinds
         columns = samples.columns
-        segment = columns.piece * (columns.group.max(initial=0) + 1) + columns.group
+        segment = columns.segment
         number = np.arange(columns.count)
         first, last = np.searchsorted(segment, segment), np.searchsorted(segment, segment, side="right")
         self._first = upload(mi.UInt32, np.maximum(number - _BESIDE, first))
         self._last = upload(mi.UInt32, np.minimum(number + _BESIDE + 1, last))
         self._piece = upload(mi.UInt32, columns.piece)
         self._line = [dr.zeros(mi.Float, columns.count) for _ in range(3)]
-        self._in_light, self._in_shadow = (dr.zeros(mi.Float, columns.count) for _ in range(2))
-        dr.eval(self._line, self._in_light, self._in_shadow)
+        self.in_light, self.in_shadow = (dr.zeros(mi.Float, columns.count) for _ in range(2))
+        dr.eval(self._line, self.in_light, self.in_shadow)
         self.learn(number)
 
     def learn(self, index: np.ndarray) -> None:
@@ -54,9 +55,9 @@ class Predictors:
         line, lit, number = self._fit(column)
         for target, value in zip(self._line, line, strict=True):
             dr.scatter(target, value, column)
-        dr.scatter(self._in_light, lit, column)
-        dr.scatter(self._in_shadow, mi.Float(number) - lit, column)
-        dr.eval(self._line, self._in_light, self._in_shadow)
+        dr.scatter(self.in_light, lit, column)
+        dr.scatter(self.in_shadow, mi.Float(number) - lit, column)
+        dr.eval(self._line, self.in_light, self.in_shadow)
 
     def predict(self, kind: int, column, row, draw):
         """V of some rows of some columns, Float: 0 or 1, or between where it was traced so.
@@ -97,17 +98,10 @@ class Predictors:
     @dr.syntax
     def _fit(self, column):
         """(Three coefficients of the line, sum of V, number) of the samples of columns [MSR equation 9]."""
-        begin, count = (
-            column * dr.opaque(mi.UInt32, self.samples.most),
-            dr.gather(mi.UInt32, self.samples.number, column),
-        )
-        width = dr.width(column)
-        matrix, right, lit, k = (
-            dr.zeros(mi.Matrix3f, width),
-            dr.zeros(mi.Vector3f, width),
-            dr.zeros(mi.Float, width),
-            mi.UInt32(0),
-        )
+        begin = column * dr.opaque(mi.UInt32, self.samples.most)
+        count, k = dr.gather(mi.UInt32, self.samples.number, column), mi.UInt32(0)
+        matrix, right = (dr.zeros(kind, dr.width(column)) for kind in (mi.Matrix3f, mi.Vector3f))
+        lit = dr.zeros(mi.Float, dr.width(column))
         while dr.hint(k < count, exclude=[self, begin, column]):
             value = dr.gather(mi.Float, self.samples.value, begin + k)
             u, v = (dr.gather(mi.Float, side, begin + k) for side in (self.samples.x, self.samples.y))
@@ -136,9 +130,9 @@ class Predictors:
         width = dr.width(column)
         light, shadow, row_light, row_shadow = (dr.full(mi.Float, _PRIOR, width) for _ in range(4))
         while dr.hint(j < end, exclude=[self, row]):
-            light += dr.gather(mi.Float, self._in_light, j)
-            shadow += dr.gather(mi.Float, self._in_shadow, j)
-            seen, lit = self.samples.at(j, row, True)
+            light += dr.gather(mi.Float, self.in_light, j)
+            shadow += dr.gather(mi.Float, self.in_shadow, j)
+            seen, lit = self.samples.at(j, row)
             row_light += mi.Float(lit)
             row_shadow += mi.Float(seen - lit)
             j += 1

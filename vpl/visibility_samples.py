@@ -50,7 +50,6 @@ class VisibilitySamples:
     def __init__(self, entries: MatrixEntries, columns: Columns, most: int, seed: int):
         self.entries, self.columns, self.most, self._seed = entries, columns, most, seed
         self._piece, self._light = (upload(mi.UInt32, values) for values in (columns.piece, columns.light))
-        self._step = upload(mi.UInt32, _golden_steps(np.diff(entries.rows.first))[columns.piece])
         self._words, count = -(-entries.rows.most // _WORD), columns.count
         self.number, self._next = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
         self.row = dr.zeros(mi.UInt32, count * most)
@@ -91,7 +90,7 @@ class VisibilitySamples:
     @dr.syntax
     def _draw_rows(self, group: LightGroup, column, found, target, count):
         piece, number = dr.gather(mi.UInt32, self._piece, column), dr.gather(mi.UInt32, self._light, column)
-        light, step = group.lights.gather(number), dr.gather(mi.UInt32, self._step, column)
+        light, step = group.lights.gather(number), self.entries.rows.step(piece)
         first, rows = self.entries.rows.range(piece)
         start, _ = mi.sample_tea_32(number, piece ^ dr.opaque(mi.UInt32, self._seed))
         # The lanes that fill a kernel's last packet divide too, and find zeros
@@ -147,29 +146,9 @@ class VisibilitySamples:
         dr.scatter(self.number, number, column)
         dr.eval(self.number, self.row, self.x, self.y, self.value, self._seen, self._lit)
 
-    @dr.syntax
-    def totals(self):
-        """(Sum of V, number) of the samples of every column, Float both."""
-        begin = dr.arange(mi.UInt32, self.columns.count) * dr.opaque(mi.UInt32, self.most)
-        lit, k = dr.zeros(mi.Float, self.columns.count), mi.UInt32(0)
-        while dr.hint(k < self.number, exclude=[self, begin]):
-            lit += dr.gather(mi.Float, self.value, begin + k)
-            k += 1
-        number = mi.Float(self.number)
-        dr.eval(lit, number)
-        return lit, number
-
-    def at(self, column, row, active):
+    def at(self, column, row):
         """(Whether a row was traced, whether light arrived there) for some columns and rows of their slices."""
         word = column * dr.opaque(mi.UInt32, self._words) + (row >> 5)
         bit = row & 31
-        seen, lit = (dr.gather(mi.UInt32, bits, word, active) >> bit & 1 for bits in (self._seen, self._lit))
+        seen, lit = (dr.gather(mi.UInt32, bits, word) >> bit & 1 for bits in (self._seen, self._lit))
         return seen, lit
-
-
-def _golden_steps(counts: np.ndarray) -> np.ndarray:
-    """For each count the number nearest below its golden section that has no divisor in common with it."""
-    steps = np.maximum(np.round(counts * (0.5 * (5**0.5 - 1))).astype(np.int64), 1)
-    while (common := np.gcd(steps, counts) > 1).any():
-        steps[common] -= 1
-    return steps
