@@ -133,7 +133,8 @@ class Problem:
         return Found(seconds, rmse / self.mean, absolute / self.mean, rays, cut, stages, counts)
 
     def quality_for(self, method: str, wanted: float, measure: str = "absolute", **more):
-        """The value of a method's parameter that came nearest to a mean absolute error, or to so many ``rays``.
+        """The value of a method's parameter that came nearest to a mean absolute error, or to so many ``rays``, and the
+        run with it.
 
         ``more``: other properties.
         """
@@ -141,18 +142,27 @@ class Problem:
         power = quality.power if measure == "absolute" else -np.sign(quality.power)
         value, tried = quality.rounded(quality.guess), []
         for _ in range(_TRIES):
-            reached = getattr(self.shade(self.plugin(method, **{quality.name: value}, **more)), measure)
-            tried.append((abs(np.log(reached / wanted)), value))
+            found = self.shade(self.plugin(method, **{quality.name: value}, **more))
+            reached = getattr(found, measure)
+            tried.append((abs(np.log(reached / wanted)), value, found))
             if tried[-1][0] < _NEAR:
                 break
             step = float(np.clip((wanted / reached) ** (1 / power), 0.2, 5))
             value = quality.rounded(value * step)
-            if any(value == before for _, before in tried):
+            if any(value == before for _, before, _ in tried):
                 break
-        return min(tried)[1]
+        return min(tried, key=lambda one: one[:2])[1:]
+
+    def interleaved(self, plugins: dict) -> dict:
+        """The median run of each plugin; they take turns, warm."""
+        runs: dict = {name: [] for name in plugins}
+        for _ in range(RUNS):
+            for name, plugin in plugins.items():
+                runs[name].append(self.shade(plugin))
+        return {name: _median(found) for name, found in runs.items()}
 
 
-def median(runs: list[Found]) -> Found:
+def _median(runs: list[Found]) -> Found:
     return sorted(runs, key=lambda one: one.seconds)[len(runs) // 2]
 
 
@@ -189,13 +199,9 @@ def equal_errors(names, width: int, samples: int, points: int, methods) -> None:
     for name in names:
         problem = Problem(name, samples, width, points)
         target = problem.shade(problem.plugin("lightcuts")).absolute
-        chosen = {"lightcuts": 0.01} | {method: problem.quality_for(method, target) for method in methods}
+        chosen = {"lightcuts": 0.01} | {method: problem.quality_for(method, target)[0] for method in methods}
         plugins = {one: problem.plugin(one, **{QUALITY[one].name: value}) for one, value in chosen.items()}
-        runs: dict = {one: [] for one in plugins}
-        for _ in range(RUNS):
-            for one, plugin in plugins.items():
-                runs[one].append(problem.shade(plugin))
-        middle = {one: median(found) for one, found in runs.items()}
+        middle = problem.interleaved(plugins)
         for one, found in middle.items():
             speedup = middle["lightcuts"].seconds / found.seconds
             print(
@@ -232,7 +238,7 @@ def growth(names, options) -> None:
             problem = Problem(name, samples, options.width, options.points)
             plugin = problem.plugin("mdlightcuts")
             problem.shade(plugin)
-            found = median([problem.shade(plugin) for _ in range(RUNS)])
+            found = _median([problem.shade(plugin) for _ in range(RUNS)])
             base = base or found.seconds
             time = f"{found.seconds:.2f}" if samples == 1 else f"{found.seconds / base:.1f}"
             shown.append(f"{time}, {found.rays:.0f}")

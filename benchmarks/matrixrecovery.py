@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 mi.set_variant("llvm_ad_rgb")
 
 from benchmarks import scenes  # noqa: E402
-from benchmarks.baselines import QUALITY, RUNS, VPLS, Found, Problem, median  # noqa: E402
+from benchmarks.baselines import QUALITY, VPLS, Found, Problem  # noqa: E402
 
 METHOD = "matrixrecovery"
 # With other properties that suit images of this size; of several, those that take the fewest rays for the same error
@@ -58,17 +58,6 @@ def _rate(found: Found, pixels: int) -> float:
     return found.rays * pixels / found.counts["entries"]
 
 
-def _interleaved(problem: Problem, plugins: dict) -> dict:
-    """The median run of each plugin."""
-    runs: dict = {name: [] for name in plugins}
-    for plugin in plugins.values():
-        problem.shade(plugin)
-    for _ in range(RUNS):
-        for name, plugin in plugins.items():
-            runs[name].append(problem.shade(plugin))
-    return {name: median(found) for name, found in runs.items()}
-
-
 def table(names, options) -> None:
     """Part "table"."""
     print(f"\n## equal error and equal rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
@@ -79,12 +68,13 @@ def table(names, options) -> None:
         plugins = {METHOD: problem.plugin(METHOD)}
         ours = problem.shade(plugins[METHOD])
         for other in OTHERS:
-            best = min((_at_equal_error(problem, other, ours, settings) for settings in OTHERS[other]), key=_rays)
-            value = problem.quality_for(other, ours.rays, "rays", **best[1])
-            for measure, quality in (("error", best[2]), ("rays", value)):
-                label = f"{other}, equal {measure}: {QUALITY[other].show(quality)} {best[1] or ''}"
-                plugins[label] = problem.plugin(other, **{QUALITY[other].name: quality}, **best[1])
-        found = _interleaved(problem, plugins)
+            tried = [(more, *problem.quality_for(other, ours.absolute, **more)) for more in OTHERS[other]]
+            more, quality, _ = min(tried, key=lambda one: one[2].rays)
+            at_rays, _ = problem.quality_for(other, ours.rays, "rays", **more)
+            for measure, value in (("error", quality), ("rays", at_rays)):
+                label = f"{other}, equal {measure}: {QUALITY[other].show(value)} {more or ''}"
+                plugins[label] = problem.plugin(other, **{QUALITY[other].name: value}, **more)
+        found = problem.interleaved(plugins)
         ours = found[METHOD]
         for label, one in found.items():
             _show(name, label, one, ours, problem)
@@ -95,16 +85,6 @@ def table(names, options) -> None:
     for method, pairs in ratios.items():
         rays, seconds = (scenes.geometric_mean(values) for values in zip(*pairs, strict=True))
         print(f"geometric means over {method}: {rays:.2f} times fewer rays, {seconds:.2f} times faster")
-
-
-def _at_equal_error(problem: Problem, other: str, ours: Found, settings: dict) -> tuple[float, dict, float]:
-    """(Rays per pixel, settings, quality) of a method where its error is ours."""
-    quality = problem.quality_for(other, ours.absolute, **settings)
-    return problem.shade(problem.plugin(other, **{QUALITY[other].name: quality}, **settings)).rays, settings, quality
-
-
-def _rays(found: tuple) -> float:
-    return found[0]
 
 
 def _show(name: str, label: str, one: Found, ours: Found, problem: Problem) -> None:

@@ -79,7 +79,7 @@ MATTER = {
 }  # fmt: skip
 
 
-def renders_well(description, name, least=0.1):
+def assert_renders_well(description, name, least=0.1):
     """Render by a plugin of the catalogue: finite, not negative, and hardly darker than the good lamp makes it."""
     found = render(mi.load_dict(description), mi.load_dict(plugin(name, max_depth=3)), 2)
     assert np.isfinite(found).all()
@@ -95,7 +95,7 @@ def _cases(sources, values):
 @pytest.mark.parametrize(("source", "value"), _cases(LIGHTS | MATTER, QUICK))
 @pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])
 def test_a_bad_value_spoils_nothing_else(name, source, value):
-    renders_well((LIGHTS | MATTER)[source](BAD[value]), name)
+    assert_renders_well((LIGHTS | MATTER)[source](BAD[value]), name)
 
 
 @pytest.mark.stress
@@ -103,7 +103,7 @@ def test_a_bad_value_spoils_nothing_else(name, source, value):
 @pytest.mark.parametrize(("source", "value"), _cases(LIGHTS | MATTER, BAD))
 @pytest.mark.parametrize("name", PLUGINS)
 def test_no_bad_value_spoils_any_plugin(name, source, value):
-    renders_well((LIGHTS | MATTER)[source](BAD[value]), name)
+    assert_renders_well((LIGHTS | MATTER)[source](BAD[value]), name)
 
 
 def sky_only(value, kind):
@@ -205,11 +205,11 @@ DEGENERATE = {
 @pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])
 @pytest.mark.parametrize("shape", DEGENERATE)
 def test_shapes_of_no_size_do_no_harm(name, shape):
-    renders_well(lit({"bad": DEGENERATE[shape]()}), name)
+    assert_renders_well(lit({"bad": DEGENERATE[shape]()}), name)
 
 
 @pytest.mark.stress
 @pytest.mark.parametrize("name", PLUGINS)
 @pytest.mark.parametrize("shape", DEGENERATE)
 def test_shapes_of_no_size_do_no_harm_in_any_plugin(name, shape):
-    renders_well(lit({"bad": DEGENERATE[shape]()}), name)
+    assert_renders_well(lit({"bad": DEGENERATE[shape]()}), name)
