@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
 from comparison import curves
 from comparison.curves import Curve, Point
+
+from .conftest import examples
 
 SEEDS = (0, 1, 2)
 
@@ -55,6 +57,7 @@ def test_front_keeps_what_nothing_beats():
 
 
 @given(st.lists(st.tuples(st.floats(0.1, 10), st.floats(0.1, 10)), max_size=20))
+@settings(max_examples=examples(100), deadline=None)
 def test_fronts_rise_and_fall(pairs):
     costs, errors = curves.front(pairs)
     assert np.all(np.diff(costs) > 0) and np.all(np.diff(errors) < 0)

@@ -25,6 +25,7 @@ from .conftest import (
     assert_property_is_refused,
     assert_same_mean_over_seeds,
     closed_box,
+    examples,
     relative_error,
     render,
     render_with_statistics,
@@ -49,7 +50,7 @@ rendered = partial(render_with_statistics, NAME)
     shape=st.sampled_from(["spread", "one place", "two places", "line", "tiny differences", "one far away"]),
     scale=st.sampled_from([1e-30, 1e-4, 1.0, 1e4, 1e30]),
 )
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 def test_every_point_is_in_one_slice_and_there_are_as_many_as_asked_for(seed, count, slices, shape, scale):
     rng = np.random.default_rng(seed)
     position, normal = rng.random((count, 3)), unit_vectors(rng, count)
@@ -130,7 +131,7 @@ def costs_of(forest, columns, rng):
     most=st.integers(0, 80),
     kind=st.sampled_from(["columns", "equal", "zero"]),
 )
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 def test_pruned_forests_hold_every_column_once_and_split_what_costs_most(seed, trees, most, kind):
     rng = np.random.default_rng(seed)
     forest = ColumnForest.joined([ColumnForest.of_tree(random_escape(rng, n), k) for k, n in enumerate(trees)])

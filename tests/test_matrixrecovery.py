@@ -22,6 +22,7 @@ from .conftest import (
     assert_properties_are_shown,
     assert_property_is_refused,
     closed_box,
+    examples,
     relative_error,
     render,
     render_with_statistics,
@@ -50,7 +51,7 @@ rendered = partial(render_with_statistics, NAME)
     most=st.integers(1, 70),
     shape=st.sampled_from(["spread", "one place", "line", "one far away"]),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_every_point_is_in_one_slice_whose_rows_are_few_enough_and_whole(seed, pixels, samples, most, shape):
     rng = np.random.default_rng(seed)
     pixel = rng.permutation(np.repeat(np.arange(pixels), samples))

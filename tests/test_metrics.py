@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from comparison import metrics
+
+from .conftest import examples
 
 ERRORS = ("relative_l1", "rmse", "relmse", "relmse_trimmed", "bias")
 
@@ -43,6 +45,7 @@ def test_trimming_removes_single_outliers_only(reference):
 
 
 @given(scale=st.floats(1e-6, 1e6))
+@settings(max_examples=examples(100), deadline=None)
 def test_relative_errors_do_not_depend_on_scale(scale):
     random = np.random.default_rng(2)
     reference = random.lognormal(0, 1, (16, 16, 3))
