@@ -93,7 +93,7 @@ class ManyLightIntegrator(GatheringIntegrator):
         self.direct_count = properties.integer(props, "direct_count", 4096, 1)
         self.clamping = properties.number(props, "clamping", 0.01, 0)
         self.direct = properties.choice(props, "direct", "nee", ("nee", "adaptive", "vpl", "none"))
-        self.emitter_samples = properties.integer(props, "emitter_samples", 4, 1)
+        self.emitter_samples = properties.integer(props, "emitter_samples", 16, 1)
         self.direct_error = properties.number(props, "direct_error", 0.05, 1e-4)
         self.lobe_limit = properties.number(props, "lobe_limit", 1.0, 0)
 
@@ -139,7 +139,7 @@ class ManyLightIntegrator(GatheringIntegrator):
         """Direct light of extended emitters by a fixed number of samples: (radiance, rays)."""
         return direct_light(
             scene, ExtendedEmitters(scene, start.emitters), start.traits, start.paths.points, self.max_depth,
-            self.emitter_samples, derived_seed(start.seed, 30),
+            self.emitter_samples, grid.samples, derived_seed(start.seed, 30),
         )  # fmt: skip
 
     def _adaptive(self, scene, start: Start, grid):

@@ -92,8 +92,8 @@ def test_direct_light_equals_path(direct, kind):
 @pytest.mark.parametrize("max_depth", [0, 1, 2, 3, -1])
 def test_max_depth_counts_the_same_edges_as_path(max_depth):
     scene = mi.load_dict(closed_box({"lamp": area_light()}))
-    ours = passes(scene, "lightcuts", 12, 4, max_depth=max_depth, **EXACT)
-    reference = passes(scene, "path", 12, 64, 100, max_depth=max_depth)
+    ours = passes(scene, "lightcuts", 24, 4, max_depth=max_depth, **EXACT)
+    reference = passes(scene, "path", 24, 64, 100, max_depth=max_depth)
     assert (ours.max() > 0) == (reference.max() > 0) == (max_depth != 0)
     assert_same_expectation(ours, reference)
 

@@ -14,7 +14,7 @@ import numpy as np
 from .emission import Choice, bounding_sphere, other_power
 from .gather import GatherPoints, emitted_towards
 from .lights import Emitters, finite_or_zero
-from .sampling import independent_sampler
+from .sampling import SpreadSamples, derived_seed, independent_sampler
 
 _UNIFORM_SHARE = 0.5
 
@@ -113,10 +113,14 @@ def emission_beyond_delta(scene, emitters: Emitters, traits, hit, depth, max_dep
 
 
 @dr.syntax
-def direct_light(scene, extended: ExtendedEmitters, traits, points: GatherPoints, max_depth, samples: int, seed: int):
+def direct_light(
+    scene, extended: ExtendedEmitters, traits, points: GatherPoints, max_depth, samples: int, rays_per_pixel: int,
+    seed: int,
+):  # fmt: skip
     """Direct light at every gather point from emitters with an extent: (radiance, number of shadow rays).
 
-    ``samples``: pairs of an emitter sample and a BSDF sample per point.
+    ``samples``: pairs of an emitter sample and a BSDF sample per point.  Those of a pixel, which are the points of
+    ``rays_per_pixel`` successive camera rays, are spread evenly together.
     """
     si, bsdf = points.si, points.si.bsdf()
     if dr.hint(extended.choice is None, mode="scalar"):
@@ -124,12 +128,15 @@ def direct_light(scene, extended: ExtendedEmitters, traits, points: GatherPoints
     sampler = independent_sampler(seed, points.count)
     context = mi.BSDFContext()
     limit = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF)))
-    total = dr.opaque(mi.UInt32, samples)
+    total, of_pixel = dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, rays_per_pixel)
+    pixel = points.ray // of_pixel
+    first = (points.ray - pixel * of_pixel) * total
+    to_emitters, to_directions = (SpreadSamples(pixel, derived_seed(seed, stream)) for stream in (1, 2))
     radiance, rays = dr.zeros(mi.UnpolarizedSpectrum, points.count), dr.zeros(mi.UInt32, points.count)
     k = mi.UInt32(0)
     while dr.hint(k < total, exclude=[traits]):
         # ---- Emitter sampling
-        ds, weight, density = extended.sample(si, sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
+        ds, weight, density = extended.sample(si, *to_emitters.at(first + k), mi.Bool(True))
         active = dr.any(weight > 0)
         wo = si.to_local(ds.d)
         value, pdf = bsdf.eval_pdf(context, si, wo, active)
@@ -141,7 +148,7 @@ def direct_light(scene, extended: ExtendedEmitters, traits, points: GatherPoints
         radiance += dr.select(active & ~blocked, finite_or_zero(arriving * mis), 0)
 
         # ---- BSDF sampling
-        sample, value = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d())
+        sample, value = bsdf.sample(context, si, *to_directions.at(first + k))
         smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Smooth) & dr.any(mi.unpolarized_spectrum(value) > 0)
         found = _scattered_emission(scene, extended, traits, si, sample, points.depth, limit, sampler, smooth)
         radiance += dr.select(smooth, finite_or_zero(mi.unpolarized_spectrum(value) * found), 0)

@@ -20,6 +20,7 @@ import numpy as np
 from .arrays import download, upload
 from .matrix_block import MatrixBlock
 from .matrix_separation import Separation, SeparationLimits, separate
+from .sampling import HASH_ROUNDS
 from .visibility_prediction import Predictors
 
 # The Gaussian of the density of errors: 7 × 7 entries [MSR 6.2]
@@ -143,7 +144,8 @@ def _predicted(block: MatrixBlock, predictors: Predictors, best: np.ndarray, fir
         index = np.flatnonzero(best[first : first + block.columns.count] == kind)
         if len(index):
             column, inside, _, active, place = block.lanes(index)
-            row, draw = dr.select(active, inside, 0), mi.sample_tea_float32(place, dr.opaque(mi.UInt32, seed))
+            draw = mi.sample_tea_float32(place, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)
+            row = dr.select(active, inside, 0)
             value = predictors.predict(kind, column + dr.opaque(mi.UInt32, first), row, draw)
             dr.scatter(values, value, place, active)
             dr.eval(values)

@@ -17,6 +17,7 @@ from .evaluation import probe_visibility, unoccluded
 from .gather import SceneTraits
 from .light_set import LightGroup, LightSet
 from .point_clusters import PointClusters, unit_or_up
+from .sampling import HASH_ROUNDS
 from .slice_rows import golden_steps, rows_of, tangent_places
 
 
@@ -81,7 +82,7 @@ class MatrixRows:
         """A surface of every row, drawn by two numbers."""
         first = dr.gather(mi.UInt32, self.points, row, active)
         size = dr.gather(mi.UInt32, self.points, row + 1, active) - first
-        draw, _ = mi.sample_tea_32(row, number)
+        draw, _ = mi.sample_tea_32(row, number, HASH_ROUNDS)
         return self.clusters.batch.surfaces_at(first + draw % dr.maximum(size, 1), active)
 
 

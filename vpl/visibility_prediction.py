@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from .arrays import download, upload
-from .sampling import derived_seed
+from .sampling import HASH_ROUNDS, derived_seed
 from .visibility_samples import VisibilitySamples
 
 NEAREST, LINEAR, BAYES = range(3)
@@ -172,7 +172,7 @@ def _validate(predictors: Predictors, index: np.ndarray, count: int, seed: int):
     lane = dr.arange(mi.UInt32, len(index) * count)
     column = dr.gather(mi.UInt32, upload(mi.UInt32, index), lane // dr.opaque(mi.UInt32, count))
     drawn = rows != 0xFFFFFFFF
-    inside, draw = dr.select(drawn, rows, 0), mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed))
+    inside, draw = dr.select(drawn, rows, 0), mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)
     predicted = [predictors.predict(kind, column, inside, draw) for kind in predictors.kinds]
     dr.eval(predicted)
     value = samples.trace(index, rows, count)

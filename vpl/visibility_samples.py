@@ -16,6 +16,7 @@ from .arrays import download, upload
 from .evaluation import unoccluded
 from .light_set import LightGroup
 from .reduced_matrix import Columns, MatrixEntries
+from .sampling import HASH_ROUNDS
 
 _WORD = 32
 
@@ -92,7 +93,7 @@ class VisibilitySamples:
         piece, number = dr.gather(mi.UInt32, self._piece, column), dr.gather(mi.UInt32, self._light, column)
         light, step = group.lights.gather(number), self.entries.rows.step(piece)
         first, rows = self.entries.rows.range(piece)
-        start, _ = mi.sample_tea_32(number, piece ^ dr.opaque(mi.UInt32, self._seed))
+        start, _ = mi.sample_tea_32(number, piece ^ dr.opaque(mi.UInt32, self._seed), HASH_ROUNDS)
         # The lanes that fill a kernel's last packet divide too, and find zeros
         divisor = dr.maximum(rows, 1)
         k, taken = dr.gather(mi.UInt32, self._next, column), mi.UInt32(0)

@@ -1,0 +1,47 @@
+"""Sequences of numbers that fill the unit cube evenly."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy import stats
+
+from vpl.arrays import download
+from vpl.sampling import SpreadSamples
+
+SEQUENCES, MEMBERS = 2000, 64
+
+
+@pytest.fixture
+def members(variant):
+    """The first members of many sequences, (sequences, members, 3)."""
+    lane = dr.arange(mi.UInt32, SEQUENCES * MEMBERS)
+    x, pair = SpreadSamples(lane // MEMBERS, 5).at(lane % MEMBERS)
+    return np.stack([download(x), *download(pair).T], axis=1).reshape(SEQUENCES, MEMBERS, 3)
+
+
+def test_every_number_alone_is_uniform_and_below_one(members):
+    assert members.min() >= 0 and members.max() < 1
+    for member in (0, 1, MEMBERS - 1):
+        for axis in range(3):
+            assert stats.kstest(members[:, member, axis], "uniform").pvalue > 1e-4
+
+
+def test_sequences_and_axes_are_independent(members):
+    starts = members[:, 0].T
+    assert np.abs(np.corrcoef(starts) - np.eye(3)).max() < 0.1
+    assert np.abs(np.corrcoef(starts[:, :-1], starts[:, 1:])[:3, 3:]).max() < 0.1
+
+
+@pytest.mark.parametrize("count", [4, 16, 64])
+def test_means_have_far_less_noise_than_those_of_independent_numbers(members, count):
+    values = np.prod(1 + np.cos(np.pi * members[:, :count]), axis=2)
+    independent = values[:, 0].var() / count
+    assert values.mean(1).var() < independent * 2 / count**0.5
+    assert values.mean() == pytest.approx(1, abs=4 * float(values.mean(1).std()) / SEQUENCES**0.5)
+
+
+def test_other_seeds_give_other_sequences(variant):
+    lane = dr.arange(mi.UInt32, 8)
+    first, second = (download(SpreadSamples(lane, seed).at(mi.UInt32(0))[0]) for seed in (1, 2))
+    assert np.abs(first - second).min() > 0
