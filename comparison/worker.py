@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parent.parent
 TICK = 0.5  # seconds
 LONG_PASS = 60.0  # seconds; with given samples, a first pass longer than this is no longer rendered twice
 WARM_SPP = 4  # Mitsuba compiles other kernels for passes of fewer samples per pixel
-PASSES_IN_BUDGET = 5  # or about so many, unless even passes of one sample per pixel take longer
+PASSES_IN_BUDGET = 3  # or about so many, unless even passes of one sample per pixel take longer
 UNUSED_PASSES = 2**31  # passes that are not in the image are numbered from here, so that they share no lights with it
 
 
@@ -200,11 +200,11 @@ def _samples_that_fit(progressive, spp, budget):
 def _samples_of_a_pass(progressive, seconds, seeds):
     """Return the samples per pixel of passes of about the given time, found by rendering some.
 
-    One if that takes half of it: every pass has virtual lights of its own. More where the cost of starting a pass would
+    One if that takes longer: every pass has virtual lights of its own. More where the cost of starting a pass would
     matter.
     """
     largest = largest_pass(progressive.pixels)
-    if largest < WARM_SPP or progressive.render(1, next(seeds)).seconds > seconds / 2:
+    if largest < WARM_SPP or progressive.render(1, next(seeds)).seconds > seconds:
         return 1
     spp = WARM_SPP
     progressive.render(spp, next(seeds))
