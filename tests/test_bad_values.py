@@ -153,8 +153,9 @@ def test_a_bad_constant_sky_is_dropped_and_counted(name, value):
 def test_a_scene_without_a_finite_size_is_refused(name):
     corners = [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0, 0.5, 0], [math.inf, 0, 0.3]]
     assert "its size must be finite" in error_of(mi.load_dict(lit(bad=mesh(corners, TRIANGLES))), name)
-    nowhere = {"type": "disk", "to_world": mi.ScalarTransform4f().scale(math.nan)}
-    assert "its size must be finite" in error_of(mi.load_dict(lit(bad=nowhere)), name)
+    for kind in ("disk", "rectangle"):
+        nowhere = {"type": kind, "to_world": mi.ScalarTransform4f().scale(math.nan)}
+        assert "its size must be finite" in error_of(mi.load_dict(lit(bad=nowhere)), name)
 
 
 @pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])

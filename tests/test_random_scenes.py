@@ -114,6 +114,7 @@ def test_a_choice_never_falls_on_nothing(weights, seed):
     intensity=st.lists(st.floats(width=32, allow_nan=True, allow_infinity=True), min_size=3, max_size=30),
     direction=st.floats(width=32),
 )
+@example(intensity=[0.0, np.inf, -np.inf], direction=0.0)
 @settings(max_examples=examples(300), deadline=None)
 def test_lights_that_are_kept_are_usable(intensity, direction):
     rows = np.float32(intensity[: len(intensity) // 3 * 3]).reshape(-1, 3)

@@ -16,7 +16,7 @@ import numpy as np
 
 from .arrays import download, upload
 from .bounds import contribution_bound
-from .evaluation import evaluate_pairs
+from .evaluation import evaluate_representatives
 from .gather import SceneTraits
 from .light_set import LightGroup, LightSet
 from .surfaces import Batch
@@ -219,11 +219,12 @@ def evaluate_cuts(scene, traits: SceneTraits, lights: LightSet, batch: Batch, th
     radiance = dr.zeros(mi.UnpolarizedSpectrum, batch.count)
     rays, visits = dr.zeros(mi.UInt32, batch.count), dr.zeros(mi.UInt32, batch.count)
     for chunk in collect_cuts(lights, batch, threshold, sizes):
-        light, scale = chunk.group.representatives(chunk.nodes, second)
-        surface = chunk.batch.surfaces_at(chunk.rows)
-        value, traced = evaluate_pairs(scene, traits, lights, chunk.group, surface, light, scale)
+        tree = chunk.group.tree
+        light, intensity = tree.representative(chunk.nodes, second=second), tree.summed_intensity(chunk.nodes)
+        value, traced = evaluate_representatives(
+            scene, traits, lights, chunk.group, chunk.batch, chunk.rows, light, intensity
+        )
         traced = dr.select(traced, mi.UInt32(1), mi.UInt32(0))
-        dr.eval(value, traced)
         dr.scatter_add(radiance, _sum_segments(value, chunk.offset, chunk.length), chunk.points)
         dr.scatter_add(rays, _sum_segments(traced, chunk.offset, chunk.length), chunk.points)
         dr.scatter_add(visits, chunk.visits, chunk.points)

@@ -63,11 +63,17 @@ def other_power(emitter, bounding_sphere) -> float:
 
 
 def bounding_box(scene):
-    """The scene's box, with the shapes that Mitsuba 3.9.1 leaves out: rectangles that it merged have no box."""
+    """The scene's box, with the shapes that Mitsuba 3.9.1 leaves out: rectangles that it merged have no box.
+
+    Raises a ValueError for a shape of its own that has none, which is one whose transformation is not finite.
+    """
     box = scene.bbox()
     for shape in scene.shapes():
         if shape.is_mesh() and shape.vertex_count() and not shape.bbox().valid():
-            vertices = np.asarray(parameters_of(shape, below=False)["vertex_positions"]).reshape(-1, 3)
+            vertices = parameters_of(shape, below=False).get("vertex_positions")
+            if vertices is None:
+                raise ValueError(f'the shape "{shape.id()}" has no place in space: its size must be finite')
+            vertices = np.asarray(vertices).reshape(-1, 3)
             box.expand(mi.ScalarPoint3f(vertices.min(0)))
             box.expand(mi.ScalarPoint3f(vertices.max(0)))
     return box

@@ -34,6 +34,22 @@ def evaluate_pairs(scene, traits: SceneTraits, lights: LightSet, group: LightGro
     return dr.select(arrives, value * passed, 0), traced
 
 
+def evaluate_representatives(
+    scene, traits: SceneTraits, lights: LightSet, group: LightGroup, batch: Batch, rows, light, intensity
+):
+    """Shade and trace pairs of ``rows`` of a batch and lights of a group, each of which stands for a cluster.
+
+    ``light``: their indices; ``intensity``: of the clusters, the mean over channels.  However the pairs were chosen,
+    this is the same kernel, compiled once.  Returns as :func:`evaluate_pairs`, evaluated.
+    """
+    dr.eval(rows, light, intensity)
+    shown = group.lights.gather(light)
+    scale = intensity / channel_mean(shown.intensity)
+    value, traced = evaluate_pairs(scene, traits, lights, group, batch.surfaces_at(rows), shown, scale)
+    dr.eval(value, traced)
+    return value, traced
+
+
 def evaluate_one_of(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface, candidates: list, number):
     """Shade several lights that stand for the same cluster, and trace the ray of one, drawn by what they would send.
 
@@ -136,7 +152,8 @@ def mean_radiance(scene, traits: SceneTraits, lights: LightSet, batch: Batch, se
         points = dr.opaque(mi.UInt32, batch.count)
         row = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(points)), points - 1)
         index = choice.row(sampler.next_1d())
-        light, scale = group.lights.gather(index), dr.rcp(choice.probability(index))
-        value, _ = evaluate_pairs(scene, traits, lights, group, batch.surfaces_at(row), light, scale)
+        # Drawn by intensity, each of them stands for all
+        everything = dr.opaque(mi.Float, float(group.lights.scalar_intensity.sum()), count)
+        value, _ = evaluate_representatives(scene, traits, lights, group, batch, row, mi.UInt32(index), everything)
         total += float(download(value).mean(dtype="float64"))
     return total

@@ -221,9 +221,9 @@ def follow_camera_rays(
     throughput, depth = ones(count), 1
     found = None
     while True:
-        # Opaque, so that the second wave, where there is one, is the same kernel as the first
-        dr.make_opaque(ray, active)
         random = (sampler.next_1d(), sampler.next_2d(), sampler.next_1d(), sampler.next_1d()) if traits.delta else None
+        # Opaque, so that the second wave, where there is one, is the same kernel as the first
+        dr.make_opaque(ray, active, throughput, random)
         emitted, hit, gathered, going = _wave(
             scene, emitters, traits, random, ray, throughput, dr.opaque(mi.UInt32, depth), limits, skip, active
         )

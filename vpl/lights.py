@@ -88,7 +88,7 @@ class VirtualLights:
         finite = usable(self.intensity).all(1) & np.isfinite(self.direction).all(1)
         if self.position is not None:
             finite &= np.isfinite(self.position).all(1)
-        keep = finite & (self.intensity.sum(1, dtype=np.float64) > 0)
+        keep = finite & (self.intensity > 0).any(1)
         return (self if keep.all() else self.select(keep)), int((~finite).sum())
 
 

@@ -141,7 +141,9 @@ def make_batches(points: GatherPoints, proxy: MaterialProxy) -> list[Batch]:
         normal = part.si.sh_frame.n * dr.mulsign(mi.Float(1), mi.Frame3f.cos_theta(part.si.wi))
         if lambertian:
             interaction = dr.zeros(mi.Interaction3f, len(index))
-            interaction.p, interaction.n, interaction.time = part.si.p, part.si.n, part.si.time
+            # All that is gathered is an array: a literal here would make kernels of parts of the batch other ones
+            for name in ("p", "n", "t", "time"):
+                setattr(interaction, name, getattr(part.si, name))
             surfaces = LambertianSurface(interaction, part.depth, normal, part_proxy.base)
         else:
             surfaces = ScatteringSurface(part.si, part.depth)

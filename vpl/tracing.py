@@ -95,11 +95,11 @@ def _paths_of_group(scene, group, first: int, count: int, total: int, seed: int,
     ray, power = group.sample(chosen, sampler.next_2d(), sampler.next_2d())
     power = mi.unpolarized_spectrum(power) / dr.opaque(mi.Float, float(total))
     origin, direction, throughput = ray.o, ray.d, ones(count)
-    dr.make_opaque(origin, direction, power)
 
     parts, dropped, depth = [], 0, 1
     while count > 0 and depth <= limits.deepest:
         sampler.seed(derived_seed(seed, depth), count)
+        dr.make_opaque(origin, direction, throughput, power)  # or each depth would have a kernel of its own
         ray = mi.Ray3f(origin, direction)
         stored, alive, bad = _bounce(scene, sampler, ray, throughput, power, dr.opaque(mi.UInt32, depth), limits)
         dropped += bad
