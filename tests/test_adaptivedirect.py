@@ -358,6 +358,7 @@ def test_aovs_have_their_names_and_ranges(mixed):
         assert 0 < integrator.statistics["shadow_rays"] and rays[~lit].max() == 0
         # BSDF samples that found light are counted among those that the emitter samples are
         assert 0 < regions.max() <= 4 and visible.max() <= 1 and visible.mean() > 0.05
+        assert passes.sum() * 4 == pytest.approx(integrator.statistics["passes"], rel=1e-5)
         if plugin == "adaptivedirect" and more["lights"] == "clusters":
             assert passes.max() <= 15
 
