@@ -95,6 +95,21 @@ class Curve:
         hidden = [noise for at, noise in self.bounds(without) if at <= cost]
         return _read_off(cost, *self.front(without), hidden)
 
+    def between(self, value, axis):
+        """Return the one or two settings of the front between which the curve has a cost (axis 0) or an error (axis 1),
+        a dict from names to shares of them in logarithmic axes, which add up to 1. Beyond the greater end it is the
+        setting there, which has less of it; beyond the lesser end there is none."""
+        front = set(zip(*map(np.ndarray.tolist, self.front()), strict=True))
+        along = {mean[axis]: point.name for point in self.points if (mean := point.mean()) in front}
+        at = sorted(along)
+        if not at or value < at[0]:
+            return {}
+        above = min(int(np.searchsorted(at, value)), len(at) - 1)
+        if above == 0 or value >= at[above]:
+            return {along[at[above]]: 1.0}
+        share = float(np.log(value / at[above - 1]) / np.log(at[above] / at[above - 1]))
+        return {along[at[above - 1]]: 1 - share, along[at[above]]: share}
+
     @property
     def seeds(self):
         return sorted({seed for point in self.points for seed in point.cost})
