@@ -414,6 +414,15 @@ def test_max_passes_holds(mixed):
     assert passes.max() == 2
 
 
+def test_clusters_are_counted_and_fall_with_their_angle(mixed):
+    found = []
+    for angle in (0.02, 10.0):
+        plugin = mi.load_dict({"type": "adaptivedirect", "cluster_angle": angle, "error": 0.2})
+        render(mixed, plugin, 1)
+        found.append(plugin.statistics["clusters"] / plugin.statistics["gather_points"])
+    assert plugin.statistics["sources"] >= found[0] > found[1] > 0
+
+
 def test_time_is_a_limit(mixed):
     found = []
     for seconds in (1e-6, 100.0):
