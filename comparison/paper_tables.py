@@ -212,7 +212,7 @@ def _how_read(table, entry):
     first = entry["rows"][0]["label"]
     return (
         f"At equal {held}: each setting of {first}, and below it the others, read off between two of their settings "
-        "along logarithmic axes, never beyond the end of a curve; 'less already' is where that end has less of it. "
+        "along logarithmic axes, never beyond the end of a curve; 'less already' is a setting that has less of it. "
         f"{paper}"
     )
 

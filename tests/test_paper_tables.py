@@ -221,6 +221,7 @@ def test_declared_tables_have_columns_that_exist():
     assert len({(one.paper, one.name) for one in TABLES}) == len(TABLES)
     for one in TABLES:
         assert set(one.quantities) <= QUANTITIES.keys() and not set(one.ratios) & QUANTITIES.keys()
+        assert one.equal is None or one.methods[0].integrator in one.needed
         assert one.equal is None or {"error": one.metric, "rays": "rays"}[one.equal] in one.quantities
         for method in one.methods:
             assert method.figures.keys() <= set(one.quantities), (one.name, method.name)
