@@ -236,8 +236,8 @@ def _cell(row, name):
 def _range(name, figures):
     if figures is None:
         return ""
-    ends = dict.fromkeys(_number(name, figures[end]) for end in ("low", "high"))
-    return " to ".join(ends)
+    low, high = (_number(name, figures[end]) for end in ("low", "high"))
+    return low if low == high else f"{low.removesuffix('%')}–{high}"
 
 
 def _number(name, value):

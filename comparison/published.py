@@ -153,6 +153,7 @@ _ILLUMINATION_CUT = (
             _light_slice(
                 "LS(800)",
                 render_seconds=(346.61, 399.48, 332.62, 221.34),
+                columns=(800, 800, 800, 800),
                 relative_l1=(0.04011, 0.06959, 0.02938, 0.08923),
             ),
             _illumination_cut(
@@ -258,7 +259,7 @@ _MSR_DEPARTURES = (
     "lights and their trees. sampling rate: shadow rays over entries of all matrices."
 )
 _RECOVERY = Method(
-    "ours",
+    "matrix recovery",
     "matrixrecovery",
     {
         "columns": (2000, 4000, 2000, 2000),

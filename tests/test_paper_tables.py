@@ -126,7 +126,7 @@ def test_published_figures_are_ranges_and_ratios_scene_by_scene():
     assert other["speed_up"] == {"low": pytest.approx(116.71 / 36.94), "high": pytest.approx(183.07 / 43.04)}
     (shown, _) = paper_tables.shown({"paper_tables": [found, found]})
     assert shown["classes"] == ["", "", "published", "published"]
-    assert shown["rows"][-1][0] == "[IC] IC(1.5%)" and shown["rows"][-1][-1] == "3.16 to 4.25"
+    assert shown["rows"][-1][0] == "[IC] IC(1.5%)" and shown["rows"][-1][-1] == "3.16–4.25"
 
 
 def test_stages_and_rates_of_matrix_recovery():
@@ -247,7 +247,7 @@ def test_page_and_text_show_the_tables_of_a_sweep(swept, tmp_path):
     (first, _) = results_of(tmp_path)["scenes"][0]["paper_tables"]
     assert first["table"] == "Table 1" and first["equal"] == "error"
     assert all(row["values"]["rays"] > 0 for row in first["rows"] if row["settings"])
-    for wanted in ("Tables of the papers", "[IC] Table 1", "[IC] Table 5", "3.16 to 4.25"):
+    for wanted in ("Tables of the papers", "[IC] Table 1", "[IC] Table 5", "3.16–4.25"):
         assert wanted in page
     assert page.count('class="published"') == 4 and "[MSR]" not in page and "[IAS]" not in page
     assert "[IC] Table 1: " in report.text(scene) and "[IC] IC(1.5%)" in report.text(scene)
