@@ -84,12 +84,14 @@ def _row(method, label, shares, values, at_most=(), beyond=False):
 
 
 def _plain_rows(table, runs):
-    """Return a row a setting; ratios are to the first method's if that has a single setting, and seconds were not given
-    beforehand."""
+    """Return a row a setting. Ratios are to the row of the first method with the same setting, or to its only one;
+    there are none where seconds were given beforehand."""
     rows = list(_measured(table, runs).values())
-    first = [row for row in rows if row["method"] == table.methods[0].name]
-    comparable = len(first) == 1 and not any(run["budget"] for run in runs)
-    return [_with_ratios(table, row, first[0] if comparable else None) for row in rows]
+    label = next((row["label"] for row in rows if row["method"] == table.methods[0].name), None)
+    first = [] if any(run["budget"] for run in runs) else [row for row in rows if row["label"] == label]
+    alone = first[0] if len(first) == 1 else None
+    same = {tuple(row["settings"]): row for row in first}
+    return [_with_ratios(table, row, same.get(tuple(row["settings"]), alone)) for row in rows]
 
 
 def _with_ratios(table, row, first):
@@ -146,7 +148,7 @@ def _weighted(numbers, weights):
     """Return the weighted mean of logarithms, or of the numbers where one is zero; None if one is not known."""
     if None in numbers:
         return None
-    if min(numbers) <= 0:
+    if len(numbers) == 1 or min(numbers) <= 0:
         return sum(number * weight for number, weight in zip(numbers, weights, strict=True))
     return math.exp(sum(math.log(number) * weight for number, weight in zip(numbers, weights, strict=True)))
 

@@ -57,7 +57,7 @@ def names(renders):
         (["lightcuts", "illuminationcut"], ["IC Table 1", "IC Table 5"]),
         (["unoccludeddirect"], []),
         (["adaptivedirect"], ["IAS Tables 4 and 6"]),
-        (["unoccludeddirect", "adaptivedirect"], ["IAS Table 2", "IAS Table 3", "IAS Tables 4 and 6"]),
+        (["unoccludeddirect", "adaptivedirect"], ["IAS Tables 2 and 3, same rule", "IAS Tables 4 and 6"]),
         (["mdlightcuts", "lightslice"], []),
         (["matrixrecovery"], ["MSR Table 1, equal quality"]),
     ],
@@ -156,10 +156,23 @@ def test_counts_of_adaptive_sampling_are_a_point():
 
 def test_errors_that_the_noise_hides_are_marked():
     pair = [run("unoccludeddirect", error=0.02, noise=0.05), run("adaptivedirect", error=0.2, noise=0.05)]
-    found = table(pair, "IAS", "Table 2")
+    found = table(pair, "IAS", "Tables 2 and 3, same rule")
     assert [row["at_most"] for row in found["rows"]] == [["relmse_trimmed"], []]
     shown = paper_tables.shown({"paper_tables": [found]})[0]
-    assert [row[2] for row in shown["rows"][:2]] == ["< 0.05", "0.2"]
+    assert [row[3] for row in shown["rows"][:2]] == ["< 0.05", "0.2"]
+
+
+def test_ratios_are_between_runs_of_one_setting():
+    """Beside those at equal error, which need curves."""
+    reference = curve("unoccludeddirect", [("error=0.1", 8.0, 0.2), ("error=0.05", 30.0, 0.1)], rays_per_sample=4)
+    adaptive = curve("adaptivedirect", [("error=0.1", 4.0, 0.2), ("error=0.05", 10.0, 0.1)], rays_per_sample=2)
+    found = table([*reference, *adaptive], "IAS", "Tables 2 and 3, same rule")
+    assert values(found, "adaptivedirect", "speed_up") == [2.0, 3.0]
+    assert values(found, "adaptivedirect", "fewer_rays") == [4.0, 6.0]
+    assert values(table([*reference, *adaptive], "IAS", "Table 2"), "adaptivedirect", "speed_up") == [2.0, 3.0]
+    adaptive[0]["setting"] = "error=0.07"
+    found = table([*reference, *adaptive], "IAS", "Tables 2 and 3, same rule")
+    assert values(found, "adaptivedirect", "speed_up") == [None, 3.0]
 
 
 # --- At equal errors and rays ---
