@@ -2,8 +2,8 @@
 
 Only tables that runs of a comparison can fill are here; `paper_tables` fills them. Figures are those of the paper's
 scenes, in its order. Left out are pictures ([IC] Table 2), how many emitters a pixel sees ([IAS] Table 5), which no
-integrator counts, regions of pixels ([IAS] Table 4), which `adaptivedirect` does without unless asked, and numbers of triangles and
-emitters, which say nothing about a method.
+integrator counts, regions of pixels ([IAS] Table 4), which `adaptivedirect` does without unless asked, and
+numbers of triangles and emitters, which say nothing about a method.
 """
 
 from .published_table import Method, Ratio, Table
