@@ -12,6 +12,8 @@
                 all runs on one scene; how far they are
 `curves`, `analysis`
                 error against time and rays: means, intervals, what is read off; from runs to these
+`quantities`, `published_table`, `published`, `paper_tables`
+                what the papers' tables list; their figures; the same tables from runs
 `tables`, `report`, `plots`, `pictures`, `page_images`, `page`
                 tables, `results.json` (`results.schema.json`) and `report.html`
 `strip`         pictures beside each other, for a paper

@@ -95,6 +95,25 @@ class Curve:
         hidden = [noise for at, noise in self.bounds(without) if at <= cost]
         return _read_off(cost, *self.front(without), hidden)
 
+    def between(self, value, axis):
+        """Return the settings that what is read off at a cost (axis 0) or an error (axis 1) comes from: a dict from
+        names to shares in logarithmic axes, which add up to 1. They are two settings of the front, or one; where only a
+        bound is known it is the setting that has it, and where the curve does not get there, none."""
+        read, at_most = self.error_at(value) if axis == 0 else self.cost_at(value)
+        if at_most is not None:
+            pairs = {point.name: point.mean() or point.bound() for point in self.points}
+            return {next(name for name, pair in pairs.items() if pair and pair[1 - axis] == at_most): 1.0}
+        if read is None:
+            return {}
+        front = set(zip(*map(np.ndarray.tolist, self.front()), strict=True))
+        along = {mean[axis]: point.name for point in self.points if (mean := point.mean()) in front}
+        at = sorted(along)
+        above = int(np.searchsorted(at, value))
+        if at[above] == value:
+            return {along[value]: 1.0}
+        share = float(np.log(value / at[above - 1]) / np.log(at[above] / at[above - 1]))
+        return {along[at[above - 1]]: 1 - share, along[at[above]]: share}
+
     @property
     def seeds(self):
         return sorted({seed for point in self.points for seed in point.cost})

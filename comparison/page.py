@@ -8,7 +8,7 @@ import jinja2
 import numpy as np
 from matplotlib import colormaps
 
-from . import analysis, images, plots, tables
+from . import analysis, images, paper_tables, plots, tables
 from .curves import pareto
 
 PARTS = Path(__file__).parent / "page"
@@ -53,6 +53,7 @@ def _scene(scene, pictures, results):
         for title, table in (("equal error", tables.equal_errors), ("equal cost", tables.equal_costs)):
             if rows := table(scene, cost):
                 shown["comparisons"].append((cost, title, rows))
+    shown["paper_tables"] = paper_tables.shown(scene)
     shown["warnings"] = tables.warnings(scene, results["machine"]["cores"])
     counted = {render["label"] for render in scene["renders"] if render.get("rays_per_sample") is not None}
     shown["uncounted"] = [label for label in labels if label not in counted]

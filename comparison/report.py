@@ -4,7 +4,7 @@ import json
 from datetime import UTC, datetime
 from pathlib import Path
 
-from . import images, machine, metrics, page, tables
+from . import images, machine, metrics, page, paper_tables, tables
 
 FORMAT = 2  # of results.json; rises with changes that old readers would not understand
 
@@ -42,6 +42,8 @@ def text(scene):
         if table:
             parts += ["", f"{title} (in brackets: how many times better than {table[0][1]}, 95% interval)"]
             parts.append(tables.text(table))
+    for table in paper_tables.shown(scene):
+        parts += ["", table["title"], tables.text([table["head"], *table["rows"]]), table["reading"]]
     parts += tables.warnings(scene, machine.cores())
     return "\n".join(parts)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import analysis, images, metrics, references, worker
+from . import analysis, images, metrics, paper_tables, references, worker
 from .command_line import explain, own_integrators
 from .pictures import REFERENCE, Pictures
 from .scene_files import SceneFile, short_name
@@ -72,6 +72,7 @@ class SceneComparison:
         if aovs := self.pictures.write_aovs(names):
             self.result["aovs"] = aovs
         self.result |= analysis.analyse(self.result["renders"], list(self.settings), self.options.metric)
+        self.result["paper_tables"] = paper_tables.make(self.result["renders"])
         self.result["pictures"] = {"exposure": self.pictures.exposure, "block": self.pictures.block}
 
     # --- References ---

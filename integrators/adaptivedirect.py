@@ -225,6 +225,7 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
         )  # fmt: skip
         start.clock.lap("direct")
         counts = {"sources": sources.count, "shadow_rays": whole_sum(found.shadow_rays)}
+        counts |= {"passes": whole_sum(found.passes), "clusters": found.clusters}
         return found.radiance, vars(found), counts | {"dropped": start.emitters.dropped}
 
     def describe(self):

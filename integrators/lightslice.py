@@ -149,7 +149,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
         # What was spent on choosing is shared by all points
         shared = [(rays + rows.rays) / clusters.count, (bounds + rows.count * rows.forest.columns) / clusters.count]
         rays, bounds = (dr.opaque(mi.Float, number, clusters.count) for number in shared)
-        return Shaded(radiance, traced + rays, bounds, columns, clock.seconds)
+        return Shaded(radiance, traced + rays, bounds, columns, clock.seconds, counts={"slices": rows.count})
 
     def _turns(self, job: Shading) -> np.ndarray:
         """The set of lights that each point takes, (n,): another one for each sample, then each pixel of a block."""

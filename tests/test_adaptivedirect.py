@@ -358,6 +358,7 @@ def test_aovs_have_their_names_and_ranges(mixed):
         assert 0 < integrator.statistics["shadow_rays"] and rays[~lit].max() == 0
         # BSDF samples that found light are counted among those that the emitter samples are
         assert 0 < regions.max() <= 4 and visible.max() <= 1 and visible.mean() > 0.05
+        assert passes.sum() * 4 == pytest.approx(integrator.statistics["passes"], rel=1e-5)
         if plugin == "adaptivedirect" and more["lights"] == "clusters":
             assert passes.max() <= 15
 
@@ -411,6 +412,15 @@ def test_max_samples_holds_and_matters(mixed, plugin, more):
 def test_max_passes_holds(mixed):
     passes = render(mixed, "adaptivedirect", 1, lights="clusters", error=1e-3, max_passes=2, aovs="passes")[..., 3]
     assert passes.max() == 2
+
+
+def test_clusters_are_counted_and_fall_with_their_angle(mixed):
+    found = []
+    for angle in (0.02, 10.0):
+        plugin = mi.load_dict({"type": "adaptivedirect", "cluster_angle": angle, "error": 0.2})
+        render(mixed, plugin, 1)
+        found.append(plugin.statistics["clusters"] / plugin.statistics["gather_points"])
+    assert plugin.statistics["sources"] >= found[0] > found[1] > 0
 
 
 def test_time_is_a_limit(mixed):

@@ -416,6 +416,7 @@ def test_columns_are_counted_and_rays_include_those_of_rows():
     _, counted = rendered(scene, 1, **given)
     points = counted["gather_points"]
     assert 20 * points < counted["cut_size"] <= 30 * points
+    assert counted["slices"] == 20
     assert counted["bound_computations"] > 20 * 400
     # A fair part of what is in a row arrives; the rows of the shared columns come on top
     assert counted["shadow_rays"] - counted["cut_size"] > 20 * 100

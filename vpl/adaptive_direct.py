@@ -79,7 +79,7 @@ class PixelGrid:
 class DirectLight:
     """Per gather point: ``radiance``; ``noise``: estimated standard error over radiance; ``passes``; ``shadow_rays``,
     shared out among the points that were shaded as one; ``regions``: points that were shaded in the site; ``visible``:
-    share of the samples that found light. Float but the radiance."""
+    share of the samples that found light. Float but the radiance.  ``clusters``: how many light each point, summed."""
 
     radiance: object
     noise: object
@@ -87,6 +87,7 @@ class DirectLight:
     shadow_rays: object
     regions: object
     visible: object
+    clusters: int = 0
 
 
 def light_directly(
@@ -98,7 +99,7 @@ def light_directly(
     ``level``: mean radiance of the image, which ``dark_floor`` is a fraction of; estimated where it is None.
     """
     start = perf_counter()
-    found = np.zeros((points.count, 3 + len(FIELDS)), np.float32)
+    found, clusters = np.zeros((points.count, 3 + len(FIELDS)), np.float32), 0
     if sources.count or sources.extended:
         parts = [
             _BatchLight(scene, traits, sources, points, batch, grid, max_depth, options, derived_seed(seed, 2, k))
@@ -112,9 +113,10 @@ def light_directly(
             done += part.batch.count
             deadline = start + options.time * done / points.count if options.time > 0 else np.inf
             found[part.rows] = part.solve(level, derived_seed(seed, 1, number), stopped, deadline)
+            clusters += part.clusters
     columns = [upload(mi.Float, column) for column in found.T.copy()]
     radiance = mi.UnpolarizedSpectrum(*columns[: dr.size_v(mi.UnpolarizedSpectrum)])
-    return DirectLight(radiance, *columns[3:])
+    return DirectLight(radiance, *columns[3:], clusters=clusters)
 
 
 class _BatchLight:
@@ -165,6 +167,11 @@ class _BatchLight:
         cuts = cut_clusters(self.nodes, self._bounds.select(groups), solid_angle, self.options.faint_share)
         # Where light comes by way of mirrors, BSDF samples are taken even if nothing lights a group directly
         return cuts if self._beyond is None or self.nodes.count == 0 else cuts.without_empty()
+
+    @property
+    def clusters(self) -> int:
+        """Size of the cut of each point's group, summed over the points."""
+        return int((self.sites.points * self._cuts.size[self.sites.group]).sum())
 
     def pilot(self, seed: int) -> float:
         """Mean radiance of the batch's points, roughly: one pass over some of the groups."""

@@ -1,0 +1,92 @@
+"""What the tables of the papers list, by name: how each quantity follows from the result of a run (see worker.run).
+
+Shadow rays and upper bounds are those per pixel, of all its samples; seconds are those of all passes in the image.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from . import analysis
+
+# What is made before a method begins: virtual lights and their trees
+LIGHT_STAGES = ("trace", "tree")
+CHOOSING_STAGES = {
+    "matrixrecovery": ("slices", "initial_cut", "columns", "prediction"),
+    "lightslice": ("slices", "shared_columns", "rows", "columns"),
+}
+SEPARATION_STAGES = ("shading", "separation", "correction")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column of a table: its head, a function from a run's result to a number (None if it is not known of that run),
+    and whether the number is shown in percent."""
+
+    head: str
+    of: Callable
+    percent: bool = False
+
+
+def _counter(name):
+    return lambda run: run["statistics"].get(name)
+
+
+def _error(name):
+    return lambda run: run["errors"][name] if "errors" in run else None
+
+
+def _per_pixel(name):
+    return lambda run: None if run[name] is None else run[name] * run["spp"]
+
+
+def _ratio(over, under):
+    """Return a function to the ratio of two counters."""
+
+    def of(run):
+        above, below = (run["statistics"].get(name) for name in (over, under))
+        return above / below if above is not None and below else None
+
+    return of
+
+
+def _stages(run, names):
+    """Return the seconds of some stages, None for a method that has none of them."""
+    spent = [seconds for name, seconds in run["statistics"].get("seconds", {}).items() if name in names]
+    return sum(spent) if spent else None
+
+
+def _render_seconds(run):
+    return run["seconds"] - (_stages(run, LIGHT_STAGES) or 0)
+
+
+def _light_count(run):
+    lights = run["statistics"].get("lights")
+    return None if lights is None else sum(lights.values())
+
+
+def _slices(run):
+    """Return how many there are in one pass: each has its own, and counters of passes are added up."""
+    slices = run["statistics"].get("slices")
+    return None if slices is None else slices / run["passes"]
+
+
+QUANTITIES = {
+    "light_seconds": Quantity("lights [s]", lambda run: _stages(run, LIGHT_STAGES)),
+    "seconds": Quantity("time [s]", lambda run: run["seconds"]),
+    "render_seconds": Quantity("render [s]", _render_seconds),
+    "choosing_seconds": Quantity("choosing [s]", lambda run: _stages(run, CHOOSING_STAGES.get(run["integrator"], ()))),
+    "separation_seconds": Quantity("separation [s]", lambda run: _stages(run, SEPARATION_STAGES)),
+    "rays": Quantity("rays per pixel", lambda run: analysis.cost_of(run, "rays")),
+    "bounds": Quantity("bounds per pixel", _per_pixel("bounds_per_sample")),
+    "columns": Quantity("columns or cut", lambda run: run["cut_size_per_sample"]),
+    "sampling_rate": Quantity("sampling rate", _ratio("shadow_rays", "entries"), percent=True),
+    "slices": Quantity("slices", _slices),
+    "lights": Quantity("lights", _light_count),
+    "points": Quantity("surface points", _counter("gather_points")),
+    "memory": Quantity("peak memory [GB]", lambda run: run["peak_memory_bytes"] / 1e9),
+    "passes": Quantity("passes per point", _ratio("passes", "gather_points")),
+    "clusters": Quantity("clusters per point", _ratio("clusters", "gather_points")),
+    "relative_l1": Quantity("rel. L1", _error("relative_l1"), percent=True),
+    "rmse": Quantity("RMSE", _error("rmse")),
+    "relmse_trimmed": Quantity("relMSE, trimmed", _error("relmse_trimmed")),
+}
