@@ -82,11 +82,14 @@ class Found:
 
 
 class Problem:
-    """Lights and gather points of a scene, and the exact light of as many of its pixels as have ``points`` samples."""
+    """Lights and gather points of a scene, and the exact light of as many of its pixels as have ``points`` samples.
 
-    def __init__(self, name: str, samples: int, width: int, points: int):
-        self.settings = {"max_depth": DEPTH, "vpl_count": VPLS}
-        self.scene, self.samples = scenes.load(name, width), samples
+    ``scene``: already loaded, or None for that of the name.
+    """
+
+    def __init__(self, name: str, samples: int, width: int, points: int, max_depth: int = DEPTH, scene=None):
+        self.settings = {"max_depth": max_depth, "vpl_count": VPLS}
+        self.scene, self.samples = scene or scenes.load(name, width), samples
         self.pixels = width * scenes.height(name, width)
         rays = scenes.camera_rays(self.scene, 0, samples)
         plugin = self.plugin("lightcuts")

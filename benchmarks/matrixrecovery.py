@@ -5,6 +5,8 @@
 table     [MSR] Table 1: shadow rays, sampling rate, columns, time by stage and error; the other methods with the
           parameter that gives the same mean absolute error of pixels, and with that which takes as many rays; and what
           a shadow ray would have to cost more for both to take as long.
+cost      the same at equal error in scenes/veils.xml, with more and more veils, which make shadow rays dearer and
+          dearer: whether and where the method is the fastest.
 steps     [MSR] figure 8: error and rays with one step after another left out, and with light separated as in the paper.
 pictures  [MSR] figure 7: the matrices of one slice of each scene, as PNG files below --out (needs matplotlib).
 
@@ -19,7 +21,9 @@ from __future__ import annotations
 
 import argparse
 import os
+import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import mitsuba as mi
@@ -40,6 +44,7 @@ SAMPLES = 4
 # Where all lights are summed for pictures, which do not look at errors
 _FEW_POINTS = 400
 NAMES = ("cornell", "kitchen", "sponza_crytek", "dining_room", "bistro_interior")
+VEILS, VEILS_DEPTH = (0, 8, 16, 32), 80
 STEPS = {
     "all": {},
     "no prediction": {"prediction": False},
@@ -65,16 +70,7 @@ def table(names, options) -> None:
     ratios: dict = {}
     for name in names:
         problem = Problem(name, SAMPLES, options.width, options.points)
-        plugins = {METHOD: problem.plugin(METHOD)}
-        ours = problem.shade(plugins[METHOD])
-        for other in OTHERS:
-            tried = [(more, *problem.quality_for(other, ours.absolute, **more)) for more in OTHERS[other]]
-            more, quality, _ = min(tried, key=lambda one: one[2].rays)
-            at_rays, _ = problem.quality_for(other, ours.rays, "rays", **more)
-            for measure, value in (("error", quality), ("rays", at_rays)):
-                label = f"{other}, equal {measure}: {QUALITY[other].show(value)} {more or ''}"
-                plugins[label] = problem.plugin(other, **{QUALITY[other].name: value}, **more)
-        found = problem.interleaved(plugins)
+        found = problem.interleaved(_equal_plugins(problem, ("error", "rays")))
         ours = found[METHOD]
         for label, one in found.items():
             _show(name, label, one, ours, problem)
@@ -85,6 +81,44 @@ def table(names, options) -> None:
     for method, pairs in ratios.items():
         rays, seconds = (scenes.geometric_mean(values) for values in zip(*pairs, strict=True))
         print(f"geometric means over {method}: {rays:.2f} times fewer rays, {seconds:.2f} times faster")
+
+
+def _equal_plugins(problem: Problem, measures) -> dict:
+    """Our method, and the others with that value of their parameter that gives the same error or rays, by label."""
+    plugins = {METHOD: problem.plugin(METHOD)}
+    ours = problem.shade(plugins[METHOD])
+    for other in OTHERS:
+        tried = [(more, *problem.quality_for(other, ours.absolute, **more)) for more in OTHERS[other]]
+        more, value, _ = min(tried, key=lambda one: one[2].rays)
+        for measure in measures:
+            if measure == "rays":
+                value, _ = problem.quality_for(other, ours.rays, "rays", **more)
+            label = f"{other}, equal {measure}: {QUALITY[other].show(value)} {more or ''}"
+            plugins[label] = problem.plugin(other, **{QUALITY[other].name: value}, **more)
+    return plugins
+
+
+def costs(_, options) -> None:
+    """Part "cost"."""
+    print(f"\n## dearer and dearer rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
+    print("veils | method | s | rays/px | mean absolute | RMSE | ns a ray, all in all | fewer rays | faster")
+    for veils in VEILS:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "veils.xml"
+            command = ["scenes/veils.py", "--veils", str(veils), "--output", str(file)]
+            subprocess.run([sys.executable, *command], cwd=scenes.PROJECT, check=True)
+            size = {"resx": options.width, "resy": scenes.height("veils", options.width)}
+            scene = mi.load_file(str(file), **size)
+        problem = Problem("veils", SAMPLES, options.width, options.points, VEILS_DEPTH, scene)
+        found = problem.interleaved(_equal_plugins(problem, ("error",)))
+        ours = found[METHOD]
+        for label, one in found.items():
+            each = 1e9 * one.seconds / (one.rays * problem.pixels)
+            print(
+                f"{veils} | {label} | {one.seconds:.2f} | {one.rays:.1f} | {100 * one.absolute:.2f}% | "
+                f"{one.rmse:.4f} | {each:.0f} | {one.rays / ours.rays:.1f} | {one.seconds / ours.seconds:.2f}",
+                flush=True,
+            )
 
 
 def _show(name: str, label: str, one: Found, ours: Found, problem: Problem) -> None:
@@ -140,7 +174,7 @@ def main() -> None:
     """Parse the command line and run the parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(NAMES), choices=scenes.NAMES)
-    parts = {"table": table, "steps": steps, "pictures": pictures}
+    parts = {"table": table, "cost": costs, "steps": steps, "pictures": pictures}
     parser.add_argument("--parts", nargs="+", default=list(parts), choices=list(parts))
     parser.add_argument("--width", type=int, default=256, help="pixels (default: 256)")
     parser.add_argument("--points", type=int, default=8000, help="where all lights are summed (default: 8000)")

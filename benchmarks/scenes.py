@@ -17,7 +17,7 @@ NAMES = (
 # Heights at a width of 256, by the aspect of the references
 _HEIGHTS = {
     "cornell": 256, "glossy": 256, "everything8003": 256, "bistro_interior": 192, "kitchen_lamps": 192,
-    "kitchen_windows": 192, "forest_lights": 192, "concourse": 192,
+    "kitchen_windows": 192, "forest_lights": 192, "concourse": 192, "veils": 192,
 }  # fmt: skip
 
 

@@ -156,14 +156,19 @@ def downlight(position, cutoff, intensity, colour, random):
     )
 
 
-def write_scene(document, name, make, images=None, arguments=None):
-    """The command line of a generator: write `make(seed)` to the output, which is `name`.xml by default, and the
-    textures of `images` (name: texels) beside it."""
+def write_scene(document, name, make, images=None, arguments=None, counts=None):
+    """The command line of a generator: write `make(seed, **counts)` to the output, which is `name`.xml by default, and
+    the textures of `images` (name: texels) beside it. Each of the `counts` (name: usual number) is an option."""
     command_line = parser(document, f"{name}.xml")
+    for what, usual in (counts or {}).items():
+        command_line.add_argument(f"--{what}", type=int, default=usual, help=f"how many (default: {usual})")
     options = command_line.parse_args(arguments)
     output = options.output or Path(f"{name}.xml")
+    numbers_of = {what: getattr(options, what) for what in counts or {}}
     try:
-        output.write_text(make(options.seed))
+        if any(number < 0 for number in numbers_of.values()):
+            raise ValueError(f"numbers must not be negative, got {numbers_of}")
+        output.write_text(make(options.seed, **numbers_of))
         for file, texels in (images or {}).items():
             write_image(output.parent / file, texels)
     except (ValueError, OSError) as error:

@@ -1,4 +1,5 @@
-"""Render the small pictures beside the scenes, by `lightcuts` with adaptive direct light, the forest by direct light.
+"""Render the small pictures beside the scenes, by `lightcuts` with adaptive direct light, the forest by direct light,
+the veils with lamps that are virtual lights.
 
 ./run -- python scenes/previews.py [NAME...]
 """
@@ -9,8 +10,9 @@ from pathlib import Path
 import mitsuba as mi
 
 FOLDER = Path(__file__).resolve().parent
-WIDTH, SAMPLES, FEW_SAMPLES, DEPTH = 192, 16, 4, 8
+WIDTH, SAMPLES, FEW_SAMPLES, DEPTH, DEEP = 192, 16, 4, 8, 24
 DIRECT = ("forest_lights",)  # light paths among so many leaves would take minutes
+BEHIND_MASKS = ("veils",)  # which emitter sampling does not pass, as in Mitsuba's integrators
 
 
 def preview(name):
@@ -22,7 +24,9 @@ def preview(name):
     if name in DIRECT:
         integrator, samples = {"type": "adaptivedirect"}, FEW_SAMPLES
     else:
-        integrator, samples = {"type": "lightcuts", "max_depth": DEPTH, "direct": "adaptive"}, SAMPLES
+        direct = "vpl" if name in BEHIND_MASKS else "adaptive"
+        depth = DEEP if name in BEHIND_MASKS else DEPTH
+        integrator, samples = {"type": "lightcuts", "max_depth": depth, "direct": direct}, SAMPLES
     image = mi.render(scene, integrator=mi.load_dict(integrator), spp=samples)
     mi.util.write_bitmap(str(FOLDER / f"{name}.png"), image, write_async=False)
 

@@ -31,7 +31,7 @@ def kinds(text):
     return [len(re.findall(f'<emitter type="{kind}">', text)) for kind in ("point", "spot", "area")]
 
 
-@pytest.mark.parametrize("name", ["cornell", "glossy", "hall", "banquet", "arcade", "corridor", "furnace"])
+@pytest.mark.parametrize("name", ["cornell", "glossy", "hall", "banquet", "arcade", "corridor", "veils", "furnace"])
 def test_scene_takes_the_usual_parameters(name):
     defines = {"integrator": "direct", "max_depth": "3", "spp": "7", "resx": "16", "resy": "8"}
     file = SceneFile(ROOT / "scenes" / f"{name}.xml", defines)
@@ -52,7 +52,7 @@ def test_shipped_hall_is_what_the_generator_makes(generator, tmp_path):
 
 
 # Points, spots and areas of the scenes that have one number of them
-OTHERS = {"banquet": [0, 60, 66], "arcade": [0, 0, 0], "corridor": [0, 0, 32]}
+OTHERS = {"banquet": [0, 60, 66], "arcade": [0, 0, 0], "corridor": [0, 0, 32], "veils": [0, 0, 6]}
 
 
 @pytest.mark.parametrize("name", OTHERS)
