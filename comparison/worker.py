@@ -19,6 +19,8 @@ from dataclasses import asdict, dataclass, field
 from itertools import count
 from pathlib import Path
 
+import numpy as np
+
 from . import images, machine
 from .command_line import explain, set_variant, versions
 from .rendering import Progressive, largest_pass, pass_seed, pass_sizes, total_statistics
@@ -28,7 +30,8 @@ ROOT = Path(__file__).resolve().parent.parent
 TICK = 0.5  # seconds
 LONG_PASS = 60.0  # seconds; with given samples, a first pass longer than this is no longer rendered twice
 WARM_SPP = 4  # Mitsuba compiles other kernels for passes of fewer samples per pixel
-PASSES_IN_BUDGET = 3  # or about so many, unless even passes of one sample per pixel take longer
+PASSES_IN_BUDGET = 3  # or about so many, or fewer where starting them takes
+START_SHARE = 0.3  # of the time, or more
 UNUSED_PASSES = 2**31  # passes that are not in the image are numbered from here, so that they share no lights with it
 
 
@@ -175,7 +178,7 @@ def _measure(progressive, job):
         for spp in sizes[len(progressive.passes) :]:
             progressive.render(spp)
     elif not kept:
-        spp = job.pass_spp or _samples_of_a_pass(progressive, job.budget / PASSES_IN_BUDGET, unused)
+        spp = job.pass_spp or _samples_of_a_pass(progressive, job.budget, unused)
         progressive.restart()
         following = spp
         while following:
@@ -197,22 +200,27 @@ def _samples_that_fit(progressive, spp, budget):
     return least if left > least / 2 else 0
 
 
-def _samples_of_a_pass(progressive, seconds, seeds):
-    """Return the samples per pixel of passes of about the given time, found by rendering some.
+def _samples_of_a_pass(progressive, budget, seeds):
+    """Return the samples per pixel of the passes that a budget is divided into, found by rendering some.
 
-    One if that takes longer: every pass has virtual lights of its own. More where the cost of starting a pass would
-    matter.
+    Of about `PASSES_IN_BUDGET` passes, or of fewer where starting them (every pass has virtual lights of its own, and
+    trees) would take more than `START_SHARE` of the time; one sample if even that takes half of the budget.
     """
     largest = largest_pass(progressive.pixels)
-    if largest < WARM_SPP or progressive.render(1, next(seeds)).seconds > seconds:
+    first = progressive.render(1, next(seeds)).seconds
+    if largest < WARM_SPP or first > budget / 2:
         return 1
-    spp = WARM_SPP
-    progressive.render(spp, next(seeds))
-    while spp < largest:
-        growth = seconds / progressive.render(spp, next(seeds)).seconds
-        if growth < 1.5:
+    progressive.render(WARM_SPP, next(seeds))  # compiles
+    more = progressive.render(WARM_SPP, next(seeds)).seconds - first
+    each = max(more, 0.01 * first) / (WARM_SPP - 1)
+    start = max(first - each, 0)
+    seconds = min(max(budget / PASSES_IN_BUDGET, start / START_SHARE), budget)
+    spp = int(np.clip((seconds - start) / each, 1, largest))
+    for _ in range(3):
+        taken = progressive.render(spp, next(seeds)).seconds
+        if taken <= 1.25 * seconds:
             break
-        spp = min(largest, int(spp * growth))
+        spp = max(int(spp * seconds / taken), 1)
     return spp
 
 

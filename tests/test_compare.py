@@ -153,17 +153,19 @@ def test_worker_measures_within_a_time_budget(tmp_path):
 
 
 class Recorded(rendering.Progressive):
-    """A render that takes as long as it is told, by default a second a sample, and remembers what it was asked for."""
+    """A render that takes as long as it is told, by default a second a sample after ``start``, and remembers what it
+    was asked for."""
 
-    def __init__(self, pixels, *seconds):
-        self._pixels, self._seconds, self.asked = pixels, list(seconds), []
+    def __init__(self, pixels, *seconds, start=0.0):
+        self._pixels, self._seconds, self._start, self.asked = pixels, list(seconds), start, []
         self.restart()
 
     pixels = property(lambda self: self._pixels)
 
     def render(self, spp, seed=None):
         self.asked.append((spp, seed is not None))
-        self.passes.append(rendering.Pass(seed or 0, spp, self._seconds.pop(0) if self._seconds else float(spp)))
+        seconds = self._seconds.pop(0) if self._seconds else self._start + spp
+        self.passes.append(rendering.Pass(seed or 0, spp, seconds))
         return self.passes[-1]
 
 
@@ -196,6 +198,28 @@ def test_the_last_pass_fills_the_budget(budget, pass_spp, passes):
     worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget, pass_spp=pass_spp))
     assert [one.spp for one in progressive.passes] == passes
     assert abs(progressive.seconds - budget) <= min(pass_spp, worker.WARM_SPP) / 2
+
+
+@pytest.mark.parametrize(
+    ("budget", "start", "spp"),
+    [
+        (30, 0, 10),  # three passes
+        (30, 2, 8),  # which take as long with what starting them takes
+        (30, 6, 14),  # starting takes no more than three tenths
+        (30, 12, 18),  # one pass that fills the budget
+        (30, 15, 1),  # one sample takes half of it
+        (3000, 0, 1000),
+        (10_000, 0, 2048),  # the largest pass
+    ],
+)
+def test_passes_are_as_large_as_the_cost_of_starting_one_asks_for(budget, start, spp):
+    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 2048, start=float(start))
+    assert worker._samples_of_a_pass(progressive, budget, iter(range(100))) == spp
+
+
+def test_passes_that_turn_out_to_be_slower_are_made_smaller():
+    progressive = Recorded(100, 1.0, 4.0, 4.0, 50.0)
+    assert worker._samples_of_a_pass(progressive, 30, iter(range(100))) == 2
 
 
 def test_worker_that_dies_is_an_error(tmp_path, monkeypatch):
