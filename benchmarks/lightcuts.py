@@ -6,7 +6,7 @@ brute  same VPLs, one run: time and error of ``lightcuts`` at 1% against plugin 
        random subset of points and its time scaled to all of them.
 rays   shadow rays per second of the whole cut evaluation, against the same rays traced alone in one batch.
 cold   first render in a fresh process with an empty kernel cache, against ``path``.
-path   error at equal time and time at equal error against the path-traced references.
+path   ``lightcuts`` and ``mdlightcuts`` against ``path`` in equal time, by compare.py, with its report in output/path.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 mi.set_variant("llvm_ad_rgb")
 
+import compare  # noqa: E402
 import integrators  # noqa: E402, F401
 from benchmarks import scenes  # noqa: E402
-from comparison import references  # noqa: E402
-from comparison.metrics import compare  # noqa: E402
 from vpl.arrays import download, upload  # noqa: E402
 from vpl.cuts import collect_cuts, limited_cuts  # noqa: E402
 from vpl.evaluation import sum_all_lights  # noqa: E402
@@ -167,38 +166,16 @@ def cold_starts(names) -> None:
 
 
 def against_path(names, budget: float) -> None:
-    """Part "path": relMSE (0.1% trimmed, the reference's noise taken off) after ``budget`` seconds, warm."""
-    print(f"\n## against path at {budget:g} s, warm, relMSE trimmed by 0.1%, noise of the reference taken off")
-    print("scene | lightcuts relMSE (bias) | path relMSE | path's time for lightcuts' error, s | times slower")
-    for name in names:
-        if scenes.reference_file(name) is None:
-            continue
-        known = references.read(scenes.reference_file(name))
-        results = {}
-        for label, plugin in (("lightcuts", lightcuts()), ("path", mi.load_dict({"type": "path", "max_depth": DEPTH}))):
-            scene = scenes.load(name)
-            results[label] = _within(scene, plugin, budget, known.image, known.standard_error)
-        ours, path = results["lightcuts"], results["path"]
-        # The variance of path falls as 1 / time
-        needed = path["seconds"] * path["relmse_trimmed"] / max(ours["relmse_trimmed"], 1e-12)
-        mark = " (below the reference's noise)" if "relmse_trimmed" in ours["below_noise"] else ""
-        print(
-            f"{name} | {ours['relmse_trimmed']:.4f} ({100 * ours['bias']:+.1f}%){mark} | "
-            f"{path['relmse_trimmed']:.4f} | "
-            f"{needed:.0f} | {needed / ours['seconds']:.1f}",
-            flush=True,
-        )
-
-
-def _within(scene, plugin, budget: float, reference, noise) -> dict:
-    """Errors of the average of as many passes as fit into ``budget`` seconds, at least one."""
-    mi.render(scene, integrator=plugin, spp=1, seed=99)
-    seconds, total, count = 0.0, 0.0, 0
-    spp = 2 if plugin.class_name() != "PathIntegrator" else 8
-    while count == 0 or seconds * (count + 1) / count <= budget:
-        image, spent = scenes.timed(lambda: mi.render(scene, integrator=plugin, spp=spp, seed=count))  # noqa: B023
-        total, seconds, count = total + np.array(image, np.float64), seconds + spent, count + 1
-    return compare(total / count, reference, noise) | {"seconds": seconds}
+    """Part "path": what compare.py prints for the scenes that have a reference."""
+    files = [str(scenes.scene_file(name)) for name in names if scenes.reference_file(name)]
+    if files:
+        compare.main(
+            [
+                *files, "--integrators", "path,lightcuts,mdlightcuts", "--param", "mdlightcuts.error=0.02",
+                "--max-depth", str(DEPTH), "--time", f"{budget:g}", "--reference", str(scenes.REFERENCES),
+                "--out", "output/path",
+            ]
+        )  # fmt: skip
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 PROJECT = Path(__file__).resolve().parent.parent
 SHARED = PROJECT.parent / "shared"
+REFERENCES = SHARED / "references"
 NAMES = (
     "cornell", "kitchen", "sponza_crytek", "staircase2", "living_room", "dining_room", "bistro_interior",
     "veach_ajar", "everything8003",
@@ -34,7 +35,7 @@ def scene_file(name: str) -> Path:
 
 def reference_file(name: str) -> Path | None:
     """The path-traced reference of a scene at a width of 256, if there is one."""
-    path = SHARED / "references" / f"{name}.exr"
+    path = REFERENCES / f"{name}.exr"
     return path if path.exists() else None
 
 
