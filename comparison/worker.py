@@ -30,8 +30,8 @@ ROOT = Path(__file__).resolve().parent.parent
 TICK = 0.5  # seconds
 LONG_PASS = 60.0  # seconds; with given samples, a first pass longer than this is no longer rendered twice
 WARM_SPP = 4  # Mitsuba compiles other kernels for passes of fewer samples per pixel
-PASSES_IN_BUDGET = 3  # or about so many, or fewer where starting them takes
-START_SHARE = 0.3  # of the time, or more
+PASSES_IN_BUDGET = 3  # or about so many; fewer, where starting that many would take more of it than
+START_SHARE = 0.3
 UNUSED_PASSES = 2**31  # passes that are not in the image are numbered from here, so that they share no lights with it
 
 
@@ -178,50 +178,56 @@ def _measure(progressive, job):
         for spp in sizes[len(progressive.passes) :]:
             progressive.render(spp)
     elif not kept:
-        spp = job.pass_spp or _samples_of_a_pass(progressive, job.budget, unused)
+        spp, start = (job.pass_spp, 0.0) if job.pass_spp else _samples_of_a_pass(progressive, job.budget, unused)
         progressive.restart()
         following = spp
         while following:
             progressive.render(following)
-            following = _samples_that_fit(progressive, spp, job.budget)
+            following = _samples_that_fit(progressive, spp, job.budget, start)
     return cold, kept
 
 
-def _samples_that_fit(progressive, spp, budget):
+def _samples_that_fit(progressive, spp, budget, start):
     """Return the samples per pixel of the next pass, 0 if the budget is used up: `spp`, or in the last pass as many as
-    there is time for. Fewer than `WARM_SPP` are not worth one, unless `spp` is; whether that many are still rendered is
-    decided by what is nearer to the budget."""
+    there is time for, when it has been started in `start` seconds. Fewer than `WARM_SPP` are not worth one, unless
+    `spp` is; whether that many are still rendered is decided by what is nearer to the budget."""
     if progressive.passes[-1].spp < spp:
         return 0
-    each, least = progressive.seconds / progressive.spp, min(spp, WARM_SPP)
-    left = (budget - progressive.seconds) / each
-    if left >= least:
-        return min(spp, int(left))
-    return least if left > least / 2 else 0
+    sampling = progressive.seconds - len(progressive.passes) * start
+    each, least = max(sampling, 0.1 * progressive.seconds) / progressive.spp, min(spp, WARM_SPP)
+    left = budget - progressive.seconds
+    if left - start >= least * each:
+        return min(spp, int((left - start) / each))
+    return least if left > (start + least * each) / 2 else 0
 
 
 def _samples_of_a_pass(progressive, budget, seeds):
-    """Return the samples per pixel of the passes that a budget is divided into, found by rendering some.
+    """Return the samples per pixel of the passes that a budget is divided into, found by rendering some, and the
+    seconds that starting one takes.
 
     Of about `PASSES_IN_BUDGET` passes, or of fewer where starting them (every pass has virtual lights of its own, and
-    trees) would take more than `START_SHARE` of the time; one sample if even that takes half of the budget.
+    trees) would take more than `START_SHARE` of the time; one sample, and no time to start that is known, if even that
+    takes half of the budget.
     """
     largest = largest_pass(progressive.pixels)
+    if largest < WARM_SPP:
+        return 1, 0.0
     first = progressive.render(1, next(seeds)).seconds
-    if largest < WARM_SPP or first > budget / 2:
-        return 1
+    if first > budget / 2:
+        return 1, 0.0
     progressive.render(WARM_SPP, next(seeds))  # compiles
     more = progressive.render(WARM_SPP, next(seeds)).seconds - first
     each = max(more, 0.01 * first) / (WARM_SPP - 1)
     start = max(first - each, 0)
-    seconds = min(max(budget / PASSES_IN_BUDGET, start / START_SHARE), budget)
+    affordable = START_SHARE * budget / start if start > 0 else PASSES_IN_BUDGET
+    seconds = budget / np.clip(int(affordable), 1, PASSES_IN_BUDGET)  # of one pass
     spp = int(np.clip((seconds - start) / each, 1, largest))
     for _ in range(3):
         taken = progressive.render(spp, next(seeds)).seconds
-        if taken <= 1.25 * seconds:
+        if taken <= 1.1 * seconds:
             break
         spp = max(int(spp * seconds / taken), 1)
-    return spp
+    return spp, start
 
 
 def _render_vpl(job, passes, described):

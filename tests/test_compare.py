@@ -201,25 +201,25 @@ def test_the_last_pass_fills_the_budget(budget, pass_spp, passes):
 
 
 @pytest.mark.parametrize(
-    ("budget", "start", "spp"),
+    ("budget", "start", "passes"),
     [
-        (30, 0, 10),  # three passes
-        (30, 2, 8),  # which take as long with what starting them takes
-        (30, 6, 14),  # starting takes no more than three tenths
-        (30, 12, 18),  # one pass that fills the budget
-        (30, 15, 1),  # one sample takes half of it
-        (3000, 0, 1000),
-        (10_000, 0, 2048),  # the largest pass
+        (30, 2, [8, 8, 8]),
+        (30, 4, [11, 11]),  # starting them takes no more than three tenths
+        (30, 15, [1, 1]),  # one sample takes half of it
+        (10_000, 0, [2048, 2048, 2048, 2048, 1808]),  # the largest pass
     ],
 )
-def test_passes_are_as_large_as_the_cost_of_starting_one_asks_for(budget, start, spp):
+def test_passes_are_as_large_as_the_cost_of_starting_one_asks_for(budget, start, passes):
     progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 2048, start=float(start))
-    assert worker._samples_of_a_pass(progressive, budget, iter(range(100))) == spp
+    worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget))
+    assert [one.spp for one in progressive.passes] == passes and abs(progressive.seconds - budget) <= 2
 
 
-def test_passes_that_turn_out_to_be_slower_are_made_smaller():
-    progressive = Recorded(100, 1.0, 4.0, 4.0, 50.0)
-    assert worker._samples_of_a_pass(progressive, 30, iter(range(100))) == 2
+def test_passes_may_turn_out_to_be_slower_or_faster():
+    assert worker._samples_of_a_pass(Recorded(100, 1.0, 4.0, 4.0, 50.0), 30, iter(range(100)))[0] == 2
+    progressive = Recorded(100, 13.0, 13.0, 16.0, 16.0, 30.0, 25.5, start=12.0)
+    worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=30))
+    assert progressive.seconds == 25.5  # four more samples would take 15 seconds
 
 
 def test_worker_that_dies_is_an_error(tmp_path, monkeypatch):
