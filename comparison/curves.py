@@ -102,7 +102,9 @@ class Curve:
         read, at_most = self.error_at(value) if axis == 0 else self.cost_at(value)
         if at_most is not None:
             pairs = {point.name: point.mean() or point.bound() for point in self.points}
-            return {next(name for name, pair in pairs.items() if pair and pair[1 - axis] == at_most): 1.0}
+            # Bounds may be alike, as the reference's noise is: of them, one that is not beyond the place
+            reached = {name: pair for name, pair in pairs.items() if pair and pair[axis] <= value}
+            return {next(name for name, pair in reached.items() if pair[1 - axis] == at_most): 1.0}
         if read is None:
             return {}
         front = set(zip(*map(np.ndarray.tolist, self.front()), strict=True))

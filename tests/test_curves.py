@@ -95,6 +95,8 @@ def test_places_are_between_two_settings():
     assert beaten.between(2, 0) == pytest.approx({"1": 0.5, "3": 0.5})
     hidden = Curve("d", [point("d", "1", 1, 1.0), point("d", "2", 4, 0.25, noise=0.3), point("d", "3", 8, 0.5)])
     assert hidden.between(0.5, 1) == hidden.between(20, 0) == {"2": 1.0} and hidden.between(0.29, 1) == {}
+    alike = Curve("e", [point("e", "1", 16, 0.1, noise=0.3), point("e", "2", 2, 0.2, noise=0.3)])
+    assert alike.between(4, 0) == {"2": 1.0}
 
 
 def test_what_the_noise_hides_is_in_no_curve():
