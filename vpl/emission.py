@@ -31,13 +31,16 @@ class Choice:
         cumulative = np.cumsum(self.pmf)
         last = np.flatnonzero(self.pmf)[-1]
         cumulative[last:] = np.inf  # rounding must not let u = 1 - eps fall past the last row with weight
-        self._cumulative = upload(mi.Float, cumulative)
+        # The search's kernel holds its bounds: the same for all lengths up to a power of two
+        padding = (1 << len(weight).bit_length()) - len(weight)
+        self._cumulative = upload(mi.Float, np.append(cumulative, np.full(padding, np.inf)))
         self._pmf = upload(mi.Float, self.pmf)
         self.count = len(weight)
 
     def row(self, sample):
         """Row for a uniform number in [0, 1): the first whose cumulative probability exceeds it."""
-        return dr.binary_search(0, self.count, lambda i: dr.gather(mi.Float, self._cumulative, i) <= sample)
+        length = dr.width(self._cumulative)
+        return dr.binary_search(0, length, lambda i: dr.gather(mi.Float, self._cumulative, i) <= sample)
 
     def probability(self, row, active=True):
         """Probability of a row (0 where not active)."""
@@ -65,7 +68,7 @@ def other_power(emitter, bounding_sphere) -> float:
 def bounding_box(scene):
     """The scene's box, with the shapes that Mitsuba 3.9.1 leaves out: rectangles that it merged have no box.
 
-    Raises a ValueError for a shape of its own that has none, which is one whose transformation is not finite.
+    Raises a ValueError for a shape that was not merged and has no box either: its transformation is not finite.
     """
     box = scene.bbox()
     for shape in scene.shapes():
