@@ -206,7 +206,10 @@ def _class(entry, row):
 
 def _how_read(table, entry):
     """Say how the rows came about."""
-    paper = f"[{table.paper}]: the figures of {PAPERS[table.paper]}, from the least to the largest of its scenes."
+    paper = (
+        f"[{table.paper}]: the figures of {PAPERS[table.paper]}, from the least to the largest of its scenes, blank "
+        "where it gives none."
+    )
     if entry["equal"] is None:
         ratios = " Their errors differ: ratios are not at equal error." if table.ratios else ""
         return f"Runs as they are, means over seeds.{ratios} {paper}"

@@ -27,10 +27,6 @@ class Quantity:
     percent: bool = False
 
 
-def _counter(name):
-    return lambda run: run["statistics"].get(name)
-
-
 def _error(name):
     return lambda run: run["errors"][name] if "errors" in run else None
 
@@ -64,10 +60,14 @@ def _light_count(run):
     return None if lights is None else sum(lights.values())
 
 
-def _slices(run):
-    """Return how many there are in one pass: each has its own, and counters of passes are added up."""
-    slices = run["statistics"].get("slices")
-    return None if slices is None else slices / run["passes"]
+def _per_pass(name):
+    """Return a function to a counter of what every pass has of its own: counters of passes are added up."""
+
+    def of(run):
+        count = run["statistics"].get(name)
+        return None if count is None else count / run["passes"]
+
+    return of
 
 
 QUANTITIES = {
@@ -80,9 +80,9 @@ QUANTITIES = {
     "bounds": Quantity("bounds per pixel", _per_pixel("bounds_per_sample")),
     "columns": Quantity("columns or cut", lambda run: run["cut_size_per_sample"]),
     "sampling_rate": Quantity("sampling rate", _ratio("shadow_rays", "entries"), percent=True),
-    "slices": Quantity("slices", _slices),
+    "slices": Quantity("slices", _per_pass("slices")),
     "lights": Quantity("lights", _light_count),
-    "points": Quantity("surface points", _counter("gather_points")),
+    "points": Quantity("surface points", _per_pass("gather_points")),
     "memory": Quantity("peak memory [GB]", lambda run: run["peak_memory_bytes"] / 1e9),
     "passes": Quantity("passes per point", _ratio("passes", "gather_points")),
     "clusters": Quantity("clusters per point", _ratio("clusters", "gather_points")),
