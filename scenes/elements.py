@@ -1,5 +1,5 @@
-"""Building blocks of the generated scenes, as XML text: what hall.py has, and what the scenes of `kitchen_lamps.py`,
-`forest_lights.py` and `concourse.py` share beyond it (glossy materials, turned slabs, lamps, skies).
+"""Building blocks of the generated scenes, as XML text: what hall.py has, and what the other generators share
+beyond it (glossy materials, turned slabs, lamps, skies, the command line).
 """
 
 import argparse
@@ -164,11 +164,12 @@ def write_scene(document, name, make, images=None, arguments=None, counts=None):
         command_line.add_argument(f"--{what}", type=int, default=usual, help=f"how many (default: {usual})")
     options = command_line.parse_args(arguments)
     output = options.output or Path(f"{name}.xml")
-    numbers_of = {what: getattr(options, what) for what in counts or {}}
+    given = {what: getattr(options, what) for what in counts or {}}
     try:
-        if any(number < 0 for number in numbers_of.values()):
-            raise ValueError(f"numbers must not be negative, got {numbers_of}")
-        output.write_text(make(options.seed, **numbers_of))
+        for what, number in given.items():
+            if number < 0:
+                raise ValueError(f"the number of {what} must not be negative, got {number}")
+        output.write_text(make(options.seed, **given))
         for file, texels in (images or {}).items():
             write_image(output.parent / file, texels)
     except (ValueError, OSError) as error:

@@ -9,6 +9,8 @@ from scipy import stats
 from vpl.arrays import download
 from vpl.sampling import SpreadSamples
 
+from .conftest import area_light, render, sensor, wall
+
 SEQUENCES, MEMBERS = 2000, 64
 
 
@@ -45,3 +47,18 @@ def test_other_seeds_give_other_sequences(variant):
     lane = dr.arange(mi.UInt32, 8)
     first, second = (download(SpreadSamples(lane, seed).at(mi.UInt32(0))[0]) for seed in (1, 2))
     assert np.abs(first - second).min() > 0
+
+
+def test_rays_of_a_pixel_share_a_sequence(variant):
+    """Sixteen rays with one sample each leave as little noise as one ray with sixteen."""
+    floor = wall([0, -1, 0], [1, 0, 0], -90, 2.0)
+    scene = mi.load_dict({"type": "scene", "sensor": sensor(16, 1), "floor": floor, "lamp": area_light()})
+
+    def noise(rays, samples):
+        given = {"max_depth": 2, "emitter_samples": samples}
+        images = np.stack([render(scene, "lightcuts", rays, seed, **given) for seed in range(12)])
+        lit = images.mean(0) > 0
+        return np.median(images.std(0)[lit] / images.mean(0)[lit])
+
+    assert noise(16, 1) < 1.5 * noise(1, 16)
+    assert noise(16, 1) < 0.3 * noise(1, 1)

@@ -106,6 +106,19 @@ def test_hall_without_lights_is_refused(generator, tmp_path, capsys):
     assert "at least one light" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("count", ["0", "1", "5", "-1"])
+def test_veils_are_as_many_as_asked_for(count, tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(ROOT / "scenes")
+    main, output = importlib.import_module("veils").main, tmp_path / "veils.xml"
+    if count == "-1":
+        with pytest.raises(SystemExit):
+            main(["--veils", count, "--output", str(output)])
+        assert "the number of veils must not be negative, got -1" in capsys.readouterr().err
+    else:
+        main(["--veils", count, "--output", str(output)])
+        assert output.read_text().count('<ref id="gauze"/>') == int(count)
+
+
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/scenes")
 def test_scenes_of_others_parse():
     for path in sorted(SHARED.glob("*/scene.xml")):
