@@ -216,7 +216,7 @@ def follow_camera_rays(
     ray.time += dr.zeros(mi.Float, count)
     ray.maxt += dr.zeros(mi.Float, count)
     lane = dr.arange(mi.UInt32, count)
-    active = mi.Bool(active) & (lane < count)
+    active = mi.Bool(active) & (lane < dr.opaque(mi.UInt32, count))
     limits = (dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF))), dr.opaque(mi.UInt32, rr_depth))
     throughput, depth = ones(count), 1
     found = None
