@@ -64,7 +64,7 @@ def hangings(count, random):
         yield flat("rectangle", "gauze", place, (np.sin(angle), -side * np.cos(angle), 0), (3.6, 1.4))
 
 
-def veils(seed, veils):
+def hall(seed, veils):
     """Return the scene as XML text, the same for the same seed."""
     random = np.random.default_rng(seed)
     command = f"veils.py --seed {seed} --veils {veils} --output scenes/veils.xml"
@@ -74,7 +74,7 @@ def veils(seed, veils):
 
 
 def main(arguments=None):
-    write_scene(__doc__, "veils", veils, arguments=arguments, counts={"veils": 16})
+    write_scene(__doc__, "veils", hall, arguments=arguments, counts={"veils": 16})
 
 
 if __name__ == "__main__":
