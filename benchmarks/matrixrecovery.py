@@ -89,10 +89,9 @@ def _equal_plugins(problem: Problem, measures) -> dict:
     ours = problem.shade(plugins[METHOD])
     for other in OTHERS:
         tried = [(more, *problem.quality_for(other, ours.absolute, **more)) for more in OTHERS[other]]
-        more, value, _ = min(tried, key=lambda one: one[2].rays)
+        more, at_error, _ = min(tried, key=lambda one: one[2].rays)
         for measure in measures:
-            if measure == "rays":
-                value, _ = problem.quality_for(other, ours.rays, "rays", **more)
+            value = at_error if measure == "error" else problem.quality_for(other, ours.rays, measure, **more)[0]
             label = f"{other}, equal {measure}: {QUALITY[other].show(value)} {more or ''}"
             plugins[label] = problem.plugin(other, **{QUALITY[other].name: value}, **more)
     return plugins

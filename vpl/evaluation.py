@@ -43,9 +43,9 @@ def evaluate_representatives(
     this is the same kernel, compiled once.  Returns as :func:`evaluate_pairs`, evaluated.
     """
     dr.eval(rows, light, intensity)
-    shown = group.lights.gather(light)
-    scale = intensity / channel_mean(shown.intensity)
-    value, traced = evaluate_pairs(scene, traits, lights, group, batch.surfaces_at(rows), shown, scale)
+    value, traced = evaluate_pairs(
+        scene, traits, lights, group, batch.surfaces_at(rows), *group.standing_for(light, intensity)
+    )
     dr.eval(value, traced)
     return value, traced
 

@@ -54,13 +54,17 @@ class LightGroup:
         return [(self.lights.gather(index), 1)]
 
     def representatives(self, nodes, second=False):
-        """The light that stands for each node (or its second one), and the factor from its intensity to the cluster's.
+        """The light that stands for each node, or its second one: see :meth:`standing_for`."""
+        return self.standing_for(self.tree.representative(nodes, second=second), self.tree.summed_intensity(nodes))
+
+    def standing_for(self, index, intensity):
+        """Lights by their index, and the factors from their intensities to those of the clusters they stand for.
 
         A representative is drawn with probability intensity / cluster intensity; dividing by it, rather than taking the
-        cluster's colour, keeps the estimate unbiased where colours differ.
+        cluster's colour, keeps the estimate unbiased where colours differ.  ``intensity``: the mean over channels.
         """
-        light = self.lights.gather(self.tree.representative(nodes, second=second))
-        return light, self.tree.summed_intensity(nodes) / channel_mean(light.intensity)
+        light = self.lights.gather(index)
+        return light, intensity / channel_mean(light.intensity)
 
 
 @dataclass
