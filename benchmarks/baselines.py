@@ -31,8 +31,8 @@ mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
 from benchmarks import scenes  # noqa: E402
-from vpl.arrays import download, upload  # noqa: E402
-from vpl.evaluation import sum_all_lights  # noqa: E402
+from vpl.core.arrays import download, upload  # noqa: E402
+from vpl.transport.evaluation import sum_all_lights  # noqa: E402
 
 DEPTH, VPLS, RUNS = 6, 200_000, 3
 # How often, and how closely, the parameter that gives a wanted error is tried for

@@ -33,12 +33,12 @@ mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
 from benchmarks import scenes  # noqa: E402
-from vpl.arrays import download, upload  # noqa: E402
-from vpl.evaluation import sum_all_lights  # noqa: E402
-from vpl.pairs import BoundCounter, Pairs, find_pairs  # noqa: E402
-from vpl.point_clusters import PointClusters  # noqa: E402
-from vpl.shading import contribution  # noqa: E402
-from vpl.visibility import shadow_ray  # noqa: E402
+from vpl.core.arrays import download, upload  # noqa: E402
+from vpl.cuts.product_cuts import BoundCounter, Pairs, find_pairs  # noqa: E402
+from vpl.points.point_clusters import PointClusters  # noqa: E402
+from vpl.transport.contribution import contribution  # noqa: E402
+from vpl.transport.evaluation import sum_all_lights  # noqa: E402
+from vpl.transport.visibility import shadow_ray  # noqa: E402
 
 NAMES = (*scenes.NAMES, "glossy")
 DEPTH, VPLS, WIDTH, SUBSET, RUNS = 6, 200_000, 512, 4000, 3

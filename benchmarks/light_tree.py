@@ -1,7 +1,7 @@
 """How long a light tree takes to build, by stage, and how good it is.
 
     python benchmarks/light_tree.py            # build times, 10,000 to 1.2 million lights
-    python benchmarks/light_tree.py --cuts     # sizes of cuts, for the choices that vpl/light_tree.py makes
+    python benchmarks/light_tree.py --cuts     # sizes of cuts, for the choices that vpl/lights/light_tree.py makes
 
 The lights lie on the surfaces of a room with boxes and spheres. The cost of a tree is the sum of the paper's cluster
 sizes over its inner nodes; "halved" is a balanced tree over the lights in Morton order.
@@ -16,8 +16,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from vpl import light_tree
-from vpl.light_tree import BOX_MAX, BOX_MIN, CONE_AXIS, CONE_COS, INTENSITY, build_light_tree
+from vpl.lights import light_tree
+from vpl.lights.light_tree import BOX_MAX, BOX_MIN, CONE_AXIS, CONE_COS, INTENSITY, build_light_tree
 
 SIZE = np.array([10.0, 8.0, 3.0])
 STAGES = ("_validate", "_sort_lights", "_start_clusters", "_cluster", "_assemble")

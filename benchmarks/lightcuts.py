@@ -28,11 +28,11 @@ mi.set_variant("llvm_ad_rgb")
 import compare  # noqa: E402
 import integrators  # noqa: E402, F401
 from benchmarks import scenes  # noqa: E402
-from vpl.arrays import download, upload  # noqa: E402
-from vpl.cuts import collect_cuts, limited_cuts  # noqa: E402
-from vpl.evaluation import sum_all_lights  # noqa: E402
-from vpl.shading import contribution  # noqa: E402
-from vpl.visibility import shadow_ray  # noqa: E402
+from vpl.core.arrays import download, upload  # noqa: E402
+from vpl.cuts.light_cuts import collect_cuts, limited_cuts  # noqa: E402
+from vpl.transport.contribution import contribution  # noqa: E402
+from vpl.transport.evaluation import sum_all_lights  # noqa: E402
+from vpl.transport.visibility import shadow_ray  # noqa: E402
 
 DEPTH, VPLS, SUBSET = 6, 200_000, 4000
 

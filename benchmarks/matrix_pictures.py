@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import mitsuba as mi
 import numpy as np
 
-from vpl.arrays import download
+from vpl.core.arrays import download
 
 
 def draw_slice(plugin, job, number: int, file, note: dict) -> None:

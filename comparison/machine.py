@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # What seconds and images depend on; the report may change without a run having to be made again.
 SOURCES = (
     "integrators/*.py",
-    "vpl/*.py",
+    "vpl/**/*.py",
     *(f"comparison/{name}.py" for name in ("worker", "rendering", "scene_files")),
 )
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import sys
 
-from vpl.backend import check_backend, import_drjit
+from vpl.core.backend import check_backend, import_drjit
 
 import_drjit()
 

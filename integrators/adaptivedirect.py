@@ -8,10 +8,11 @@ from time import perf_counter
 import drjit as dr
 import mitsuba as mi
 
-from vpl.adaptive_direct import FIELDS, DirectOptions, PixelGrid, light_directly
-from vpl.arrays import download
-from vpl.sampling import derived_seed
-from vpl.sources import Sources
+from vpl.core.arrays import download
+from vpl.core.sampling import derived_seed
+from vpl.direct.adaptive import FIELDS, DirectOptions, light_directly
+from vpl.direct.sources import Sources
+from vpl.points.camera_paths import PixelGrid
 
 from . import properties
 from .bands import fits_one_band, random_rays, render_in_bands
@@ -104,8 +105,9 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
     samples are combined with BSDF samples for glossy surfaces and near emitters (``bsdf_share``); variances come from
     neighbouring strata; a sample takes the point of any camera ray of its pixel, which costs no more than the points of
     regions and is less noisy (``shade_regions``). Cuts, groups, regions and clusters differ in detail: see
-    :mod:`vpl.cluster_cuts`, :mod:`vpl.point_groups`, :mod:`vpl.pixel_regions` and :mod:`vpl.cluster_forest`. A black
-    pixel is given up after three passes and 250 samples without light, as in the paper.
+    :mod:`vpl.direct.cluster_cuts`, :mod:`vpl.direct.sites`, :mod:`vpl.direct.pixel_regions` and
+    :mod:`vpl.direct.emitter_clusters`. A black pixel is given up after three passes and 250 samples without light, as
+    in the paper.
 
     .. tabs::
         .. code-tab:: xml
@@ -210,7 +212,7 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
         return self._band.grid if self._band else super().pixel_grid(scene, sampler)
 
     def light(self, scene, sampler, start: Start):
-        """Direct light of all emitters; see :func:`vpl.adaptive_direct.light_directly`."""
+        """Direct light of all emitters; see :func:`vpl.direct.adaptive.light_directly`."""
         points = start.paths.points
         if start.dark or self.max_depth < 2:
             return mi.UnpolarizedSpectrum(0), {}, {"shadow_rays": 0}

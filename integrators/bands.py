@@ -9,9 +9,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from vpl.adaptive_direct import PixelGrid
-from vpl.point_groups import BLOCK
-from vpl.sampling import derived_seed
+from vpl.core.sampling import derived_seed
+from vpl.direct.sites import BLOCK
+from vpl.points.camera_paths import PixelGrid
 
 # Camera rays of a band; some 300 bytes each
 LARGEST_BAND = 1 << 22

@@ -8,16 +8,16 @@ from dataclasses import dataclass, field
 import drjit as dr
 import mitsuba as mi
 
-from vpl.adaptive_direct import DirectOptions, PixelGrid, light_directly
-from vpl.arrays import download
-from vpl.direct import ExtendedEmitters, direct_light
-from vpl.evaluation import mean_radiance
-from vpl.gather import SceneTraits
-from vpl.light_set import LightOptions, LightSet, prepare_lights
-from vpl.proxies import probe_materials
-from vpl.sampling import derived_seed
-from vpl.sources import Sources
-from vpl.surfaces import Batch, make_batches
+from vpl.core.arrays import download
+from vpl.core.sampling import derived_seed
+from vpl.direct.adaptive import DirectOptions, light_directly
+from vpl.direct.emitter_sampling import ExtendedEmitters, direct_light
+from vpl.direct.sources import Sources
+from vpl.lights.light_set import LightOptions, LightSet, prepare_lights
+from vpl.points.bsdf_proxies import probe_materials
+from vpl.points.camera_paths import PixelGrid, SceneTraits
+from vpl.points.surfaces import Batch, make_batches
+from vpl.transport.evaluation import mean_radiance
 
 from . import properties
 from .gathering import GatheringIntegrator, Start, whole_sum

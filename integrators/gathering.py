@@ -10,10 +10,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from vpl.adaptive_direct import PixelGrid
-from vpl.arrays import download
-from vpl.gather import CameraPaths, SceneTraits, follow_camera_rays, refuse_media, scene_traits
-from vpl.lights import Emitters, read_emitters, usable
+from vpl.core.arrays import download, usable
+from vpl.lights.emitters import Emitters, read_emitters
+from vpl.points.camera_paths import CameraPaths, PixelGrid, SceneTraits, follow_camera_rays, refuse_media, scene_traits
 
 from . import properties
 

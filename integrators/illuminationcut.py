@@ -8,16 +8,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from vpl.approximate_image import approximate_radiance
-from vpl.arrays import add_at, download, upload
-from vpl.cut_limits import raise_thresholds
-from vpl.cuts import upload_thresholds
-from vpl.pair_lists import evaluate_lists, list_pairs
-from vpl.pair_visibility import decide_visibility
-from vpl.pairs import BoundCounter, Pairs, find_pairs, in_batches
-from vpl.point_clusters import PointClusters
-from vpl.shared_samples import share_samples
-from vpl.surfaces import Batch
+from vpl.core.arrays import add_at, download, upload
+from vpl.cuts.adaptive_visibility import decide_visibility
+from vpl.cuts.cut_limits import raise_thresholds
+from vpl.cuts.light_cuts import upload_thresholds
+from vpl.cuts.pair_lists import evaluate_lists, list_pairs
+from vpl.cuts.phase_one import approximate_radiance
+from vpl.cuts.product_cuts import BoundCounter, Pairs, find_pairs, in_batches
+from vpl.direct.shared_samples import share_samples
+from vpl.points.point_clusters import PointClusters
+from vpl.points.surfaces import Batch
 
 from . import properties
 from .common import AOVS, ManyLightIntegrator, Shaded, Shading
@@ -96,12 +96,12 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
 
     {what is estimated}
 
-    **Departures from the paper.** Order of refinement: see :mod:`vpl.pairs`. Tree of points: see :mod:`vpl.point_tree`.
-    Phase I: see :mod:`vpl.approximate_image`. Adaptive visibility: see :mod:`vpl.pair_visibility`. ``dark_floor`` and
-    ``max_cut`` are ours: without the latter, sharp lobes take thousands of clusters; it is held by raising the bound
-    around points for which a light cut at their bound is larger, tried at every 32nd point. A cluster's representative
-    counts with its own colour, so that pairs are unbiased where colours differ. Lambertian points and all others are in
-    trees of their own.
+    **Departures from the paper.** Order of refinement: see :mod:`vpl.cuts.product_cuts`. Tree of points: see
+    :mod:`vpl.points.point_tree`. Phase I: see :mod:`vpl.cuts.phase_one`. Adaptive visibility: see
+    :mod:`vpl.cuts.adaptive_visibility`. ``dark_floor`` and ``max_cut`` are ours: without the latter, sharp lobes take
+    thousands of clusters; it is held by raising the bound around points for which a light cut at their bound is larger,
+    tried at every 32nd point. A cluster's representative counts with its own colour, so that pairs are unbiased where
+    colours differ. Lambertian points and all others are in trees of their own.
 
     .. tabs::
         .. code-tab:: xml

@@ -5,9 +5,9 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from vpl.arrays import upload
-from vpl.cuts import evaluate_cuts, limited_cuts
-from vpl.radiance_estimate import estimate_radiance
+from vpl.core.arrays import upload
+from vpl.cuts.light_cuts import evaluate_cuts, limited_cuts
+from vpl.cuts.radiance_estimate import estimate_radiance
 
 from . import properties
 from .common import ManyLightIntegrator, Shaded, Shading
@@ -57,7 +57,7 @@ class LightcutsIntegrator(ManyLightIntegrator):
     neighbouring points: thresholds are known in advance, so that cuts need no heap and no stack, and all shadow rays of
     many points can be traced together. ``dark_floor`` is ours. The representative's colour is its own, not the
     cluster's, so that the cut is unbiased for lights of different colours. Bounds and the cluster metric differ in
-    detail: see :mod:`vpl.bounds` and :mod:`vpl.light_tree`. There are no reconstruction cuts.
+    detail: see :mod:`vpl.transport.bounds` and :mod:`vpl.lights.light_tree`. There are no reconstruction cuts.
 
     .. tabs::
         .. code-tab:: xml

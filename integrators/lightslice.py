@@ -8,14 +8,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from vpl.arrays import download, upload
-from vpl.evaluation import sum_lights
-from vpl.light_matrix import DeviceForest, NearRows, SampledRows
-from vpl.morton import interleave
-from vpl.point_clusters import PointClusters
-from vpl.sampling import derived_seed
-from vpl.slice_columns import SliceLights, shared_columns, slice_lights, slice_places
-from vpl.slices import build_slices
+from vpl.core.arrays import download, upload
+from vpl.core.morton import interleave
+from vpl.core.sampling import derived_seed
+from vpl.matrix.light_matrix import DeviceForest, NearRows, SampledRows
+from vpl.matrix.slice_columns import SliceLights, shared_columns, slice_lights, slice_places
+from vpl.points.point_clusters import PointClusters
+from vpl.points.slices import build_slices
+from vpl.transport.evaluation import sum_lights
 
 from . import properties
 from .common import ManyLightIntegrator, Shaded, Shading
@@ -96,8 +96,8 @@ class LightSliceIntegrator(ManyLightIntegrator):
     Neighbouring pixels take different lights of a cluster (interleaved sampling), which makes noise of what would be
     seams between slices; ``sets`` 1 is the paper's. At glossy points one of several lights of a cluster is traced
     (``candidates``; resampled importance sampling); at matt ones that gained less than it cost. See
-    :mod:`vpl.slices`, :mod:`vpl.light_matrix`, :mod:`vpl.slice_columns`. Lambertian points and all others are in
-    slices of their own.
+    :mod:`vpl.points.slices`, :mod:`vpl.matrix.light_matrix`, :mod:`vpl.matrix.slice_columns`. Lambertian points and all
+    others are in slices of their own.
 
     .. tabs::
         .. code-tab:: xml

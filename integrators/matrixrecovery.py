@@ -9,18 +9,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from vpl.arrays import download
-from vpl.light_matrix import ENTRIES
-from vpl.matrix_block import MatrixBlock
-from vpl.matrix_recovery import RecoveryOptions, recover
-from vpl.matrix_separation import SeparationLimits
-from vpl.point_clusters import PointClusters
-from vpl.reduced_columns import initial_columns, split_columns
-from vpl.reduced_matrix import MatrixEntries, MatrixRows
-from vpl.sampling import derived_seed
-from vpl.slice_rows import build_row_slices
-from vpl.visibility_prediction import PREDICTORS, predict_columns
-from vpl.visibility_samples import VisibilitySamples
+from vpl.core.arrays import ENTRIES, download
+from vpl.core.sampling import derived_seed
+from vpl.matrix.matrix_block import MatrixBlock
+from vpl.matrix.recovery import RecoveryOptions, recover
+from vpl.matrix.reduced_columns import initial_columns, split_columns
+from vpl.matrix.reduced_matrix import MatrixEntries, MatrixRows
+from vpl.matrix.separation import SeparationLimits
+from vpl.matrix.visibility_prediction import PREDICTORS, predict_columns
+from vpl.matrix.visibility_samples import VisibilitySamples
+from vpl.points.point_clusters import PointClusters
+from vpl.points.slice_rows import build_row_slices
 
 from . import properties
 from .common import ManyLightIntegrator, Shaded, Shading
@@ -113,15 +112,16 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
     Penumbrae are noisy, since predictors answer at random where they are not sure. The visibility of a light is one
     number for all channels: what masks and thin glass tint arrives grey.
 
-    **Departures from the paper.** Visibility is separated, not light (see :mod:`vpl.matrix_recovery`), once for all
+    **Departures from the paper.** Visibility is separated, not light (see :mod:`vpl.matrix.recovery`), once for all
     channels, and every gather point is shaded exactly. Slices are halved at medians by the number of points
-    (:mod:`vpl.slice_rows`). Clusters are split in rounds, and lend their samples to those beside them along the light
-    tree (:mod:`vpl.reduced_columns`); ``alpha`` is a tenth of the paper's, with which slices have 200 columns here
-    rather than its 700; ``density`` is 0.65 instead of 0.2, for errors lie denser here. Rows that are traced follow
-    each other by golden sections instead of being drawn at random (:mod:`vpl.visibility_samples`). Nearest rows are
-    found by looking at all samples of a column, and the line of the linear predictor lies in the slice's plane
-    (:mod:`vpl.visibility_prediction`). Where the separation of a slice fails, all entries of the columns in question
-    are traced, and the slice is counted. Lambertian points and all others are in slices of their own.
+    (:mod:`vpl.points.slice_rows`). Clusters are split in rounds, and lend their samples to those beside them along the
+    light tree (:mod:`vpl.matrix.reduced_columns`); ``alpha`` is a tenth of the paper's, with which slices have 200
+    columns here rather than its 700; ``density`` is 0.65 instead of 0.2, for errors lie denser here. Rows that are
+    traced follow each other by golden sections instead of being drawn at random (:mod:`vpl.matrix.visibility_samples`).
+    Nearest rows are found by looking at all samples of a column, and the line of the linear predictor lies in the
+    slice's plane (:mod:`vpl.matrix.visibility_prediction`). Where the separation of a slice fails, all entries of the
+    columns in question are traced, and the slice is counted. Lambertian points and all others are in slices of their
+    own.
 
     .. tabs::
         .. code-tab:: xml

@@ -8,13 +8,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from vpl.arrays import download
-from vpl.cut_limits import raise_thresholds
-from vpl.gather_tree import build_gather_tree
-from vpl.pairs import BoundCounter, find_pairs, in_batches
-from vpl.pixel_cuts import PixelCuts
-from vpl.point_clusters import PointClusters
-from vpl.radiance_estimate import Estimate, estimate_radiance
+from vpl.core.arrays import download
+from vpl.cuts.cut_limits import raise_thresholds
+from vpl.cuts.pixel_cuts import PixelCuts
+from vpl.cuts.product_cuts import BoundCounter, find_pairs, in_batches
+from vpl.cuts.radiance_estimate import Estimate, estimate_radiance
+from vpl.points.gather_tree import build_gather_tree
+from vpl.points.point_clusters import PointClusters
 
 from . import properties
 from .common import ManyLightIntegrator, Shaded, Shading
@@ -73,11 +73,11 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
     sensors of the scene; with another one every camera ray counts as a pixel, which is as slow as ``lightcuts``.
 
     **Departures from the paper.** Thresholds come from an estimate made before instead of from a running total, and the
-    upper levels of both trees are descended for blocks of pixels at once; see :mod:`vpl.pixel_cuts`. A representative
-    counts with its own colour, light or point, so that cuts are unbiased where colours differ. Gather trees: see
-    :mod:`vpl.gather_tree`. ``dark_floor`` is ours. ``max_cut`` is held only about, by raising the bound where the light
-    cut of a point at every 32nd pixel is larger. Lambertian points and all others are in trees of their own, so a pixel
-    that sees both has two cuts, each held to what its own points give to the pixel.
+    upper levels of both trees are descended for blocks of pixels at once; see :mod:`vpl.cuts.pixel_cuts`. A
+    representative counts with its own colour, light or point, so that cuts are unbiased where colours differ. Gather
+    trees: see :mod:`vpl.points.gather_tree`. ``dark_floor`` is ours. ``max_cut`` is held only about, by raising the
+    bound where the light cut of a point at every 32nd pixel is larger. Lambertian points and all others are in trees of
+    their own, so a pixel that sees both has two cuts, each held to what its own points give to the pixel.
 
     .. tabs::
         .. code-tab:: xml

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from vpl.adaptive_direct import DirectOptions
+from vpl.direct.adaptive import DirectOptions
 
 from . import properties
 from .adaptivedirect import AdaptiveDirectIntegrator

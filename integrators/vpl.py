@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from vpl.evaluation import sum_all_lights
+from vpl.transport.evaluation import sum_all_lights
 
 from .common import ManyLightIntegrator, Shaded, Shading
 from .manual import manual_page
@@ -46,7 +46,7 @@ class VPLIntegrator(ManyLightIntegrator):
     needs_trees = False
 
     def shade(self, job: Shading) -> Shaded:
-        """Sum over all lights; see :func:`vpl.evaluation.sum_all_lights`."""
+        """Sum over all lights; see :func:`vpl.transport.evaluation.sum_all_lights`."""
         count = job.batch.count
         radiance, rays = sum_all_lights(job.scene, job.traits, job.lights, job.batch, job.stopped)
         return Shaded(radiance, rays, dr.zeros(mi.UInt32, count), dr.full(mi.UInt32, job.lights.count, count))

@@ -4,8 +4,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.emission import solid_angle_radiance
-from vpl.environment_regions import EnvironmentRegions
+from vpl.direct.environment_regions import EnvironmentRegions
+from vpl.lights.emission import solid_angle_radiance
 
 from .conftest import closed_box, relative_error, render, sensor, wall
 

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.arrays import download, upload
+from vpl.core.arrays import download, upload
 
 
 def array_before_guard_page(count: int) -> np.ndarray:

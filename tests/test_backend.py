@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vpl.backend import check_backend, import_drjit
+from vpl.core.backend import check_backend, import_drjit
 
 ROOT = Path(__file__).resolve().parents[1]
 

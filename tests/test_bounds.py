@@ -5,12 +5,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.arrays import download, upload
-from vpl.bounds import DeviceTree, Receiver, contribution_bound
-from vpl.light_set import light_tree
-from vpl.light_tree import CONE_COS, build_light_tree
-from vpl.lights import VirtualLights
-from vpl.proxies import MaterialProxy
+from vpl.core.arrays import download, upload
+from vpl.lights.device_tree import DeviceTree
+from vpl.lights.light_set import light_tree
+from vpl.lights.light_tree import CONE_COS, build_light_tree
+from vpl.lights.virtual_lights import VirtualLights
+from vpl.points.bsdf_proxies import MaterialProxy
+from vpl.points.surfaces import Receiver
+from vpl.transport.bounds import contribution_bound
 
 POINTS = 400
 

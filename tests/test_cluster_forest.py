@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vpl.cluster_forest import ClusterForest, build_cluster_forest
+from vpl.direct.emitter_clusters import ClusterForest, build_cluster_forest
 
 from .conftest import examples
 

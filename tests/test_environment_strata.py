@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from vpl.environment_strata import _assign, _cells, _components, _farthest_first, cones, stratify
+from vpl.direct.environment_strata import _assign, _cells, _components, _farthest_first, cones, stratify
 
 from .conftest import examples
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vpl.arrays import download, upload
+from vpl.core.arrays import download, upload
 
 from .conftest import area_light, closed_box, relative_error, render, sensor, wall
 from .test_integrators import ODD_SCENES
@@ -91,8 +91,8 @@ def test_work_in_parts_gives_the_same_image(visibility, monkeypatch):
     settings = {"visibility": visibility, "error": 0.1, "vpl_count": 500, "max_depth": 5}
     whole = rendered(scene, 4, **settings)
     for name, value in (
-        ("vpl.pairs._FRONTIER", 1000), ("integrators.illuminationcut._PAIRS_HELD", 900),
-        ("vpl.approximate_image._PAIRS_PER_KERNEL", 700), ("vpl.pair_visibility._PROBES_PER_KERNEL", 1100),
+        ("vpl.cuts.product_cuts._FRONTIER", 1000), ("integrators.illuminationcut._PAIRS_HELD", 900),
+        ("vpl.cuts.phase_one._PAIRS_PER_KERNEL", 700), ("vpl.cuts.adaptive_visibility._PROBES_PER_KERNEL", 1100),
     ):  # fmt: skip
         monkeypatch.setattr(name, value)
     assert_same(rendered(scene, 4, **settings), whole)

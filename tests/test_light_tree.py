@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from vpl.light_tree import (
+from vpl.lights.light_tree import (
     BOX_MAX,
     BOX_MIN,
     CONE_AXIS,

@@ -5,13 +5,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.arrays import download, upload
-from vpl.cuts import collect_cuts, cut_sizes, evaluate_cuts, limited_cuts
-from vpl.evaluation import sum_all_lights
-from vpl.light_set import LightGroup, LightSet, light_tree
-from vpl.lights import VirtualLights
-from vpl.shading import contribution
-from vpl.surfaces import LambertianSurface, ScatteringSurface
+from vpl.core.arrays import download, upload
+from vpl.cuts.light_cuts import collect_cuts, cut_sizes, evaluate_cuts, limited_cuts
+from vpl.lights.light_set import LightGroup, LightSet, light_tree
+from vpl.lights.virtual_lights import VirtualLights
+from vpl.points.surfaces import LambertianSurface, ScatteringSurface
+from vpl.transport.contribution import contribution
+from vpl.transport.evaluation import sum_all_lights
 
 from .conftest import area_light, closed_box, render, sensor, wall
 

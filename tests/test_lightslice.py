@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
-from vpl import light_matrix
-from vpl.arrays import download, upload
-from vpl.column_forest import ColumnForest, split_threshold
-from vpl.light_matrix import ColumnWeights, DeviceForest, NearRows, SampledRows
-from vpl.point_clusters import PointClusters
-from vpl.slice_columns import _Chosen, _drawn_lights, fine_forest, slice_lights
-from vpl.slices import build_slices
+from vpl.core.arrays import download, upload
+from vpl.matrix import light_matrix
+from vpl.matrix.column_forest import ColumnForest, split_threshold
+from vpl.matrix.light_matrix import ColumnWeights, DeviceForest, NearRows, SampledRows
+from vpl.matrix.slice_columns import _Chosen, _drawn_lights, fine_forest, slice_lights
+from vpl.points.point_clusters import PointClusters
+from vpl.points.slices import build_slices
 
 from .conftest import (
     area_light,

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vpl import matrix_recovery
-from vpl.arrays import download, upload
-from vpl.matrix_separation import Separation, SeparationLimits, separate, sketch
-from vpl.point_clusters import PointClusters
-from vpl.reduced_columns import _nearby_largest
-from vpl.reduced_matrix import MatrixRows
-from vpl.slice_rows import build_row_slices, golden_steps, rows_of, tangent_places
+from vpl.core.arrays import download, upload
+from vpl.matrix import recovery as matrix_recovery
+from vpl.matrix.reduced_columns import _nearby_largest
+from vpl.matrix.reduced_matrix import MatrixRows
+from vpl.matrix.separation import Separation, SeparationLimits, separate, sketch
+from vpl.points.point_clusters import PointClusters
+from vpl.points.slice_rows import build_row_slices, golden_steps, rows_of, tangent_places
 
 from .conftest import (
     area_light,

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vpl import gather_tree
-from vpl.arrays import download, upload
-from vpl.gather_tree import build_gather_tree
-from vpl.pairs import Pairs
-from vpl.pixel_cuts import PixelCuts
-from vpl.point_clusters import PointClusters
+from vpl.core.arrays import download, upload
+from vpl.cuts.pixel_cuts import PixelCuts
+from vpl.cuts.product_cuts import Pairs
+from vpl.points import gather_tree
+from vpl.points.gather_tree import build_gather_tree
+from vpl.points.point_clusters import PointClusters
 
 from .conftest import (
     area_light,

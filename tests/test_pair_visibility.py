@@ -5,15 +5,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl import pair_visibility
-from vpl.arrays import download, upload
-from vpl.evaluation import sum_all_lights
-from vpl.gather import scene_traits
-from vpl.lights import VirtualLights
-from vpl.pair_lists import evaluate_lists, list_pairs
-from vpl.pair_visibility import decide_visibility
-from vpl.pairs import Pairs
-from vpl.point_clusters import PointClusters
+from vpl.core.arrays import download, upload
+from vpl.cuts import adaptive_visibility as pair_visibility
+from vpl.cuts.adaptive_visibility import decide_visibility
+from vpl.cuts.pair_lists import evaluate_lists, list_pairs
+from vpl.cuts.product_cuts import Pairs
+from vpl.lights.virtual_lights import VirtualLights
+from vpl.points.camera_paths import scene_traits
+from vpl.points.point_clusters import PointClusters
+from vpl.transport.evaluation import sum_all_lights
 
 from .conftest import sensor, wall
 from .test_pairs import batch_of, lit_by

@@ -5,18 +5,18 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl import pairs
-from vpl.arrays import download, upload
-from vpl.bounds import contribution_bound
-from vpl.evaluation import evaluate_pairs, sum_all_lights
-from vpl.light_set import LightGroup, LightSet, light_tree
-from vpl.lights import KINDS, VirtualLights
-from vpl.pair_lists import evaluate_lists, list_pairs
-from vpl.pairs import BoundCounter, Pairs, find_pairs
-from vpl.point_clusters import PointClusters
-from vpl.proxies import MaterialProxy
-from vpl.shading import DeviceLights, contribution
-from vpl.surfaces import Batch, LambertianSurface
+from vpl.core.arrays import download, upload
+from vpl.cuts import product_cuts as pairs
+from vpl.cuts.pair_lists import evaluate_lists, list_pairs
+from vpl.cuts.product_cuts import BoundCounter, Pairs, find_pairs
+from vpl.lights.light_set import LightGroup, LightSet, light_tree
+from vpl.lights.virtual_lights import KINDS, DeviceLights, VirtualLights
+from vpl.points.bsdf_proxies import MaterialProxy
+from vpl.points.point_clusters import PointClusters
+from vpl.points.surfaces import Batch, LambertianSurface
+from vpl.transport.bounds import contribution_bound
+from vpl.transport.contribution import contribution
+from vpl.transport.evaluation import evaluate_pairs, sum_all_lights
 
 from .test_bounds import exact, scene_of, unit
 from .test_lightcuts import COATED, GLOSSY, many_kinds, prepared

@@ -4,8 +4,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.lights import read_emitters
-from vpl.parameters import matrix_of, numbers, parameters_of
+from vpl.core.parameters import matrix_of, numbers, parameters_of
+from vpl.lights.emitters import read_emitters
 
 NAMES = ("point", "spot", "directional", "constant", "sphere", "lamp", "mesh")
 

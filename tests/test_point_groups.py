@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vpl.cluster_cuts import GroupCuts, PointGroups, cut_clusters, has_wide_source
-from vpl.cluster_forest import build_cluster_forest
-from vpl.pixel_regions import representatives
-from vpl.point_groups import BLOCK, bound_groups, find_groups, find_sites, normal_class
-from vpl.sources import Nodes
+from vpl.direct.cluster_cuts import GroupCuts, PointGroups, cut_clusters, has_wide_source
+from vpl.direct.emitter_clusters import build_cluster_forest
+from vpl.direct.pixel_regions import representatives
+from vpl.direct.sites import BLOCK, bound_groups, find_groups, find_sites, normal_class
+from vpl.direct.sources import Nodes
 
 from .conftest import examples
 
@@ -35,7 +35,7 @@ def around(rng, axis, cosine, count):
 
 
 def nodes_of(center, radius, axis, cone_cos, infinite_axis=(), infinite_cos=(), intensity=1.0):
-    """Nodes over sources at finite places and at infinity, as :class:`vpl.sources.Sources` numbers them."""
+    """Nodes over sources at finite places and at infinity, as :class:`vpl.direct.sources.Sources` numbers them."""
     count = len(radius)
     forest = build_cluster_forest(
         np.reshape(center, (count, 3)), radius, np.reshape(axis, (count, 3)), cone_cos, np.full(count, intensity)

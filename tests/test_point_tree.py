@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vpl.arrays import download, upload
-from vpl.node_bounds import NodeBounds
-from vpl.point_tree import build_point_tree, point_codes
+from vpl.core.arrays import download, upload
+from vpl.points.node_bounds import NodeBounds
+from vpl.points.point_tree import build_point_tree, point_codes
 
 from .conftest import examples
 

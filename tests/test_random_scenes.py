@@ -7,9 +7,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from vpl.arrays import download, upload
-from vpl.emission import Choice
-from vpl.lights import LARGEST_VALUE, VirtualLights
+from vpl.core.arrays import LARGEST_VALUE, download, upload
+from vpl.core.sampling import Choice
+from vpl.lights.virtual_lights import VirtualLights
 
 from .catalogue import PLUGINS, plugin, rgb
 from .conftest import examples, render, sensor

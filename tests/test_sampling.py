@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vpl.arrays import download
-from vpl.sampling import SpreadSamples
+from vpl.core.arrays import download
+from vpl.core.sampling import SpreadSamples
 
 from .conftest import area_light, render, sensor, wall
 

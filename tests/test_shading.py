@@ -5,9 +5,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.arrays import download, upload
-from vpl.lights import VirtualLights, read_emitters
-from vpl.shading import DeviceLights, geometry
+from vpl.core.arrays import download, upload
+from vpl.lights.emitters import read_emitters
+from vpl.lights.virtual_lights import DeviceLights, VirtualLights, geometry
 
 SPOT = {
     "type": "spot",

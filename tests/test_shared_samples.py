@@ -5,9 +5,9 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 
-from vpl.arrays import download
-from vpl.point_tree import build_point_tree
-from vpl.shared_samples import share_samples
+from vpl.core.arrays import download
+from vpl.direct.shared_samples import share_samples
+from vpl.points.point_tree import build_point_tree
 
 from .conftest import area_light, closed_box, render, wall
 from .test_illuminationcut import NAME, rendered

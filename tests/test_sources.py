@@ -5,12 +5,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.arrays import download, upload
-from vpl.emitter_pieces import EmitterPieces
-from vpl.environment_regions import EnvironmentRegions
-from vpl.lights import read_emitters
-from vpl.sampling import find_interval, independent_sampler
-from vpl.sources import Sources
+from vpl.core.arrays import download, upload
+from vpl.core.sampling import find_interval, independent_sampler
+from vpl.direct.emitter_pieces import EmitterPieces
+from vpl.direct.environment_regions import EnvironmentRegions
+from vpl.direct.sources import Sources
+from vpl.lights.emitters import read_emitters
 
 COUNT = 100_000
 SHEAR = np.array([[0.8, 0.5, 0.1, 0.3], [0.0, 0.6, 0.2, -0.2], [0.2, 0.1, 0.7, 0.1], [0, 0, 0, 1]])

@@ -7,11 +7,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.arrays import download, upload
-from vpl.emission import Choice, bounding_box, emission_groups
-from vpl.lights import read_emitters
-from vpl.sampling import derived_seed
-from vpl.tracing import PathLimits, trace_lights
+from vpl.core.arrays import download, upload
+from vpl.core.sampling import Choice, derived_seed
+from vpl.lights.emission import bounding_box, emission_groups
+from vpl.lights.emitters import read_emitters
+from vpl.lights.tracing import PathLimits, trace_lights
 
 from .conftest import area_light, closed_box, wall
 

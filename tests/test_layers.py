@@ -1,0 +1,47 @@
+"""The order of the packages of vpl/: imports run one way, so that what is below can be read without what is above."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+# What a package may import from, besides itself
+BELOW = {
+    "core": (),
+    "lights": ("core",),
+    "points": ("core", "lights"),
+    "transport": ("core", "lights", "points"),
+    "direct": ("core", "lights", "points"),
+    "cuts": ("core", "lights", "points", "transport"),
+    "matrix": ("core", "lights", "points", "transport", "cuts"),
+}
+
+
+def imported(file: Path):
+    """(package, line) of every import of another module of vpl/."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.ImportFrom):
+            if node.level != 1:
+                yield (node.module or "").partition(".")[0], node.lineno
+        elif isinstance(node, ast.Import):
+            yield from ((alias.name.partition(".")[0], node.lineno) for alias in node.names)
+
+
+def test_every_package_has_its_place():
+    """A new package has to say what it may import."""
+    packages = {folder.parent.name for folder in (ROOT / "vpl").glob("*/__init__.py")}
+    assert packages == set(BELOW)
+
+
+@pytest.mark.parametrize("package", BELOW)
+def test_imports_run_one_way(package):
+    """Nothing imports from a package above its own, from the plugins or from the tools."""
+    others = ({*BELOW, "vpl", "integrators", "comparison", "compare", "manylights"} - {package}) - {*BELOW[package]}
+    wrong = [
+        f"{file.relative_to(ROOT)}:{line} imports {name}"
+        for file in sorted((ROOT / "vpl" / package).glob("*.py"))
+        for name, line in imported(file)
+        if name in others
+    ]
+    assert not wrong

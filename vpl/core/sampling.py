@@ -1,0 +1,121 @@
+"""Random numbers: seeds derived from one another, and Mitsuba's sampler for any wavefront."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .arrays import upload
+
+# Of Mitsuba's hash: after four, its default, the numbers of neighbouring lanes are alike (correlation 0.45)
+HASH_ROUNDS = 8
+
+
+def derived_seed(seed: int, *stream: int) -> int:
+    """A 32-bit seed for each (seed, stream...), by Mitsuba's own hash."""
+    for number in stream:
+        first, _ = mi.sample_tea_32(mi.UInt32(seed & 0xFFFFFFFF), mi.UInt32(number & 0xFFFFFFFF))
+        seed = int(first[0])
+    return seed
+
+
+def independent_sampler(seed: int, count: int):
+    """Mitsuba's ``independent`` sampler, seeded for a wavefront of ``count`` lanes."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, count)
+    return sampler
+
+
+def stratified(sampler, count: int, first: int, total: int):
+    """One uniform number in each of the parts first .. first + count - 1 of the ``total`` equal parts of [0, 1)."""
+    lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+    sample = (mi.Float(lane) + sampler.next_1d()) / dr.opaque(mi.Float, float(total))
+    return dr.minimum(sample, dr.one_minus_epsilon(mi.Float))
+
+
+# Steps of the additive recurrences: powers of 1/g, where g^4 = g + 1 is the golden ratio of three dimensions
+_STEPS = [int(2**32 * 1.2207440846057596**-k) for k in (1, 2, 3)]
+
+
+class SpreadSamples:
+    """Triples of numbers that fill the unit cube evenly, one sequence for each lane: they leave less noise than
+    independent ones, the less the more are taken.
+
+    An additive recurrence [Roberts 2018, "The unreasonable effectiveness of quasirandom sequences"] from a random start
+    [Cranley and Patterson 1976]: every number alone is uniform.  ``sequence``: UInt32, which one a lane takes from;
+    ``seed``: another one, other sequences.
+    """
+
+    def __init__(self, sequence, seed: int):
+        first, second = (dr.opaque(mi.UInt32, derived_seed(seed, stream)) for stream in (0, 1))
+        x, y = mi.sample_tea_32(sequence, first, HASH_ROUNDS)
+        z, _ = mi.sample_tea_32(sequence, second, HASH_ROUNDS)
+        self._start = (x, y, z)
+
+    def at(self, number):
+        """Member ``number`` (UInt32) of each sequence, from [0, 1): (a number, a pair of numbers)."""
+        # Wrapping integers are fractions that lose nothing; 24 bits of them are a float below 1
+        x, y, z = (
+            mi.Float((start + number * step) >> 8) * 2**-24 for start, step in zip(self._start, _STEPS, strict=True)
+        )
+        return x, mi.Point2f(y, z)
+
+
+def running_sums(values):
+    """The sum of all values before each, and of all, in double precision, evaluated: one more entry than values."""
+    precise = dr.float64_array_t(mi.Float)
+    count = dr.width(values)
+    sums = dr.zeros(precise, count + 1)
+    dr.scatter(sums, dr.cumsum(precise(values)), dr.arange(mi.UInt32, count) + 1)
+    dr.eval(sums)
+    return sums
+
+
+@dr.syntax
+def find_interval(cumulative, first, last, sample):
+    """The interval of ``cumulative[first] ... cumulative[last]`` that a uniform number falls into, first .. last - 1.
+
+    ``cumulative``: sums in double precision, not falling; an interval is found with its share of the whole rise, and
+    one that does not rise never, unless all do not.
+    """
+    precise = type(cumulative)
+    start = dr.gather(precise, cumulative, first)
+    target = start + precise(sample) * (dr.gather(precise, cumulative, last) - start)
+    low, high = mi.UInt32(first), mi.UInt32(last)
+    while dr.hint(high > low + 1, exclude=[cumulative]):
+        middle = (low + high) >> 1
+        below = dr.gather(precise, cumulative, middle) <= target
+        low = dr.select(below, middle, low)
+        high = dr.select(below, high, middle)
+    return low
+
+
+class Choice:
+    """Choose a row with probability proportional to a weight; exact zero weights are never chosen.
+
+    ``weight`` (n,) float64, not negative, with a positive sum.  ``pmf`` (n,) float64 sums to one.
+    """
+
+    def __init__(self, weight: np.ndarray):
+        total = weight.sum(dtype=np.float64)
+        if not (np.isfinite(total) and total > 0):
+            raise ValueError(f"weights must be finite with a positive sum, got a sum of {total}")
+        self.pmf = weight / total
+        cumulative = np.cumsum(self.pmf)
+        last = np.flatnonzero(self.pmf)[-1]
+        cumulative[last:] = np.inf  # rounding must not let u = 1 - eps fall past the last row with weight
+        # The search's kernel holds its bounds: the same for all lengths up to a power of two
+        padding = (1 << len(weight).bit_length()) - len(weight)
+        self._cumulative = upload(mi.Float, np.append(cumulative, np.full(padding, np.inf)))
+        self._pmf = upload(mi.Float, self.pmf)
+        self.count = len(weight)
+
+    def row(self, sample):
+        """Row for a uniform number in [0, 1): the first whose cumulative probability exceeds it."""
+        length = dr.width(self._cumulative)
+        return dr.binary_search(0, length, lambda i: dr.gather(mi.Float, self._cumulative, i) <= sample)
+
+    def probability(self, row, active=True):
+        """Probability of a row (0 where not active)."""
+        return dr.gather(mi.Float, self._pmf, row, active)

@@ -1,0 +1,232 @@
+"""Light cuts by threshold: the largest clusters of a light tree whose error bound a gather point can accept.
+
+Lightcuts [LC section 4] refines the cluster with the largest bound until every bound is at most ``error`` times the
+radiance of the point.  For a given radiance that cut does not depend on the order of refinement: from the root down,
+refine a node exactly while its bound is above the threshold.  So no heap and no stack is needed: nodes lie in preorder,
+and one walks on to ``i + 1`` to refine and to ``escape[i]`` to take or to skip.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import download, upload
+from ..lights.light_set import LightGroup, LightSet
+from ..points.camera_paths import SceneTraits
+from ..points.surfaces import Batch
+from ..transport.bounds import contribution_bound
+from ..transport.evaluation import evaluate_representatives
+
+# Pairs that are shaded and traced at a time: bounds the memory whatever the size of image and cuts
+_PAIRS_PER_CHUNK = 1 << 22
+# How the threshold that keeps a cut below its largest size is searched for
+_BRACKET, _BISECTIONS = 4.0, 3
+
+
+@dataclass
+class CutSizes:
+    """Per point and group of lights: ``count`` of nodes in the cut, and ``visits``: nodes whose bound was computed."""
+
+    count: list
+    visits: list
+
+    def total(self) -> np.ndarray:
+        """Nodes in the whole cut of every point, (n,) int64."""
+        return sum(download(count).astype(np.int64) for count in self.count)
+
+
+def _step(group: LightGroup, batch: Batch, threshold, smallest_distance, i):
+    """Look at node ``i``: (taken into the cut, next node).  A bound of zero skips the node: nothing can arrive."""
+    node = group.tree.gather(i)
+    bound = contribution_bound(group.kind, batch.receiver, node, smallest_distance)
+    reached = bound > 0
+    taken = reached & ((node.escape == i + 1) | (bound <= threshold))
+    return taken, dr.select(taken | ~reached, node.escape, i + 1)
+
+
+@dr.syntax
+def _count_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: float, most: int):
+    """Walk a group's tree for every point: (nodes taken, nodes visited).  Gives up beyond ``most`` nodes (0: never)."""
+    end, limit = dr.opaque(mi.UInt32, group.tree.count), dr.opaque(mi.UInt32, most or 0xFFFFFFFF)
+    clamp = dr.opaque(mi.Float, smallest_distance)
+    i, count, visits = mi.UInt32(0), dr.zeros(mi.UInt32, batch.count), dr.zeros(mi.UInt32, batch.count)
+    while dr.hint((i < end) & (count <= limit), exclude=[group, batch]):
+        taken, i = _step(group, batch, threshold, clamp, i)
+        count += dr.select(taken, 1, 0)
+        visits += 1
+    dr.eval(count, visits)
+    return count, visits
+
+
+@dr.syntax
+def _collect_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: float, offset, length, total: int):
+    """The same walk, writing (row of the batch, node) of every node taken: ``length`` of them from ``offset`` on.
+
+    Returns (rows, nodes), how many were written per point, and how many were visited.  Should rounding make this walk
+    take other nodes than the one that counted, nothing is written outside of a point's part.
+    """
+    end = dr.opaque(mi.UInt32, group.tree.count)
+    clamp = dr.opaque(mi.Float, smallest_distance)
+    rows, nodes = dr.zeros(mi.UInt32, total), dr.zeros(mi.UInt32, total)
+    dr.eval(rows, nodes)
+    row = dr.arange(mi.UInt32, batch.count)
+    i, at, visits = mi.UInt32(0), mi.UInt32(offset), mi.UInt32(0)
+    while dr.hint(i < end, exclude=[group, batch, rows, nodes]):
+        taken, following = _step(group, batch, threshold, clamp, i)
+        taken &= at < offset + length
+        dr.scatter(rows, row, at, taken)
+        dr.scatter(nodes, i, at, taken)
+        at += dr.select(taken, 1, 0)
+        visits += 1
+        i = following
+    written = at - offset
+    dr.eval(rows, nodes, written, visits)
+    return rows, nodes, written, visits
+
+
+@dr.syntax
+def _sum_segments(values, offset, count):
+    """Sum ``count`` consecutive values from ``offset`` on, in order: the same result on any number of threads."""
+    total = dr.zeros(type(values), dr.width(offset))
+    k = mi.UInt32(0)
+    while dr.hint(k < count, exclude=[values]):
+        total += dr.gather(type(values), values, offset + k)
+        k += 1
+    dr.eval(total)
+    return total
+
+
+def cut_sizes(lights: LightSet, batch: Batch, threshold, most: int = 0) -> CutSizes:
+    """Sizes of the cuts at a threshold: the largest bound that is accepted, per point.
+
+    Points whose cut has more than ``most`` nodes are not counted to the end (0: all are).
+    """
+    found = [_count_nodes(group, batch, threshold, lights.smallest_distance, most) for group in lights.groups]
+    return CutSizes([count for count, _ in found], [visits for _, visits in found])
+
+
+def upload_thresholds(values: np.ndarray):
+    """Thresholds in double precision to the device; beyond float32 they are infinite, as unclamped bounds may be."""
+    with np.errstate(over="ignore"):
+        return upload(mi.Float, values.astype(np.float32))
+
+
+def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
+    """Sizes of the cuts, with thresholds raised where a cut would have more than ``max_cut`` nodes (0: nowhere).
+
+    Refining the worst cluster until ``max_cut`` nodes are reached ([LC] section 4.2) gives a threshold cut too, with a
+    larger threshold: it is bracketed by growing steps, which end because the roots alone are a cut at an infinite
+    threshold, and narrowed by bisection of its logarithm.  Returns (threshold, sizes, nodes visited in all).
+    """
+    max_cut = max(max_cut, len(lights.groups)) if max_cut else 0  # the roots of all kinds are the coarsest cut
+    sizes = cut_sizes(lights, batch, threshold, max_cut)
+    visits = sum(sizes.visits)
+    rows = np.flatnonzero(sizes.total() > max_cut)
+    if max_cut == 0 or len(rows) == 0:
+        return threshold, sizes, visits
+    index = upload(mi.UInt32, rows)
+    part = batch.select(index)
+    spent, fitting = dr.zeros(mi.UInt32, len(rows)), [dr.zeros(mi.UInt32, len(rows)) for _ in sizes.count]
+
+    def too_large(values):
+        """Which cuts are too large at these thresholds; keeps the sizes of those that are not."""
+        nonlocal spent, fitting
+        found = cut_sizes(lights, part, upload_thresholds(values), max_cut)
+        over = found.total() > max_cut
+        kept = upload(mi.UInt32, ~over) == 1
+        fitting = [dr.select(kept, new, old) for new, old in zip(found.count, fitting, strict=True)]
+        spent += sum(found.visits)
+        dr.eval(spent, fitting)
+        return over
+
+    low = np.maximum(download(dr.gather(mi.Float, threshold, index)).astype(np.float64), np.finfo(np.float32).tiny)
+    step = _BRACKET
+    high = low * step
+    while (over := too_large(high)).any():
+        step = min(step * step, 1e30)
+        low, high = np.where(over, high, low), np.where(over, high * step, high)
+    for _ in range(_BISECTIONS):
+        middle = np.sqrt(low * high)
+        over = too_large(middle)
+        low, high = np.where(over, middle, low), np.where(over, high, middle)
+    threshold = mi.Float(threshold)
+    dr.scatter(threshold, upload_thresholds(high), index)
+    for target, count in zip(sizes.count, fitting, strict=True):
+        dr.scatter(target, count, index)
+    dr.scatter_add(visits, spent, index)
+    dr.eval(threshold, sizes.count, visits)
+    return threshold, sizes, visits
+
+
+def _chunks(count: np.ndarray):
+    """Ranges of points whose cuts hold at most _PAIRS_PER_CHUNK nodes together (or one point that alone has more)."""
+    ends = np.cumsum(count)
+    first = 0
+    while first < len(count):
+        before = ends[first - 1] if first else 0
+        last = max(int(np.searchsorted(ends, before + _PAIRS_PER_CHUNK, side="right")), first + 1)
+        yield first, last
+        first = last
+
+
+@dataclass
+class CutChunk:
+    """Part of the cuts of a batch in one group of lights: ``rows`` (in ``batch``) and ``nodes``, point by point.
+
+    ``points``: the rows of the whole batch that ``batch`` holds; ``offset``, ``length``: where the nodes of each are;
+    ``visits``: nodes visited to collect them.
+    """
+
+    group: LightGroup
+    batch: Batch
+    points: object
+    offset: object
+    length: object
+    rows: object
+    nodes: object
+    visits: object
+
+
+def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
+    """Yield the cuts of a batch as :class:`CutChunk`, evaluated, each of bounded size."""
+    for group, group_count in zip(lights.groups, sizes.count, strict=True):
+        count = download(group_count).astype(np.int64)
+        for first, last in _chunks(count):
+            total = int(count[first:last].sum())
+            if total == 0:
+                continue
+            points = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
+            part = batch if last - first == batch.count else batch.select(points)
+            offset = upload(mi.UInt32, np.cumsum(count[first:last]) - count[first:last])
+            chosen = dr.gather(mi.Float, threshold, points)
+            length = dr.gather(mi.UInt32, group_count, points)
+            rows, nodes, written, visits = _collect_nodes(
+                group, part, chosen, lights.smallest_distance, offset, length, total
+            )
+            yield CutChunk(group, part, points, offset, written, rows, nodes, visits)
+
+
+def evaluate_cuts(scene, traits: SceneTraits, lights: LightSet, batch: Batch, threshold, sizes: CutSizes, second=False):
+    """Radiance of every point from its cut: representatives, scaled to the intensity of their clusters.
+
+    ``second``: use the second representative of every cluster, for an estimate that another cut may depend on.
+    Returns (radiance, shadow rays, nodes visited) per point of the batch.
+    """
+    radiance = dr.zeros(mi.UnpolarizedSpectrum, batch.count)
+    rays, visits = dr.zeros(mi.UInt32, batch.count), dr.zeros(mi.UInt32, batch.count)
+    for chunk in collect_cuts(lights, batch, threshold, sizes):
+        tree = chunk.group.tree
+        light, intensity = tree.representative(chunk.nodes, second=second), tree.summed_intensity(chunk.nodes)
+        value, traced = evaluate_representatives(
+            scene, traits, lights, chunk.group, chunk.batch, chunk.rows, light, intensity
+        )
+        traced = dr.select(traced, mi.UInt32(1), mi.UInt32(0))
+        dr.scatter_add(radiance, _sum_segments(value, chunk.offset, chunk.length), chunk.points)
+        dr.scatter_add(rays, _sum_segments(traced, chunk.offset, chunk.length), chunk.points)
+        dr.scatter_add(visits, chunk.visits, chunk.points)
+    dr.eval(radiance, rays, visits)
+    return radiance, rays, visits

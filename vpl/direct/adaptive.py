@@ -1,0 +1,239 @@
+"""Direct light at all gather points of an image, from few sources or many [IAS].
+
+Points become sites, sites form groups, groups get their cuts through the sources; then each is lit by the cheaper of
+two ways: by iterative adaptive sampling (:mod:`vpl.direct.passes`) or, where its sources are few, by summing over all
+of them (:mod:`vpl.direct.all_sources`).
+
+[IAS] Donikian et al. 2006, Accurate direct illumination using iterative adaptive sampling.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from time import perf_counter
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import download, upload
+from ..core.sampling import derived_seed
+from ..points.bsdf_proxies import probe_materials
+from ..points.camera_paths import GatherPoints, PixelGrid
+from ..points.surfaces import Batch, LambertianSurface, make_batches
+from .all_sources import SourceRounds
+from .cluster_cuts import GroupCuts, cut_clusters, has_wide_source
+from .passes import SitePasses
+from .pixel_regions import representatives
+from .site_table import Scenery, SiteTable
+from .sites import Sites, bound_groups, divide_points
+from .sources import Sources
+from .unoccluded_passes import UnoccludedPasses
+
+# Entries (pairs of a site and a cluster) that are worked on at a time: some 28 bytes each
+_ENTRIES = 12_000_000
+# Sums trace twice as many rays in a second as passes do, have no noise, and two passes are needed at least
+_SUM_WORTH = 4
+# Sites of the pilot, which finds the mean radiance of the image
+_PILOT_SITES = 1024
+FIELDS = ("noise", "passes", "shadow_rays", "regions", "visible")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirectOptions:
+    """What users choose; see the plugin ``adaptivedirect``."""
+
+    error: float
+    dark_floor: float = 0.1
+    lights: str = "auto"
+    solid_angle: float = 0.02
+    faint_share: float = 0.005
+    max_passes: int = 15
+    max_samples: int = 20000
+    samples_per_cluster: float = 1.5
+    least_samples: int = 50
+    most_samples: int = 400
+    bsdf_share: float = 0.125
+    evaluated: bool = True
+    prior: float = 1.0
+    inverse_variance: bool = False
+    shade_regions: bool = False
+    time: float = 0.0
+
+
+@dataclass
+class DirectLight:
+    """Per gather point: ``radiance``; ``noise``: estimated standard error over radiance; ``passes``; ``shadow_rays``,
+    shared out among the points that were shaded as one; ``regions``: points that were shaded in the site; ``visible``:
+    share of the samples that found light. Float but the radiance.  ``clusters``: how many light each point, summed."""
+
+    radiance: object
+    noise: object
+    passes: object
+    shadow_rays: object
+    regions: object
+    visible: object
+    clusters: int = 0
+
+
+def light_directly(
+    scene, traits, sources: Sources, points: GatherPoints, grid: PixelGrid, max_depth, options: DirectOptions,
+    seed: int, stopped: Callable[[], bool] = lambda: False, level: float | None = None,
+) -> DirectLight:  # fmt: skip
+    """Direct light of ``sources`` at all gather points.
+
+    ``level``: mean radiance of the image, which ``dark_floor`` is a fraction of; estimated where it is None.
+    """
+    start = perf_counter()
+    found, clusters = np.zeros((points.count, 3 + len(FIELDS)), np.float32), 0
+    if sources.count or sources.extended:
+        parts = [
+            _BatchLight(scene, traits, sources, points, batch, grid, max_depth, options, derived_seed(seed, 2, k))
+            for k, batch in enumerate(make_batches(points, probe_materials(points, traits)))
+        ]
+        if level is None:
+            level = sum(part.pilot(derived_seed(seed, 0, k)) * part.batch.count for k, part in enumerate(parts))
+            level /= points.count
+        done = 0
+        for number, part in enumerate(parts):
+            done += part.batch.count
+            deadline = start + options.time * done / points.count if options.time > 0 else np.inf
+            found[part.rows] = part.solve(level, derived_seed(seed, 1, number), stopped, deadline)
+            clusters += part.clusters
+    columns = [upload(mi.Float, column) for column in found.T.copy()]
+    radiance = mi.UnpolarizedSpectrum(*columns[: dr.size_v(mi.UnpolarizedSpectrum)])
+    return DirectLight(radiance, *columns[3:], clusters=clusters)
+
+
+class _BatchLight:
+    """Direct light at the points of one batch."""
+
+    def __init__(self, scene, traits, sources, points, batch: Batch, grid, max_depth, options, seed: int):
+        self.batch, self.options, self.grid, self.nodes = batch, options, grid, sources.nodes
+        self._common = scene, traits, sources, batch
+        self._beyond = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF))) if traits.delta and max_depth > 2 else None
+        self.rows = download(batch.index)
+        pixel = download(points.ray)[self.rows].astype(np.int64) // grid.samples
+        position, normal = download(batch.position), download(batch.normal)
+        generator = np.random.default_rng(seed)
+        self._single = options.lights == "unoccluded"  # sources instead of clusters
+        self._standing = np.arange(batch.count)
+        if options.shade_regions and grid.samples > 1:
+            # What is seen by way of a mirror is no neighbour of what is seen directly
+            surface = download(dr.reinterpret_array(mi.UInt32, points.si.shape)).astype(np.int64) << 8
+            surface += np.minimum(download(points.depth), 255)
+            self._standing = representatives(pixel, surface[self.rows], position, normal, generator)
+        # Only the reference method takes the points of a site in their order
+        self.sites = divide_points(pixel, grid.width, position, normal, generator if self._single else None)
+        two_sided = np.zeros(batch.count, bool)
+        if batch.proxy.without_cosines:
+            two_sided |= download(batch.proxy.no_cosine)
+        self._two_sided = upload(mi.UInt32, two_sided) == 1
+        self._bounds = bound_groups(self.sites, position, normal, two_sided)
+        self._choose()
+
+    def _choose(self) -> None:
+        """Cuts of all groups, which of them sum over all sources, and their share of BSDF samples."""
+        options, count = self.options, self._bounds.count
+        self._cuts = self._cut(np.arange(count), options.solid_angle)
+        group = self._cuts.group
+        held = (self.nodes.last.astype(np.int64) - self.nodes.first)[self._cuts.node]
+        # Sources of each group, and how many of them have an extent
+        self._held, extended = (np.bincount(group, x, count) for x in (held, self.nodes.extended[self._cuts.node]))
+        self._summed = np.full(count, options.lights == "all")
+        if options.lights == "auto" and self._beyond is None:
+            a_pass = np.maximum(options.samples_per_cluster * self._cuts.size, options.least_samples)
+            self._summed = (extended == 0) & (self._held <= _SUM_WORTH * a_pass)
+        # Emitter samples alone are enough for small sources and matt surfaces, unless light comes by way of a mirror
+        self._bsdf = np.ones(count) * options.bsdf_share
+        if isinstance(self.batch.surfaces, LambertianSurface) and self._beyond is None:
+            self._bsdf *= has_wide_source(self.nodes, self._bounds, self._cuts)
+
+    def _cut(self, groups, solid_angle: float) -> GroupCuts:
+        cuts = cut_clusters(self.nodes, self._bounds.select(groups), solid_angle, self.options.faint_share)
+        # Where light comes by way of mirrors, BSDF samples are taken even if nothing lights a group directly
+        return cuts if self._beyond is None or self.nodes.count == 0 else cuts.without_empty()
+
+    @property
+    def clusters(self) -> int:
+        """Size of the cut of each point's group, summed over the points."""
+        return int((self.sites.points * self._cuts.size[self.sites.group]).sum())
+
+    def pilot(self, seed: int) -> float:
+        """Mean radiance of the batch's points, roughly: one pass over some of the groups."""
+        order = np.random.default_rng(seed).permutation(self._bounds.count)
+        sites = self.sites.per_group[order]
+        enough = (np.cumsum(sites) <= _PILOT_SITES) & (np.cumsum(sites * self._cuts.size[order]) <= _ENTRIES)
+        chosen = np.sort(order[: max(1, int(enough.sum()))])
+        part = self.sites.select(chosen)
+        passes = SitePasses(*self._task(part, self._cuts.select(chosen), chosen), 0.0, self.options)
+        passes.max_passes = 1
+        passes.run(self._two_sided, seed, lambda number: False)
+        return float(np.average(passes.result()[0].mean(1), weights=part.points))
+
+    def _task(self, part: Sites, cuts: GroupCuts, groups):
+        """(Scenery, share of the pixel's rays, share of BSDF samples) of the sites of some groups."""
+        table = SiteTable.of(part, cuts, self._standing[part.order])
+        return (
+            Scenery(*self._common, table, self._beyond),
+            part.points / self.grid.samples,
+            self._bsdf[groups][part.group],
+        )
+
+    def solve(self, level: float, seed: int, stopped, deadline: float) -> np.ndarray:
+        """The columns of :class:`DirectLight` per point, the radiance as three."""
+        per_site = np.zeros((self.sites.count, 3 + len(FIELDS)), np.float32)
+        start, spent, number = perf_counter(), 0, 0
+        for summed in (True, False):
+            for groups in self._portions(np.flatnonzero(self._summed == summed), summed):
+                spent += len(groups)
+                until = start + (deadline - start) * spent / len(self._summed)
+                halted = partial(_halted, stopped, until)
+                part, result = self._light(groups, summed, level, derived_seed(seed, number), halted)
+                per_site[self.sites.of_groups(groups)] = self._columns(part, result)
+                number += 1
+        return per_site[self.sites.point_site]
+
+    def _portions(self, groups: np.ndarray, summed: bool):
+        """Divide groups into portions that need little enough memory."""
+        if summed:
+            entries = self._held[groups]
+        else:
+            size = self._held if self._single else self._cuts.size
+            entries = size[groups] * self.sites.per_group[groups]
+        entries, first = np.cumsum(entries), 0
+        while first < len(groups):
+            before = entries[first - 1] if first else 0
+            last = max(first + 1, int(np.searchsorted(entries, before + _ENTRIES, side="right")))
+            yield groups[first:last]
+            first = last
+
+    def _light(self, groups, summed: bool, level, seed, halted):
+        """Light some groups: (their sites, what :meth:`SitePasses.result` says of them)."""
+        single = summed or self._single
+        part, cuts = self.sites.select(groups), self._cut(groups, 0.0) if single else self._cuts.select(groups)
+        scenery, share, bsdf = self._task(part, cuts, groups)
+        if summed:
+            # Where it was chosen by itself, no source has an extent
+            method = SourceRounds(scenery, part, share, bsdf * (self.options.lights == "all"), level, self.options)
+            method.run(seed, halted)
+        else:
+            method = (UnoccludedPasses if self._single else SitePasses)(scenery, share, bsdf, level, self.options)
+            method.run(self._two_sided, seed, halted)
+        return part, method.result()
+
+    def _columns(self, part: Sites, result) -> np.ndarray:
+        radiance, variance, passes, rays, visible = result
+        level = radiance.mean(1)
+        noise = np.where(level > 0, np.sqrt(variance) / np.where(level > 0, level, 1), 0)
+        regions = np.bincount(
+            np.repeat(np.arange(part.count), part.points), self._standing[part.order] == part.order, part.count
+        )
+        return np.concatenate([radiance, np.stack([noise, passes, rays / part.points, regions, visible], 1)], 1)
+
+
+def _halted(stopped, until: float, number: int) -> bool:
+    """Whether to stop before a pass; for want of time never before the first."""
+    return stopped() or (number > 0 and perf_counter() > until)

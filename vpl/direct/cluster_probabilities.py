@@ -1,0 +1,156 @@
+"""With which probability a site samples its clusters [IAS section 4.1].
+
+First by what each cluster would send if nothing was between; then more and more by what the samples of the site and of
+its whole group found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import channel_mean, finite_or_zero
+from .site_table import SEEN, Scenery, SiteTable, Statistics
+
+# Every cluster gets this share of the mean importance of a site's clusters, for what the estimate does not see
+_LEAST_SHARE = 0.01
+# Of the share without feedback, what is spread evenly over a site's clusters
+_EVEN_SHARE = 0.1
+
+
+@dataclass
+class Mixture:
+    """How the functions of a pass are blended [IAS eq. 6]: shares of the uniform, the block's and the pixel's; weight
+    of the belief that all is visible, in samples."""
+
+    uniform: object
+    block: object
+    pixel: object
+    prior: object
+
+
+def cluster_importance(surface, normal, two_sided, node):
+    """Radiance (mean over channels) that a cluster would send to a surface if nothing was between, roughly.
+
+    From the point of its bounding sphere that stands highest above the surface, so that what is partly below the
+    horizon counts; facing as much as any of its sources could.
+    """
+    infinite, radius = node.radius < 0, dr.maximum(node.radius, 0)
+    lift = dr.select(two_sided, mi.Vector3f(0), mi.Vector3f(normal))
+    half_sine = dr.safe_sqrt(1 - dr.square(dr.maximum(node.cone_cos, 0)))
+    offset = node.centroid - surface.interaction.p + lift * radius
+    to_light = dr.select(infinite, node.axis + lift * half_sine, offset)
+    length2 = dr.squared_norm(to_light)
+    to_light *= dr.select(length2 > 0, dr.rsqrt(length2), 0)
+    distance2 = dr.maximum(dr.squared_norm(node.centroid - surface.interaction.p), dr.square(radius))
+    facing = dr.clip(half_sine + radius * dr.rsqrt(distance2) - dr.dot(node.axis, to_light), 0, 1)
+    facing = dr.select(infinite | (node.cone_cos < 0), 1, facing)
+    factor = dr.select(infinite, 1, dr.select(distance2 > 0, facing / distance2, 0))
+    return channel_mean(surface.reflected(to_light, mi.Bool(True))) * node.intensity * factor
+
+
+@dr.syntax
+def update_importance(scenery: Scenery, two_sided, sites):
+    """Set the importance of all entries of some sites, positive.  ``two_sided``: Bool per point of the batch."""
+    table, importance, sources = scenery.table, scenery.importance, scenery.sources
+    size, cut, entry, first, members = (
+        dr.gather(mi.UInt32, column, sites)
+        for column in (table.size, table.cut, table.entry, table.member_first, table.members)
+    )
+    middle = dr.gather(mi.UInt32, table.member_row, first + members // 2)
+    surface, normal = scenery.batch.surfaces_at(middle), dr.gather(mi.Normal3f, scenery.batch.normal, middle)
+    both = dr.gather(mi.Bool, two_sided, middle)
+    total, k = dr.zeros(mi.Float, dr.width(sites)), dr.zeros(mi.UInt32, dr.width(sites))
+    while dr.hint(k < size, exclude=[sources, table, surface, normal, both, importance, cut, entry, size]):
+        node = sources.node(dr.gather(mi.UInt32, table.node, cut + k))
+        value = finite_or_zero(cluster_importance(surface, normal, both, node))
+        dr.scatter(importance, value, entry + k)
+        total += value
+        k += 1
+    dr.eval(total, importance)
+    least = dr.select(total > 0, _LEAST_SHARE * total / mi.Float(size), 1)
+    k = dr.zeros(mi.UInt32, dr.width(sites))
+    while dr.hint(k < size, exclude=[importance, least, entry, size]):
+        dr.scatter_add(importance, least, entry + k, mode=dr.ReduceMode.NoConflicts)
+        k += 1
+    dr.eval(importance)
+
+
+@dr.syntax
+def sum_over_groups(table: SiteTable, statistics: Statistics, totals, place):
+    """Update ``totals``, sums over the sites of each group per node of its cut, at the given places: a tuple of
+    (samples, samples that saw the source, gain), Float."""
+    entries = dr.opaque(mi.UInt32, table.entries)
+    at, stride, sites = (
+        dr.gather(mi.UInt32, column, place) for column in (table.group_entry, table.group_stride, table.group_sites)
+    )
+    samples, seen, gain = (dr.zeros(mi.Float, dr.width(place)) for _ in range(3))
+    k = dr.zeros(mi.UInt32, dr.width(place))
+    while dr.hint(k < sites, exclude=[statistics, entries, stride, sites]):
+        tried, saw, gained = _statistics_of(statistics, at, entries)
+        samples += tried
+        seen += saw
+        gain += gained
+        at += stride
+        k += 1
+    for total, values in zip(totals, (samples, seen, gain), strict=True):
+        dr.scatter(total, values, place)
+    dr.eval(totals)
+
+
+def _statistics_of(statistics: Statistics, entry, entries):
+    """(samples, samples that saw the source, gain) of entries, both halves together."""
+    counts = [dr.gather(mi.UInt32, statistics.counts, entry + half * entries) for half in (0, 1)]
+    gain = [dr.gather(mi.Float, statistics.gain, entry + half * entries) for half in (0, 1)]
+    tried = mi.Float((counts[0] & (SEEN - 1)) + (counts[1] & (SEEN - 1)))
+    return tried, mi.Float((counts[0] >> 16) + (counts[1] >> 16)), gain[0] + gain[1]
+
+
+@dr.syntax
+def update_probabilities(scenery: Scenery, of_groups, mixture: Mixture, sites):
+    """Set the probabilities of all entries of some sites [IAS eq. 4 to 6].
+
+    C / sqrt(u) of [IAS] eq. 4 is importance × gain / sqrt(seen share) here, where ``mixture.prior`` samples that saw
+    their source and found what was expected are added to those of the block, and as many that behaved like the block to
+    those of the pixel.
+    """
+    table, importance, statistics = scenery.table, scenery.importance, scenery.statistics
+    probability = scenery.probability
+    entries = dr.opaque(mi.UInt32, table.entries)
+    size, cut, entry = (dr.gather(mi.UInt32, column, sites) for column in (table.size, table.cut, table.entry))
+    sums, k = dr.zeros(mi.Vector3f, dr.width(sites)), dr.zeros(mi.UInt32, dr.width(sites))
+    while dr.hint(k < size, exclude=[importance, statistics, of_groups, mixture, entries, size, cut, entry]):
+        sums += _guides(importance, statistics, of_groups, mixture.prior, entries, entry + k, cut + k)
+        k += 1
+    dr.eval(sums)
+    shares = mi.Vector3f(mixture.uniform, mixture.block, mixture.pixel)
+    scale = dr.select(sums > 0, shares / sums, 0)
+    scale /= dr.sum(scale * sums)
+    even = _EVEN_SHARE * scale.x * sums.x / mi.Float(size)
+    scale.x *= 1 - _EVEN_SHARE
+    k = dr.zeros(mi.UInt32, dr.width(sites))
+    while dr.hint(
+        k < size,
+        exclude=[importance, statistics, of_groups, mixture, entries, size, cut, entry, scale, even, probability],
+    ):
+        guides = _guides(importance, statistics, of_groups, mixture.prior, entries, entry + k, cut + k)
+        dr.scatter(probability, dr.dot(scale, guides) + even, entry + k)
+        k += 1
+    dr.eval(probability)
+
+
+def _guides(importance, statistics, of_groups, prior, entries, entry, node):
+    """Importance of entries without feedback, with the block's and with the pixel's."""
+    level = dr.gather(mi.Float, importance, entry)
+    samples, seen, gain = (dr.gather(mi.Float, values, node) for values in of_groups)
+    block_gain, block_seen = (gain + prior) / (samples + prior), (seen + prior) / (samples + prior)
+    samples, seen, gain = _statistics_of(statistics, entry, entries)
+    pixel_gain = (gain + prior * block_gain) / (samples + prior)
+    pixel_seen = (seen + prior * block_seen) / (samples + prior)
+
+    def guide(gain, seen):
+        return dr.select(seen > 0, level * gain * dr.rsqrt(seen), 0)
+
+    return mi.Vector3f(level, guide(block_gain, block_seen), guide(pixel_gain, pixel_seen))

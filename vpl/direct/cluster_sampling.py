@@ -1,0 +1,216 @@
+"""Kernels of direct lighting: which cluster, which source, which point on it, and what arrives [IAS]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import channel_mean, finite_or_zero
+from ..core.sampling import independent_sampler
+from .emitter_sampling import emission_beyond_delta, power_heuristic
+from .site_table import SEEN, Lanes, Scenery, SiteTable
+
+# Steps of the additive recurrence of Martin Roberts in three dimensions ("R3"), as 32-bit fixed-point numbers
+_STEPS = tuple(int(2**32 / 1.2207440846057596**k) & 0xFFFFFFFF for k in (1, 2, 3))
+
+
+@dataclass
+class Drawn:
+    """What a pass found, per lane: ``radiance``; ``variance`` of its mean over channels; ``rays``; ``seen``: samples
+    that found light."""
+
+    radiance: object
+    variance: object
+    rays: object
+    seen: object
+
+
+@dataclass
+class _Site:
+    """The site of each lane: columns of :class:`SiteTable`, and ``samples``, ``bsdf_samples`` as Float."""
+
+    size: object
+    cut: object
+    entry: object
+    member_first: object
+    members: object
+    samples: object
+    bsdf_samples: object
+
+    @classmethod
+    def of(cls, table: SiteTable, lanes: Lanes) -> _Site:
+        names = ("size", "cut", "entry", "member_first", "members")
+        columns = (dr.gather(mi.UInt32, getattr(table, name), lanes.site) for name in names)
+        return cls(*columns, mi.Float(lanes.samples), mi.Float(lanes.bsdf_samples))
+
+
+@dr.syntax
+def draw_samples(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
+    """Sample the clusters of every lane's site, stratified by their probabilities, and add to its statistics."""
+    table, statistics, sources = scenery.table, scenery.statistics, scenery.sources
+    count = dr.width(lanes.site)
+    random = independent_sampler(seed, count)
+    shift = mi.Vector3u(*(mi.UInt32(random.next_1d() * 2.0**24) << 8 for _ in range(3)))
+    site = _Site.of(table, lanes)
+    own = lanes.half * dr.opaque(mi.UInt32, table.entries) + site.entry
+    total, last, differences = dr.zeros(mi.UnpolarizedSpectrum, count), mi.Float(0), mi.Float(0)
+    rays, seen = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
+    i, k = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
+    # In double precision: what is left of a number after many clusters still has to choose among their sources
+    precise = dr.float64_array_t(mi.Float)
+    below = dr.zeros(precise, count)
+    p = dr.gather(mi.Float, scenery.probability, site.entry)
+    while dr.hint(i < lanes.samples, exclude=[scenery, table, statistics, sources, lanes, site, own, shift]):
+        # ---- Cluster: strata are equal parts of the sum of probabilities
+        target = (precise(i) + precise(random.next_1d())) / precise(site.samples)
+        while dr.hint((below + precise(p) <= target) & (k + 1 < site.size), exclude=[scenery, site, target]):
+            below += precise(p)
+            k += 1
+            p = dr.gather(mi.Float, scenery.probability, site.entry + k)
+        inside = dr.clip(mi.Float((target - below) / precise(p)), 0, dr.one_minus_epsilon(mi.Float))
+        value, weight, arrives, visible = _emitter_sample(scenery, site, k, p, inside, _recurrence(shift, i))
+        # ---- Statistics: lanes never share an entry, so nothing has to be locked. The weight is left out, or a cluster
+        # that BSDF samples find more often would be sampled ever less
+        gain = channel_mean(value) * p / dr.gather(mi.Float, scenery.importance, site.entry + k)
+        dr.scatter_add(statistics.gain, gain, own + k, mode=dr.ReduceMode.NoConflicts)
+        one = dr.select(visible, mi.UInt32(SEEN + 1), mi.UInt32(1))
+        dr.scatter_add(statistics.counts, one, own + k, mode=dr.ReduceMode.NoConflicts)
+        value *= weight
+        level = channel_mean(value)
+        # Neighbouring strata differ little: what stratification has removed already is not counted as variance
+        differences += dr.select(i > 0, dr.square(level - last), 0)
+        last = level
+        total += value
+        rays += dr.select(arrives, 1, 0)
+        seen += dr.select(visible, 1, 0)
+        i += 1
+    variance = differences * 0.5 / (dr.maximum(site.samples - 1, 1) * site.samples)
+    total /= site.samples
+    if dr.hint(sources.extended, mode="scalar"):
+        more, more_variance, more_seen = _bsdf_samples(scenery, site, lanes.bsdf_samples, random)
+        total += more
+        variance += more_variance
+        rays += lanes.bsdf_samples
+        seen += more_seen
+    dr.eval(total, variance, rays, seen, statistics.gain, statistics.counts)
+    return Drawn(total, variance, rays, seen)
+
+
+@dr.syntax
+def sum_sources(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
+    """One sample of every cluster of every lane's site.  ``lanes.samples`` must be 1; no variance is found."""
+    count = dr.width(lanes.site)
+    random = independent_sampler(seed, count)
+    site = _Site.of(scenery.table, lanes)
+    total, rays, seen = dr.zeros(mi.UnpolarizedSpectrum, count), mi.UInt32(0), mi.UInt32(0)
+    k = dr.zeros(mi.UInt32, count)
+    while dr.hint(k < site.size, exclude=[scenery, lanes, site]):
+        point = mi.Point3f(random.next_1d(), random.next_1d(), random.next_1d())
+        value, weight, arrives, visible = _emitter_sample(scenery, site, k, mi.Float(1), random.next_1d(), point)
+        total += value * weight
+        rays += dr.select(arrives, 1, 0)
+        seen += dr.select(visible, 1, 0)
+        k += 1
+    if dr.hint(scenery.sources.extended, mode="scalar"):
+        more, _, more_seen = _bsdf_samples(scenery, site, lanes.bsdf_samples, random)
+        total += more
+        rays += lanes.bsdf_samples
+        seen += more_seen
+    variance = dr.zeros(mi.Float, count)
+    dr.eval(total, variance, rays, seen)
+    return Drawn(total, variance, rays, seen)
+
+
+def _emitter_sample(scenery: Scenery, site: _Site, k, p, inside, point):
+    """A point on the k-th cluster of each site, drawn with probability ``p``.
+
+    ``inside``: uniform number that picks the source; ``point``: three more.
+    Returns (radiance over density, its weight among emitter and BSDF samples, whether anything would arrive if nothing
+    was between, whether it does).
+    """
+    node = scenery.sources.node(dr.gather(mi.UInt32, scenery.table.node, site.cut + k))
+    rank, share = scenery.sources.member(node, inside)
+    surface = scenery.batch.surfaces_at(_member(scenery.table, site, point.z))
+    sample = mi.Point2f(point.x, point.y)
+    drawn = scenery.sources.sample(rank, surface.interaction, inside, sample, mi.Bool(True))
+    reflected, bsdf_pdf = surface.reflected_with_density(drawn.direction, mi.Bool(True))
+    pdf = p * share * drawn.pdf
+    weight = dr.select(drawn.pdf > 0, power_heuristic(site.samples * pdf, site.bsdf_samples * bsdf_pdf), 1)
+    value = finite_or_zero(reflected * drawn.value / (p * share))
+    arrives = dr.any(value > 0)
+    visible = arrives & ~scenery.scene.ray_test(surface.interaction.spawn_ray_to(drawn.p), arrives)
+    # A direction that does not exist (a point on the source itself) has no weight either
+    return dr.select(visible, value, 0), dr.select(visible, weight, 0), arrives, visible
+
+
+@dr.syntax
+def _bsdf_samples(scenery: Scenery, site: _Site, bsdf_samples, random):
+    """The other half of multiple importance sampling: (radiance, variance of its mean, samples that found light)."""
+    count = dr.width(bsdf_samples)
+    total, last, differences = dr.zeros(mi.UnpolarizedSpectrum, count), mi.Float(0), mi.Float(0)
+    seen, j = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
+    while dr.hint(j < bsdf_samples, exclude=[scenery, site]):
+        value = _bsdf_sample(scenery, site, random)
+        level = channel_mean(value)
+        differences += dr.select(j > 0, dr.square(level - last), 0)
+        last = level
+        total += value
+        seen += dr.select(level > 0, 1, 0)
+        j += 1
+    scale = dr.select(bsdf_samples > 0, dr.rcp(site.bsdf_samples), 0)
+    return total * scale, differences * 0.5 * scale / dr.maximum(site.bsdf_samples - 1, 1), seen
+
+
+def _bsdf_sample(scenery: Scenery, site: _Site, random):
+    """Light that a direction drawn from the BSDF finds, over its density, weighted against emitter samples."""
+    surface = scenery.batch.surfaces_at(_member(scenery.table, site, random.next_1d()))
+    direction, weight, bsdf_pdf = surface.sample(random.next_1d(), random.next_2d(), mi.Bool(True))
+    going = dr.any(weight > 0)
+    ray = surface.interaction.spawn_ray(direction)
+    hit = scenery.scene.ray_intersect_preliminary(ray, active=going)
+    radiance, rank, source_pdf = scenery.sources.find(hit, ray, going)
+    pdf = source_pdf * _probability_of(scenery, site, rank, going)
+    radiance *= power_heuristic(site.bsdf_samples * bsdf_pdf, site.samples * pdf)
+    if scenery.max_depth is not None:
+        beyond = hit.compute_surface_interaction(ray, mi.RayFlags.All, going)
+        radiance += emission_beyond_delta(
+            scenery.scene, scenery.sources.emitters, scenery.traits, beyond, surface.depth + 1, scenery.max_depth,
+            random, going,
+        )  # fmt: skip
+    return finite_or_zero(weight * radiance) & going
+
+
+@dr.syntax
+def _probability_of(scenery: Scenery, site: _Site, rank, active):
+    """Probability with which a site's emitter samples choose the source of a rank; 0 for what its cut left out."""
+    low, high = dr.zeros(mi.UInt32, dr.width(rank)), mi.UInt32(site.size)
+    active = active & (rank < scenery.sources.count)
+    while dr.hint(active & (high > low + 1), exclude=[scenery, site, rank, active]):
+        middle = (low + high) >> 1
+        before = _cluster(scenery, site, middle, active).first <= rank
+        low = dr.select(before, middle, low)
+        high = dr.select(before, high, middle)
+    node = _cluster(scenery, site, low, active)
+    active &= (node.first <= rank) & (rank < node.last)
+    share = scenery.sources.member_probability(node, rank, active)
+    if scenery.probability is not None:
+        share *= dr.gather(mi.Float, scenery.probability, site.entry + low, active)
+    return share & active
+
+
+def _cluster(scenery: Scenery, site: _Site, k, active):
+    return scenery.sources.node(dr.gather(mi.UInt32, scenery.table.node, site.cut + k, active), active)
+
+
+def _recurrence(shift, i):
+    """The i-th point of an additive recurrence in three dimensions, in [0, 1)."""
+    fixed = (shift[k] + i * mi.UInt32(_STEPS[k]) for k in range(3))
+    return mi.Point3f(*(mi.Float(x >> 8) * 2.0**-24 for x in fixed))
+
+
+def _member(table: SiteTable, site: _Site, sample):
+    """Row in the batch of a random point of each site."""
+    place = dr.minimum(mi.UInt32(sample * mi.Float(site.members)), site.members - 1)
+    return dr.gather(mi.UInt32, table.member_row, site.member_first + place)

@@ -1,0 +1,319 @@
+"""Area emitters cut into flat pieces: triangles, parallelograms, disks and spheres as rows of one array.
+
+Sampling a point on an emitter, or the density of having sampled it, then needs no virtual call: kernels stay as small
+as they are for one emitter, however many shapes the scene has.  Shapes of another form (cylinders, for example) stay
+whole and are sampled by their own routine; so are disks with a textured emission.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import download, finite_or_zero, select_record, upload
+from ..core.parameters import matrix_of, parameters_of
+from ..lights.emitters import AreaEmitters, registered_shapes
+
+PARALLELOGRAM, TRIANGLE, DISK, SPHERE, SHAPE = range(5)
+
+
+@dataclass
+class PieceSample:
+    """Points on pieces, one per lane: position, normal of the side that emits, texture coordinates, and the density per
+    solid angle at the reference point (0 where the piece shows it its back)."""
+
+    p: object
+    n: object
+    uv: object
+    pdf: object
+
+
+class EmitterPieces:
+    """All area emitters of a scene as k pieces.
+
+    ``center`` (k, 3), ``radius`` (k,): bounding spheres, world units, float64; ``axis`` (k, 3): unit normals, with
+    ``cone_cos`` (k,) = 1 for flat pieces and -1 for all others, which emit everywhere; ``intensity`` (k,): radiance
+    (mean over channels) times the largest projected area, float64.
+    """
+
+    def __init__(self, scene, area: AreaEmitters):
+        self._area = area
+        shapes = _shapes_of(scene, area)
+        textured = {row for row, _ in area.textured}
+        parts = [_pieces_of(shape, row in textured) for row, shape in enumerate(shapes)]
+        counts = np.array([len(part.kind) for part in parts], np.int64)
+        row = np.repeat(np.arange(len(parts)), counts)
+        kind, corner, first, second, normal, uv = (_joined(parts, name) for name in _COLUMNS)
+        size = _areas(kind, first, second)
+        whole = kind == SHAPE
+        size[whole] = area.area[row[whole]]
+        self.count = len(kind)
+        self._store(kind, corner, first, second, normal, size, row)
+        self._uv = upload(mi.Float, np.pad(uv, ((0, 0), (0, 2)))) if textured else None
+        self._first_piece = upload(mi.UInt32, np.cumsum(counts) - counts)
+        self._has_meshes = upload(mi.UInt32, np.array([_is_mesh(shape) for shape in shapes], np.uint32))
+        self._kinds = set(np.unique(kind).tolist())
+        self._hollow = bool((first[kind == SPHERE, 1] < 0).any())
+        self._bound(kind, corner, first, second, normal, size, row, shapes)
+
+    def _store(self, kind, corner, first, second, normal, size, row):
+        records = np.zeros((self.count, 16), np.float32)
+        records[:, 0:3], records[:, 4:7], records[:, 8:11], records[:, 12:15] = corner, first, second, normal
+        records[:, 7] = size
+        bits = records.view(np.uint32)
+        bits[:, 3], bits[:, 11] = kind, row
+        self._records = upload(mi.Float, records)
+
+    def _bound(self, kind, corner, first, second, normal, size, row, shapes):
+        corners = np.stack([corner, corner + first, corner + second, corner + first + second], 1)
+        corners[kind == TRIANGLE, 3] = corners[kind == TRIANGLE, 0]
+        self.center = corners.mean(1)
+        triangle, disk, sphere = kind == TRIANGLE, kind == DISK, kind == SPHERE
+        self.center[triangle] = corners[triangle, :3].mean(1)
+        self.center[disk | sphere] = corner[disk | sphere]
+        self.radius = np.linalg.norm(corners - self.center[:, None], axis=2).max(1)
+        lengths = np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)
+        # An ellipse lies within the sum of its half-axes whatever their angle
+        self.radius[disk] = np.hypot(*lengths)[disk]
+        self.radius[sphere] = first[sphere, 0]
+        for index in np.flatnonzero(kind == SHAPE):
+            box = shapes[row[index]].bbox()
+            low, high = np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel()
+            self.center[index], self.radius[index] = (low + high) / 2, np.linalg.norm(high - low) / 2
+        flat = kind <= DISK
+        self.axis = np.where(flat[:, None], normal, (0.0, 0.0, 1.0))
+        self.cone_cos = np.where(flat, 1.0, -1.0)
+        # Convex bodies show a quarter of their surface on average
+        projected = np.where(flat, size, size / 4)
+        self.intensity = projected * self._area.radiance.mean(1, dtype=np.float64)[row]
+
+    def _fetch(self, piece, active):
+        """(kind, corner, first edge, second edge, normal, area, emitter's row) of pieces."""
+        a, b, c, d = (dr.gather(mi.Vector4f, self._records, piece * 4 + k, active) for k in range(4))
+        kind, row = dr.reinterpret_array(mi.UInt32, a.w), dr.reinterpret_array(mi.UInt32, c.w)
+        return kind, mi.Point3f(a.xyz), b.xyz, c.xyz, mi.Normal3f(d.xyz), b.w, row
+
+    def sample(self, piece, interaction, sample, active):
+        """A point on each piece as seen from ``interaction``: flat ones by area, spheres by solid angle.
+
+        Returns (:class:`PieceSample`, radiance towards the reference point over the density).
+        """
+        kind, corner, first, second, normal, size, row = self._fetch(piece, active)
+        a, b = mi.Float(sample.x), mi.Float(sample.y)
+        folded = (kind == TRIANGLE) & (a + b > 1)
+        a, b = dr.select(folded, 1 - a, a), dr.select(folded, 1 - b, b)
+        if DISK in self._kinds:
+            disk = mi.warp.square_to_uniform_disk_concentric(sample)
+            a, b = dr.select(kind == DISK, disk.x, a), dr.select(kind == DISK, disk.y, b)
+        p = corner + a * first + b * second
+        pdf = _flat_density(interaction.p, p, normal, size)
+        found = PieceSample(p, normal, self._texture_coordinates(piece, a, b, active), pdf)
+        if SPHERE in self._kinds:
+            of_sphere = self._sample_sphere(interaction.p, corner, first, second, normal, size, sample)
+            found = select_record(kind == SPHERE, of_sphere, found)
+        if SHAPE in self._kinds:
+            whole = active & (kind == SHAPE)
+            # By area, because texture coordinates come with positions only
+            ps = self._area.on_shape("sample_position", row, interaction.time, sample, whole)
+            other = PieceSample(ps.p, ps.n, ps.uv, _flat_density(interaction.p, ps.p, ps.n, size))
+            found = select_record(whole, other, found)
+        active = active & (found.pdf > 0)
+        radiance = self._area.emitted_in_front(row, found, active)
+        return found, dr.select(active, finite_or_zero(radiance / found.pdf), 0)
+
+    def found(self, preliminary, ray, active):
+        """What a ray met: (piece, whether it is one, radiance towards the ray's origin, density of :meth:`sample`)."""
+        row = self._area.row(preliminary, active & preliminary.is_valid())
+        active = active & (row > 0)
+        row -= 1
+        mesh = dr.gather(mi.UInt32, self._has_meshes, row, active) == 1
+        piece = dr.gather(mi.UInt32, self._first_piece, row, active) + dr.select(mesh, preliminary.prim_index, 0)
+        kind, corner, first, second, normal, size, _ = self._fetch(piece, active)
+        p = ray(preliminary.t)
+        hit = PieceSample(
+            p, normal, self._coordinates_of(piece, p, corner, first, second, active),
+            _flat_density(ray.o, p, normal, size),
+        )  # fmt: skip
+        if SPHERE in self._kinds:
+            outward = mi.Normal3f(dr.normalize(p - corner))
+            of_sphere = PieceSample(p, outward * first.y, self._on_sphere(outward, second, normal, first.z), None)
+            by_area = _flat_density(ray.o, p, of_sphere.n, size)
+            seen = dr.select(dr.dot(ray.d, of_sphere.n) < 0, _sphere_density(ray.o, corner, first.x), 0)
+            of_sphere.pdf = dr.select(first.y > 0, seen, by_area)
+            hit = select_record(kind == SPHERE, of_sphere, hit)
+        if SHAPE in self._kinds:
+            whole = active & (kind == SHAPE)
+            si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, whole)
+            other = PieceSample(si.p, si.n, si.uv, _flat_density(ray.o, si.p, si.n, size))
+            hit = select_record(whole, other, hit)
+        shown = active & (hit.pdf > 0)
+        return piece, active, self._area.emitted_in_front(row, hit, shown), hit.pdf & shown
+
+    def _sample_sphere(self, origin, center, first, second, axis, size, sample) -> PieceSample:
+        """A point on a sphere: on its visible part, uniform in solid angle, or by area where it emits inwards."""
+        n = _visible_normal(origin, center, first.x, sample)
+        if self._hollow:
+            n = dr.select(first.y > 0, n, mi.Normal3f(mi.warp.square_to_uniform_sphere(sample)))
+        p = center + first.x * n
+        pdf = dr.select(
+            first.y > 0, _sphere_density(origin, center, first.x), _flat_density(origin, p, n * first.y, size)
+        )
+        return PieceSample(p, n * first.y, self._on_sphere(n, second, axis, first.z), pdf)
+
+    def _on_sphere(self, outward, across, axis, handed):
+        """Texture coordinates of a point of a sphere with the given x and z axes."""
+        if self._uv is None:
+            return mi.Point2f(0)
+        y = dr.cross(axis, across) * handed
+        azimuth = dr.atan2(dr.dot(outward, y), dr.dot(outward, across))
+        azimuth = dr.select(azimuth < 0, azimuth + dr.two_pi, azimuth)
+        return mi.Point2f(azimuth * dr.inv_two_pi, dr.safe_acos(dr.dot(outward, axis)) * dr.inv_pi)
+
+    def _texture_coordinates(self, piece, a, b, active):
+        if self._uv is None:
+            return mi.Point2f(0)
+        origin, along = (dr.gather(mi.Vector4f, self._uv, piece * 2 + k, active) for k in range(2))
+        return mi.Point2f(origin.x + a * origin.z + b * along.x, origin.y + a * origin.w + b * along.y)
+
+    def _coordinates_of(self, piece, p, corner, first, second, active):
+        """Texture coordinates of a point in the plane of a piece."""
+        if self._uv is None:
+            return mi.Point2f(0)
+        offset = p - corner
+        ff, fs, ss = dr.squared_norm(first), dr.dot(first, second), dr.squared_norm(second)
+        of, os = dr.dot(offset, first), dr.dot(offset, second)
+        scale = dr.rcp(ff * ss - fs * fs)
+        return self._texture_coordinates(piece, (of * ss - os * fs) * scale, (os * ff - of * fs) * scale, active)
+
+
+def _flat_density(origin, p, normal, size):
+    """Density per solid angle of a point drawn by area, 0 behind the surface."""
+    offset = origin - p
+    distance2 = dr.squared_norm(offset)
+    cosine = dr.dot(offset, normal) * dr.rsqrt(distance2)
+    return dr.select((cosine > 0) & (distance2 > 0), distance2 / (size * cosine), 0)
+
+
+def _cap(origin, center, radius):
+    """Of the cone that a sphere fills: (1 - cos of its half-angle, squared distance of the centre); 0 from inside."""
+    distance2 = dr.squared_norm(center - origin)
+    sine2 = dr.square(radius) / distance2
+    return dr.select(sine2 < 1, sine2 / (1 + dr.safe_sqrt(1 - sine2)), 0), distance2
+
+
+def _sphere_density(origin, center, radius):
+    cap, _ = _cap(origin, center, radius)
+    return dr.select(cap > 0, dr.inv_two_pi / cap, 0)
+
+
+def _visible_normal(origin, center, radius, sample):
+    """Normal of a sphere at a point that is uniform in solid angle as seen from ``origin``."""
+    cap, distance2 = _cap(origin, center, radius)
+    below = sample.x * cap  # 1 - cosine, which single precision keeps for small spheres far away
+    sine2 = below * (2 - below)
+    azimuth = dr.two_pi * sample.y
+    sine = dr.safe_sqrt(sine2)
+    local = mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), 1 - below)
+    direction = mi.Frame3f(dr.normalize(center - origin)).to_world(local)
+    distance = dr.sqrt(distance2) * (1 - below) - dr.safe_sqrt(dr.square(radius) - distance2 * sine2)
+    return mi.Normal3f(dr.normalize(origin + distance * direction - center))
+
+
+# ---- Reading shapes
+
+_COLUMNS = ("kind", "corner", "first", "second", "normal", "uv")
+
+
+@dataclass
+class _Pieces:
+    """Pieces of one shape: corner, edges (half-axes of disks), normal; ``uv`` (k, 6): texture coordinates at the corner
+    and their change along both edges.
+
+    Of spheres: centre, (radius, side that emits: 1 is outside, handedness of the frame), x axis, z axis.
+    """
+
+    kind: np.ndarray
+    corner: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    normal: np.ndarray
+    uv: np.ndarray
+
+
+def _joined(parts: list[_Pieces], name: str) -> np.ndarray:
+    empty = np.zeros(0, np.uint32) if name == "kind" else np.zeros((0, 6 if name == "uv" else 3))
+    return np.concatenate([empty, *(getattr(part, name) for part in parts)])
+
+
+def _shapes_of(scene, area: AreaEmitters) -> list:
+    by_index = dict(registered_shapes(scene))
+    return [by_index[int(index)] for index in area.shape_index]
+
+
+def _areas(kind, first, second) -> np.ndarray:
+    size = np.linalg.norm(np.cross(first, second), axis=1)
+    size[kind == TRIANGLE] *= 0.5
+    size[kind == DISK] *= np.pi
+    size[kind == SPHERE] = 4 * np.pi * first[kind == SPHERE, 0] ** 2
+    return size
+
+
+def _is_mesh(shape) -> bool:
+    """Whether a shape is made of triangles; rectangles count as meshes in Mitsuba, but are not."""
+    return shape.is_mesh() and shape.class_name() != "Rectangle"
+
+
+def _pieces_of(shape, textured: bool) -> _Pieces:
+    name = shape.class_name()
+    if _is_mesh(shape):
+        return _triangles(shape, textured)
+    matrix = np.eye(4)
+    if name in ("Rectangle", "Disk", "Sphere"):
+        matrix = matrix_of(parameters_of(shape, below=False)["to_world"])
+    linear, origin = matrix[:3, :3], matrix[:3, 3]
+    if np.linalg.det(linear) == 0:
+        # Flattened shapes have no area for Mitsuba: never drawn, this only has to be numbers
+        return _one(PARALLELOGRAM, origin, np.zeros(3), np.zeros(3), (0, 0, 1))
+    if name == "Rectangle":
+        normal = np.linalg.inv(linear).T[:, 2] * (-1 if shape.has_flipped_normals() else 1)
+        return _one(PARALLELOGRAM, origin - linear[:, 0] - linear[:, 1], 2 * linear[:, 0], 2 * linear[:, 1], normal)
+    # Its texture coordinates are polar
+    if name == "Disk" and not textured:
+        return _one(DISK, origin, linear[:, 0], linear[:, 1], np.linalg.inv(linear).T[:, 2])
+    if name == "Sphere":
+        radius = np.linalg.norm(linear[:, 0])
+        facts = (radius, -1 if shape.has_flipped_normals() else 1, np.sign(np.linalg.det(linear)))
+        return _one(SPHERE, origin, facts, linear[:, 0] / radius, linear[:, 2])
+    return _one(SHAPE, (0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 1))
+
+
+def _one(kind, corner, first, second, normal) -> _Pieces:
+    normal = np.asarray(normal, np.float64)
+    rows = [np.asarray(value, np.float64)[None] for value in (corner, first, second, normal / np.linalg.norm(normal))]
+    return _Pieces(np.array([kind], np.uint32), *rows, np.array([[0.0, 0, 1, 0, 0, 1]]))
+
+
+def _triangles(mesh, textured: bool) -> _Pieces:
+    parameters = parameters_of(mesh, below=False)
+    faces = download(parameters["faces"]).reshape(-1, 3)
+    vertices = download(parameters["vertex_positions"]).astype(np.float64).reshape(-1, 3)
+    corner, second, third = (vertices[faces[:, k]] for k in range(3))
+    first, second = second - corner, third - corner
+    normal = np.cross(first, second)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    # A triangle without area is never drawn; its normal only has to be a number
+    normal = np.where(length > 0, normal / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
+    if mesh.has_vertex_normals() and not mesh.has_face_normals():
+        # Mitsuba lets meshes emit to the side of their shading normals, which mirrored ones have the other way round
+        shading = download(parameters["vertex_normals"]).astype(np.float64).reshape(-1, 3)[faces].sum(1)
+        normal = np.where(np.einsum("ij,ij->i", normal, shading)[:, None] < 0, -normal, normal)
+    if mesh.has_flipped_normals():
+        normal = -normal
+    uv = np.tile([0.0, 0, 1, 0, 0, 1], (len(faces), 1))
+    if textured and mesh.has_vertex_texcoords():
+        at = download(parameters["vertex_texcoords"]).astype(np.float64).reshape(-1, 2)[faces]
+        uv = np.concatenate([at[:, 0], at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]], 1)
+    return _Pieces(np.full(len(faces), TRIANGLE, np.uint32), corner, first, second, normal, uv)

@@ -1,0 +1,159 @@
+"""Direct light of emitters with an extent (areas, environments) and of those that only their own code can evaluate.
+
+One emitter sample and one BSDF sample, combined by the power heuristic as in Mitsuba's ``path``; a BSDF sample goes on
+through delta surfaces, so that lamps behind glass light the scene as they do there.  Emitters are chosen by power, with
+a uniform share.  Point lights, spots and directional emitters are not sampled here: they are virtual lights.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import finite_or_zero
+from ..core.sampling import Choice, SpreadSamples, derived_seed, independent_sampler
+from ..lights.emission import bounding_sphere, other_power
+from ..lights.emitters import Emitters
+from ..points.camera_paths import GatherPoints, emitted_towards
+
+_UNIFORM_SHARE = 0.5
+
+
+def power_heuristic(pdf_a, pdf_b):
+    """Weight of a sample drawn with density a among densities a and b (power 2)."""
+    # As a ratio, because squares of densities leave the range of single precision
+    return dr.select(pdf_a > 0, dr.rcp(1 + dr.square(pdf_b / pdf_a)), 0)
+
+
+class ExtendedEmitters:
+    """Area emitters (rows first), then the environment, then the others: what emitter sampling chooses from."""
+
+    def __init__(self, scene, emitters: Emitters):
+        self.emitters = emitters
+        sphere = bounding_sphere(scene)
+        self.single = [emitter for _, emitter in emitters.others]
+        if emitters.environment is not None:
+            self.single.insert(0, emitters.environment)
+        power = np.concatenate([emitters.area.power, [other_power(emitter, sphere) for emitter in self.single]])
+        self.choice = None
+        if power.sum() > 0:
+            uniform = (power > 0) / np.count_nonzero(power)
+            self.choice = Choice((1 - _UNIFORM_SHARE) * power / power.sum() + _UNIFORM_SHARE * uniform)
+
+    def sample(self, si, row_sample, direction_sample, active):
+        """Choose an emitter and a direction: (direction sample, radiance over density, density, is delta)."""
+        row = self.choice.row(row_sample)
+        probability = self.choice.probability(row)
+        areas = self.emitters.area.count
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(si.p))
+        weight = dr.zeros(mi.UnpolarizedSpectrum, dr.width(si.p))
+        if areas:
+            here = active & (row < areas)
+            ds = self.emitters.area.on_shape("sample_direction", row, si, direction_sample, here)
+            facing = here & (dr.dot(ds.d, ds.n) < 0) & (ds.pdf > 0)
+            weight = dr.select(facing, self.emitters.area.emitted_in_front(row, ds, facing) / ds.pdf, 0)
+        for number, emitter in enumerate(self.single):
+            here = active & (row == areas + number)
+            one, one_weight = emitter.sample_direction(si, direction_sample, here)
+            ds = dr.select(here, one, ds)
+            weight = dr.select(here, finite_or_zero(mi.unpolarized_spectrum(one_weight)), weight)
+        return ds, weight / probability, ds.pdf * probability
+
+    def density(self, si, hit, direction, active):
+        """Density with which :meth:`sample` would have chosen the emitter that a ray from ``si`` found."""
+        density = dr.zeros(mi.Float, dr.width(si.p))
+        areas = self.emitters.area.count
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(si.p))
+        ds.p, ds.n, ds.uv, ds.d = hit.p, hit.n, hit.uv, direction
+        ds.dist = dr.norm(hit.p - si.p)
+        if areas:
+            row = self.emitters.area.row(hit, active & hit.is_valid())
+            here = active & hit.is_valid() & (row > 0)
+            pdf = self.emitters.area.on_shape("pdf_direction", row - 1, si, ds, here)
+            density = dr.select(here, pdf * self.choice.probability(row - 1, here), 0)
+        if self.emitters.environment is not None:
+            here = active & ~hit.is_valid()
+            pdf = self.emitters.environment.pdf_direction(si, ds, here)
+            density = dr.select(here, pdf * self.choice.probability(mi.UInt32(areas), here), density)
+        return density
+
+
+def _scattered_emission(scene, extended: ExtendedEmitters, traits, si, sample, depth, max_depth, sampler, active):
+    """Radiance of emitters along a BSDF sample, weighted against emitter sampling; beyond delta surfaces, in full."""
+    direction = si.to_world(sample.wo)
+    hit = scene.ray_intersect(si.spawn_ray(direction), active)
+    weight = power_heuristic(sample.pdf, extended.density(si, hit, direction, active))
+    radiance = emitted_towards(extended.emitters, hit, active) * weight
+    if traits.delta:
+        radiance += emission_beyond_delta(
+            scene, extended.emitters, traits, hit, mi.UInt32(depth) + 1, max_depth, sampler, active
+        )
+    return finite_or_zero(radiance)
+
+
+@dr.syntax
+def emission_beyond_delta(scene, emitters: Emitters, traits, hit, depth, max_depth, sampler, active):
+    """Radiance of emitters that a ray finds by way of mirrors, glass and masks.
+
+    ``hit``: the first surface that it met, ``depth``: edges from the camera to it.
+    """
+    hit, depth = mi.SurfaceInteraction3f(hit), mi.UInt32(depth)
+    radiance = dr.zeros(mi.UnpolarizedSpectrum, dr.width(hit.p))
+    factor = dr.full(mi.UnpolarizedSpectrum, 1, dr.width(hit.p))
+    going = active & hit.is_valid() & (depth < max_depth)
+    while dr.hint(going, exclude=[traits]):
+        onward, share = hit.bsdf().sample(mi.BSDFContext(), hit, sampler.next_1d(going), sampler.next_2d(going), going)
+        going &= mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
+        factor *= mi.unpolarized_spectrum(share)
+        hit = scene.ray_intersect(hit.spawn_ray(hit.to_world(onward.wo)), going)
+        radiance += dr.select(going, factor * emitted_towards(emitters, hit, going), 0)
+        depth += 1
+        going &= hit.is_valid() & (depth < max_depth) & (dr.max(factor) > 0)
+    return radiance
+
+
+@dr.syntax
+def direct_light(
+    scene, extended: ExtendedEmitters, traits, points: GatherPoints, max_depth, samples: int, rays_per_pixel: int,
+    seed: int,
+):  # fmt: skip
+    """Direct light at every gather point from emitters with an extent: (radiance, number of shadow rays).
+
+    ``samples``: pairs of an emitter sample and a BSDF sample per point.  Those of a pixel, which are the points of
+    ``rays_per_pixel`` successive camera rays, are spread evenly together.
+    """
+    si, bsdf = points.si, points.si.bsdf()
+    if dr.hint(extended.choice is None, mode="scalar"):
+        return dr.zeros(mi.UnpolarizedSpectrum, points.count), 0
+    sampler = independent_sampler(seed, points.count)
+    context = mi.BSDFContext()
+    limit = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF)))
+    total, of_pixel = dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, rays_per_pixel)
+    pixel = points.ray // of_pixel
+    first = (points.ray - pixel * of_pixel) * total
+    to_emitters, to_directions = (SpreadSamples(pixel, derived_seed(seed, stream)) for stream in (1, 2))
+    radiance, rays = dr.zeros(mi.UnpolarizedSpectrum, points.count), dr.zeros(mi.UInt32, points.count)
+    k = mi.UInt32(0)
+    while dr.hint(k < total, exclude=[traits]):
+        # ---- Emitter sampling
+        ds, weight, density = extended.sample(si, *to_emitters.at(first + k), mi.Bool(True))
+        active = dr.any(weight > 0)
+        wo = si.to_local(ds.d)
+        value, pdf = bsdf.eval_pdf(context, si, wo, active)
+        arriving = mi.unpolarized_spectrum(value) * weight
+        active &= dr.any(arriving > 0)
+        mis = dr.select(ds.delta, 1, power_heuristic(density, pdf))
+        blocked = scene.ray_test(si.spawn_ray_to(ds.p), active)
+        rays += dr.select(active, 1, 0)
+        radiance += dr.select(active & ~blocked, finite_or_zero(arriving * mis), 0)
+
+        # ---- BSDF sampling
+        sample, value = bsdf.sample(context, si, *to_directions.at(first + k))
+        smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Smooth) & dr.any(mi.unpolarized_spectrum(value) > 0)
+        found = _scattered_emission(scene, extended, traits, si, sample, points.depth, limit, sampler, smooth)
+        radiance += dr.select(smooth, finite_or_zero(mi.unpolarized_spectrum(value) * found), 0)
+        k += 1
+    radiance /= mi.Float(total)
+    dr.eval(radiance, rays)
+    return radiance, int(dr.sum(rays)[0])

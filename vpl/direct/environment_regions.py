@@ -1,0 +1,154 @@
+"""An environment cut into regions that are sampled like lights [IAS section 4.3; Agarwal et al. 2003].
+
+The environment is read once into a table of cells along latitude and longitude (z up, whatever frame the emitter has of
+its own).  Regions are sets of cells; inside its region a cell is drawn by the light that it holds, and a direction in
+it uniformly, so that of one region every direction has nearly the same weight: what [IAS] calls preintegrated and
+jittered.  The radiance of the direction itself is used, so nothing is lost between the cells.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import channel_mean, download, finite_or_zero, upload
+from ..core.parameters import parameters_of
+from ..core.sampling import find_interval, independent_sampler
+from .environment_strata import cones, stratify
+
+_EVALUATIONS = 2  # along each of both axes of a cell, at least
+# The same in cells of skies that are no image next to others that are this many times as bright: the sun has an edge
+_EDGE_EVALUATIONS, _EDGE_CONTRAST = 16, 2.0
+_STRATA_WIDTH = 256  # columns of the grid that regions are made of
+_DEFAULT_WIDTH, _LARGEST_WIDTH = 1024, 2048
+# Share of a region's light that is spread evenly over its cells: their table is made from few evaluations
+_EVEN_SHARE = 0.02
+
+
+class EnvironmentRegions:
+    """``count`` regions: ``axis`` (count, 3), ``cone_cos`` (count,) contain their directions; ``irradiance`` (count,):
+    radiance (mean over channels) integrated over solid angle; all float64."""
+
+    def __init__(self, environment, count: int):
+        self._environment = environment
+        width = _table_width(environment)
+        radiance = _read(environment, width)
+        height = len(radiance)
+        edges = np.cos(np.linspace(0, np.pi, height + 1))
+        solid_angle = ((edges[:-1] - edges[1:]) * 2 * np.pi / width)[:, None] * np.ones(width)
+        light = radiance * solid_angle
+        block = max(1, width // _STRATA_WIDTH)
+        sums = [a.reshape(height // block, block, width // block, block).sum((1, 3)) for a in (light, solid_angle)]
+        coarse = stratify(sums[0] / sums[1], count)
+        self.axis, self.cone_cos = cones(coarse)
+        self.count = len(self.axis)
+        labels = np.repeat(np.repeat(coarse, block, 0), block, 1).ravel()
+        self.irradiance = np.bincount(labels, light.ravel(), self.count)
+        self._tabulate(labels, light.ravel(), solid_angle.ravel(), width, height)
+
+    def _tabulate(self, labels, light, solid_angle, width, height):
+        """Cells region by region with their cumulative shares, and the density of every cell within its region."""
+        angle = np.bincount(labels, solid_angle, self.count)
+        total = self.irradiance[labels]
+        share = np.where(total > 0, light / np.where(total > 0, total, 1), 0)
+        share = (1 - _EVEN_SHARE) * share + _EVEN_SHARE * solid_angle / angle[labels]
+        share[total == 0] = (solid_angle / angle[labels])[total == 0]
+        order = np.argsort(labels, kind="stable")
+        # One sum that grows by one from region to region: a region is where it lies between two whole numbers
+        cumulative = np.cumsum(share[order])
+        self._cumulative = upload(dr.float64_array_t(mi.Float), np.concatenate([[0.0], cumulative]))
+        ends = np.cumsum(np.bincount(labels, minlength=self.count))
+        self._first = upload(mi.UInt32, np.concatenate([[0], ends]))
+        self._cells = upload(mi.UInt32, order)
+        self._labels = upload(mi.UInt32, labels)
+        self._density = upload(mi.Float, share / solid_angle)
+        self._width, self._height = (dr.opaque(mi.UInt32, size) for size in (width, height))
+
+    def sample(self, region, member, sample, active):
+        """A direction of each region: (direction, radiance over density, density per solid angle).
+
+        ``member``: uniform number that picks the cell; ``sample``: two that pick the direction in it.
+        """
+        first, last = (dr.gather(mi.UInt32, self._first, region + k, active) for k in (0, 1))
+        place = find_interval(self._cumulative, first, last, member)
+        cell = dr.gather(mi.UInt32, self._cells, place, active)
+        row, column = cell // self._width, cell % self._width
+        step = dr.pi / mi.Float(self._height)
+        top, bottom = dr.cos(mi.Float(row) * step), dr.cos(mi.Float(row + 1) * step)
+        cosine = dr.lerp(top, bottom, sample.x)
+        azimuth = dr.two_pi * (mi.Float(column) + sample.y) / mi.Float(self._width)
+        sine = dr.safe_sqrt(1 - dr.square(cosine))
+        direction = mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), cosine)
+        density = dr.gather(mi.Float, self._density, cell, active)
+        radiance = self.radiance(direction, active)
+        return direction, finite_or_zero(radiance / density) & active, density
+
+    def radiance(self, direction, active):
+        """Radiance that arrives from a direction."""
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
+        si.wi = -direction
+        return finite_or_zero(mi.unpolarized_spectrum(self._environment.eval(si, active)))
+
+    def find(self, direction, active):
+        """(Region, density of :meth:`sample`) of a direction."""
+        polar = dr.safe_acos(direction.z) * mi.Float(self._height) / dr.pi
+        azimuth = dr.atan2(direction.y, direction.x)
+        azimuth = dr.select(azimuth < 0, azimuth + dr.two_pi, azimuth) * mi.Float(self._width) / dr.two_pi
+        row = dr.minimum(mi.UInt32(polar), self._height - 1)
+        column = dr.minimum(mi.UInt32(azimuth), self._width - 1)
+        cell = row * self._width + column
+        return dr.gather(mi.UInt32, self._labels, cell, active), dr.gather(mi.Float, self._density, cell, active)
+
+
+def _table_width(environment) -> int:
+    """Columns of the table: those of an image, as far as that pays, a power of two."""
+    if environment.class_name() == "ConstantBackgroundEmitter":
+        return 64
+    columns = _image_width(environment) or _DEFAULT_WIDTH
+    return int(np.clip(2 ** np.ceil(np.log2(columns)), 64, _LARGEST_WIDTH))
+
+
+def _image_width(environment) -> int:
+    """Columns of the image of an environment, 0 where it has none."""
+    parameters = parameters_of(environment)
+    # The first column is there twice
+    return max(1, parameters["data"].shape[1] - 1) if "data" in parameters else 0
+
+
+def _read(environment, width: int) -> np.ndarray:
+    """Mean radiance of every cell, (width / 2, width) float64; values that are not finite count as black."""
+    height = width // 2
+    image_width = _image_width(environment)
+    across = max(_EVALUATIONS, -(-image_width // width))
+    radiance = _read_cells(environment, np.arange(width * height), width, across).reshape(height, width)
+    if not image_width:
+        edges = np.flatnonzero(_at_edges(radiance))
+        radiance.reshape(-1)[edges] = _read_cells(environment, edges, width, _EDGE_EVALUATIONS)
+    return radiance
+
+
+def _at_edges(radiance: np.ndarray) -> np.ndarray:
+    """Cells with a far brighter or a far darker one among their eight neighbours, (height, width) bool."""
+    padded = np.pad(np.pad(radiance, ((1, 1), (0, 0)), "edge"), ((0, 0), (1, 1)), "wrap")
+    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    return around.max((2, 3)) > _EDGE_CONTRAST * around.min((2, 3))
+
+
+def _read_cells(environment, cells: np.ndarray, width: int, across: int) -> np.ndarray:
+    """Mean radiance of some cells, from ``across`` times ``across`` evaluations in each."""
+    height, count = width // 2, len(cells)
+    if count == 0:
+        return np.zeros(0)
+    sampler = independent_sampler(0, count)
+    total = dr.zeros(mi.Float, count)
+    row, column = upload(mi.Float, cells // width), upload(mi.Float, cells % width)
+    for k in range(across**2):
+        jitter = (mi.Point2f(k % across, k // across) + sampler.next_2d()) / across
+        polar, azimuth = (row + jitter.x) * (np.pi / height), (column + jitter.y) * (2 * np.pi / width)
+        sine, cosine = dr.sincos(polar)
+        si = dr.zeros(mi.SurfaceInteraction3f, count)
+        si.wi = -mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), cosine)
+        total += channel_mean(finite_or_zero(mi.unpolarized_spectrum(environment.eval(si))))
+        dr.eval(total, sampler)
+    return download(total).astype(np.float64) / across**2

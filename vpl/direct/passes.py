@@ -1,0 +1,168 @@
+"""The passes of iterative adaptive sampling over some groups of sites [IAS sections 4.1, 4.2, 5.8, 5.9].
+
+A site has two halves.  They share probabilities, but each is an estimate of its own, and whether a half goes on, and
+with how many samples, is decided by the numbers of the other.  So no half ends because it happened to look converged,
+which would bias the image (termination bias, [IAS] section 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import download, ranges, upload
+from ..core.sampling import derived_seed
+from .cluster_probabilities import Mixture, sum_over_groups, update_importance, update_probabilities
+from .cluster_sampling import draw_samples
+from .site_table import Lanes, Scenery, Statistics
+
+_LEAST_HALF = 4  # samples of a half in a pass: fewer say nothing about the variance
+_INCREMENT = 25  # samples, where little is missing [IAS section 5.8]
+# Nothing is called black before so many passes and samples without light [IAS section 5.9]
+_BLACK_PASSES, _BLACK_SAMPLES = 3, 250
+_BLACK_LEAST = 48  # however small a part of its pixel a site is
+_BSDF_LEAST = 2
+_NEIGHBOURS = 256  # sites in a row that are sampled in the order of their samples
+_LEAST_VARIANCE = 0.01  # of a pass, relative to the mean over sites, where passes are weighted by it
+# Shares of the uniform function after the first pass, and how the block's gives way to the pixel's [IAS fig. 2]
+_UNIFORM_SHARE, _BLOCK_DECAY = 0.1, 0.7
+
+
+class SitePasses:
+    """The passes over the sites of ``table``.
+
+    ``share`` (s,): of its pixel's camera rays, those that belong to a site; ``bsdf_share`` (s,): BSDF samples for each
+    emitter sample; ``level``: mean radiance of the image, which ``options.dark_floor`` is relative to.
+    """
+
+    def __init__(self, scenery: Scenery, share, bsdf_share, level: float, options):
+        self.scenery, self.share, self.bsdf_share = scenery, share, bsdf_share
+        self.level, self.options, self.max_passes = level, options, options.max_passes
+        table = scenery.table
+        self.size, self.cut = (download(column).astype(np.int64) for column in (table.size, table.cut))
+        count = table.count
+        # Per half and site: sums of weighted estimates, of weights, and of squared weights times variances
+        self.total, self.weight, self.spread = np.zeros((2, count, 3)), np.zeros((2, count)), np.zeros((2, count))
+        self.samples, self.seen = np.zeros((2, count), np.int64), np.zeros((2, count), np.int64)
+        self.tried, self.rays, self.passes = np.zeros(count), np.zeros(count), np.zeros(count, np.int64)
+
+    def run(self, two_sided, seed: int, halted: Callable[[int], bool]) -> None:
+        """Sample until all sites are done.
+
+        ``two_sided``: Bool per point of the batch, lit from both sides; ``halted``: asked before every pass.
+        """
+        scenery, table = self.scenery, self.scenery.table
+        if table.entries == 0:
+            return
+        scenery.importance = dr.ones(mi.Float, table.entries)
+        dr.eval(scenery.importance)
+        if self.options.evaluated:
+            update_importance(scenery, two_sided, dr.arange(mi.UInt32, table.count))
+        scenery.statistics = Statistics.empty(table.entries)
+        scenery.probability = dr.empty(mi.Float, table.entries)
+        of_groups = tuple(dr.zeros(mi.Float, dr.width(table.node)) for _ in range(3))
+        wanted = self._full_pass()
+        for number in range(self.max_passes):
+            active = np.flatnonzero(wanted.any(0))
+            if len(active) == 0 or halted(number):
+                break
+            sum_over_groups(table, scenery.statistics, of_groups, upload(mi.UInt32, self._places(active)))
+            update_probabilities(scenery, of_groups, self._mixture(number), upload(mi.UInt32, active))
+            # That later passes are better, but not by how much, is all that the square root assumes [Owen and
+            # Zhou 2020, "The square root rule for adaptive importance sampling"]
+            self._draw(wanted, number, np.sqrt(number + 1.0), derived_seed(seed, number))
+            wanted = self._wanted(number)
+
+    def _draw(self, wanted: np.ndarray, number: int, weight: float, seed: int) -> None:
+        """Take ``wanted`` samples of each half and site, (2, s), and add what they find.
+
+        Estimates are weighted by their samples times ``weight``.  Weights that do not depend on what was found leave
+        the combination unbiased; in the paper they are the inverse of the variance that each pass estimates (eq. 7, 8).
+        """
+        half, site = np.nonzero(wanted)
+        # Lanes run in step with the next ones, which should be near and have as many samples
+        order = np.lexsort((wanted[half, site], site // _NEIGHBOURS))
+        half, site = half[order], site[order]
+        samples = wanted[half, site]
+        bsdf = np.where(self.bsdf_share > 0, np.maximum(np.ceil(wanted * self.bsdf_share), _BSDF_LEAST), 0)[half, site]
+        drawn = draw_samples(self.scenery, Lanes(*(upload(mi.UInt32, x) for x in (site, half, samples, bsdf))), seed)
+        variance = download(drawn.variance).astype(np.float64)
+        weight = samples * weight
+        if self.options.inverse_variance:
+            # A pass that saw nothing has no variance: it counts as much as one with little
+            typical = np.mean(variance * samples) / samples
+            weight = 1 / np.maximum(variance, np.maximum(_LEAST_VARIANCE * typical, np.finfo(np.float32).tiny))
+        self.total[half, site] += weight[:, None] * download(drawn.radiance)
+        self.weight[half, site] += weight
+        self.spread[half, site] += np.square(weight) * variance
+        self.samples[half, site] += samples
+        self.seen[half, site] += download(drawn.seen)
+        np.add.at(self.tried, site, samples + bsdf)
+        self.passes[site] = number + 1
+        np.add.at(self.rays, site, download(drawn.rays))
+
+    def _places(self, active: np.ndarray) -> np.ndarray:
+        """Where the nodes of the cuts of some sites' groups are."""
+        first, at = np.unique(self.cut[active], return_index=True)
+        return ranges(first, self.size[active[at]])
+
+    def _mixture(self, number: int) -> Mixture:
+        """Shares of the three functions in a pass [IAS fig. 2]: first uniform, then mostly the block's, more and more
+        the pixel's."""
+        uniform = 1.0 if number == 0 else _UNIFORM_SHARE
+        pixel = (1 - uniform) * (1 - _BLOCK_DECAY**number)
+        shares = (uniform, 1 - uniform - pixel, pixel, self.options.prior)
+        return Mixture(*(dr.opaque(mi.Float, share) for share in shares))
+
+    def _full_pass(self) -> np.ndarray:
+        """Samples of each half in a whole pass [IAS section 5.8], (2, s); 0 for sites that no cluster lights."""
+        options = self.options
+        of_pixel = np.clip(options.samples_per_cluster * self.size, options.least_samples, options.most_samples)
+        of_pixel = np.minimum(of_pixel, options.max_samples)
+        half = np.maximum(np.ceil(of_pixel * self.share / 2).astype(np.int64), _LEAST_HALF)
+        return np.where(self.size > 0, half, 0) * np.ones((2, 1), np.int64)
+
+    def _estimates(self):
+        """(Radiance (2, s, 3), variance of its mean over channels (2, s)) of both halves."""
+        weight = np.where(self.weight > 0, self.weight, 1)
+        return self.total / weight[..., None], self.spread / np.square(weight)
+
+    def _wanted(self, number: int) -> np.ndarray:
+        """Samples that each half takes in the next pass, (2, s), as the other half has it.
+
+        [IAS section 4.2] compares s² / L² with a threshold; here the squared radiance gets a floor, and a site that is
+        only a part of its pixel may be noisier accordingly.
+        """
+        options, full = self.options, self._full_pass()
+        radiance, variance = self._estimates()
+        level = radiance.mean(2)
+        allowed = options.error**2 * (np.square(level) + (options.dark_floor * self.level) ** 2) / self.share
+        # What the variance of the other half would be if it was as good as this one, and of the mean of both
+        samples = np.maximum(self.samples, 1)
+        expected = variance * samples / samples[::-1] / 2
+        excess = expected / np.maximum(allowed, np.finfo(np.float64).tiny)
+        missing = np.ceil(np.minimum(excess - 1, 1) * samples[::-1])
+        few = np.minimum(np.maximum(missing, np.ceil(_INCREMENT * self.share / 2)), full)
+        wanted = np.where(excess >= 2, full, np.maximum(few, _LEAST_HALF))
+        dark = self.seen == 0
+        enough = np.maximum(_BLACK_SAMPLES * self.share, _BLACK_LEAST)
+        black = (number + 1 >= _BLACK_PASSES) & (2 * self.samples >= enough)
+        wanted = np.where(dark, np.where(black, 0, full), np.where(excess <= 1, 0, wanted))
+        wanted = np.where(self.size > 0, wanted, 0).astype(np.int64)[::-1]
+        left = np.floor(options.max_samples * self.share / 2 - self.samples).astype(np.int64)
+        return np.where(left >= _LEAST_HALF, np.minimum(wanted, left), 0)
+
+    def result(self):
+        """Per site: radiance (s, 3), its estimated variance, passes, rays, and the share of samples that saw light."""
+        radiance, variance = self._estimates()
+        # A half that was stopped before its first sample leaves the other
+        counted = self.weight > 0
+        halves = np.maximum(counted.sum(0), 1)
+        mean = np.where(counted[..., None], radiance, 0).sum(0) / halves[:, None]
+        return (
+            mean, np.where(counted, variance, 0).sum(0) / np.square(halves), self.passes, self.rays,
+            self.seen.sum(0) / np.maximum(self.tried, 1),
+        )  # fmt: skip

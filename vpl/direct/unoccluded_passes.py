@@ -1,0 +1,88 @@
+"""The standard that iterative adaptive sampling is compared with [IAS section 5.1].
+
+For each point a fixed density over all sources, proportional to their unoccluded contribution; point after point of a
+pixel, until its estimate converges by the same rule.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import download, upload
+from ..core.sampling import derived_seed
+from .cluster_probabilities import Mixture, update_importance, update_probabilities
+from .passes import SitePasses
+from .site_table import Statistics
+
+_LEAST_PASSES = 4  # of each half: fewer say nothing about the variance between points
+
+
+class UnoccludedPasses(SitePasses):
+    """Passes over one point of every site after another.  ``options.least_samples`` and ``most_samples``:
+    emitter samples at each."""
+
+    def __init__(self, scenery, share, bsdf_share, level, options):
+        super().__init__(scenery, share, bsdf_share, level, options)
+        self.several = download(scenery.table.members) > 1
+        # Sums over the passes of each half and site: their means, squares of these, and how many there were
+        self.levels, self.squares, self.done = (np.zeros((2, len(share))) for _ in range(3))
+
+    def run(self, two_sided, seed: int, halted) -> None:
+        """Sample until all sites are done.  Arguments as in :class:`SitePasses`."""
+        whole = self.scenery.table
+        if whole.entries == 0:
+            return
+        first, members = (download(column).astype(np.int64) for column in (whole.member_first, whole.members))
+        self.scenery.importance = dr.zeros(mi.Float, whole.entries)
+        self.scenery.probability = dr.empty(mi.Float, whole.entries)
+        self.scenery.statistics = Statistics.empty(whole.entries)
+        nothing = tuple(dr.zeros(mi.Float, dr.width(whole.node)) for _ in range(3))
+        mixture = Mixture(*(dr.opaque(mi.Float, share) for share in (1.0, 0.0, 0.0, 1.0)))
+        wanted = self._full_pass()
+        for number in range(self.max_passes):
+            active = np.flatnonzero(wanted.any(0))
+            if len(active) == 0 or halted(number):
+                break
+            for half in (0, 1):
+                # The halves stand on different points, as long as there are two
+                member = (2 * number + half) % members
+                changed = np.flatnonzero(wanted[half])
+                if number + half > 0:
+                    changed = changed[members[changed] > 1]
+                self._stand_on(whole, first + member, changed, two_sided, nothing, mixture)
+                self._draw_half(wanted, half, number, derived_seed(seed, number, half))
+            wanted = self._wanted(number)
+
+    def _stand_on(self, whole, place, changed, two_sided, nothing, mixture) -> None:
+        """Take one point of every site, and make the densities of the sites ``changed``; others keep theirs."""
+        one = dr.full(mi.UInt32, 1, whole.count)
+        self.scenery.table = replace(whole, member_first=upload(mi.UInt32, place), members=one)
+        if len(changed):
+            sites = upload(mi.UInt32, changed)
+            update_importance(self.scenery, two_sided, sites)
+            update_probabilities(self.scenery, nothing, mixture, sites)
+
+    def _draw_half(self, wanted: np.ndarray, half: int, number: int, seed: int) -> None:
+        """A pass of one half, whose mean is kept for the variance between points."""
+        taken = wanted[half]
+        if not taken.any():
+            return
+        before = self.total[half].mean(1)
+        self._draw(np.where(np.arange(2)[:, None] == half, wanted, 0), number, 1.0, seed)
+        found = np.where(taken > 0, (self.total[half].mean(1) - before) / np.maximum(taken, 1), 0)
+        self.levels[half] += found
+        self.squares[half] += np.square(found)
+        self.done[half] += taken > 0
+
+    def _estimates(self):
+        """Radiance and variance of both halves; between the passes where these stand on different points."""
+        radiance, variance = super()._estimates()
+        passes = np.maximum(self.done, 2)
+        between = np.maximum(self.squares / passes - np.square(self.levels / passes), 0) / (passes - 1)
+        several = self.several & (self.done >= _LEAST_PASSES)
+        unknown = self.several & (self.done < _LEAST_PASSES) & (self.done > 0)
+        return radiance, np.where(several, between, np.where(unknown, np.inf, variance))

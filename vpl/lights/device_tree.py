@@ -1,0 +1,82 @@
+"""A light tree on the device: packed records that one gather fetches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import download, upload
+from .light_tree import LightTree
+
+
+@dataclass
+class Node:
+    """Nodes of a light tree in a kernel: one per lane."""
+
+    box_min: object
+    box_max: object
+    axis: object
+    cosine: object
+    intensity: object
+    escape: object
+
+    @property
+    def center(self):
+        """Centre of the box of positions."""
+        return 0.5 * (self.box_min + self.box_max)
+
+    @property
+    def extent(self):
+        """Half extents of the box of positions."""
+        return 0.5 * (self.box_max - self.box_min)
+
+    @property
+    def radius(self):
+        """Radius of the ball around the box; 0 for lights at infinity."""
+        return dr.norm(self.extent)
+
+
+class DeviceTree:
+    """A light tree's packed records on the device.
+
+    ``second_representative``: (2n - 1,) another light per node, drawn independently of the tree's own.
+    """
+
+    def __init__(self, kind: str, tree: LightTree, second_representative):
+        self.kind = kind
+        self._second = upload(mi.UInt32, second_representative)
+        self.count = len(tree.records)
+        self._records = upload(mi.Float, tree.records)
+
+    def records(self) -> np.ndarray:
+        """The records again, of NumPy: see :class:`vpl.lights.light_tree.LightTree`."""
+        return download(self._records).reshape(self.count, -1)
+
+    def gather(self, index, active=True) -> Node:
+        """Fetch one node per lane; see :mod:`vpl.lights.light_tree` for the layout of the record."""
+        a, b, c, d = (dr.gather(mi.Vector4f, self._records, index * 4 + k, active) for k in range(4))
+        return Node(
+            mi.Point3f(a.x, a.y, a.z),
+            mi.Point3f(a.w, b.x, b.y),
+            mi.Vector3f(b.z, b.w, c.x),
+            c.y,
+            mi.Color3f(c.w, d.x, d.y),
+            dr.reinterpret_array(mi.UInt32, d.z),
+        )
+
+    def escape(self, index, active=True):
+        """The node that follows a node's subtree."""
+        return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._records, index * 16 + 14, active))
+
+    def summed_intensity(self, index, active=True):
+        """Scalar intensity of a node: the mean over channels of the sum over its lights."""
+        return dr.gather(mi.Float, self._records, index * 16 + 10, active)
+
+    def representative(self, index, active=True, second=False):
+        """Index of a node's representative light, or of its second one."""
+        if second:
+            return dr.gather(mi.UInt32, self._second, index, active)
+        return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._records, index * 16 + 15, active))

@@ -1,0 +1,268 @@
+"""Reading the scene's emitters into flat arrays, once, without ever dispatching a kernel over emitter objects.
+
+A virtual call on emitter pointers makes Dr.Jit trace every emitter instance of the process: a minute of compilation
+for some thousands of lights.  Here points, spots, directional and area emitters become rows of arrays; the few that
+cannot (environment maps, projectors, textured spots) are called directly, one by one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import LARGEST_VALUE, download, finite_or_zero, rgb_to_spectrum, upload, usable
+from ..core.parameters import matrix_of, numbers, parameters_of
+from .virtual_lights import VirtualLights
+
+# Shapes, besides meshes, on which Mitsuba can sample a point; of others, such as curves, it does not know the area
+SAMPLED_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
+
+
+@dataclass
+class AreaEmitters:
+    """Area emitters as rows: the shape's registry index, radiance (RGB), area; textured ones keep their object.
+
+    ``shapes``: the shapes one by one, for scenes in which some other shape cannot be sampled; see :meth:`on_shape`.
+    """
+
+    shape_index: np.ndarray
+    radiance: np.ndarray
+    area: np.ndarray
+    textured: list = field(default_factory=list)
+    shapes: list | None = None
+
+    @property
+    def count(self) -> int:
+        return len(self.area)
+
+    @property
+    def power(self) -> np.ndarray:
+        """Emitted power up to a constant shared by all kinds: (n,) float64."""
+        return np.pi * self.area.astype(np.float64) * self.radiance.mean(1, dtype=np.float64)
+
+    def __post_init__(self):
+        size = int(self.shape_index.max(initial=0)) + 1
+        rows = np.zeros(size, np.uint32)
+        rows[self.shape_index] = np.arange(1, self.count + 1)
+        self._row_of_shape = upload(mi.UInt32, rows)
+        self._radiance = upload(mi.Float, self.radiance)
+        self._shapes = upload(mi.UInt32, self.shape_index)
+
+    def row(self, si, active=True):
+        """Row of the emitter that a hit (surface interaction or preliminary) lies on, plus one; 0 where on none."""
+        index = dr.reinterpret_array(mi.UInt32, si.shape)
+        return dr.gather(mi.UInt32, self._row_of_shape, index, active & (index < dr.width(self._row_of_shape)))
+
+    def on_shape(self, method: str, row, *arguments):
+        """Call a method of the shape of each row (counted from 0); the last argument is the mask of active lanes.
+
+        A call on pointers is recorded for all shapes of a scene at once, quickly however many they are, but fails if
+        one of them, such as a curve or an instance, does not have the method.  Then only emitters are called.
+        """
+        if self.shapes is not None:
+            return dr.switch(mi.UInt32(row), [getattr(shape, method) for shape in self.shapes], *arguments)
+        index = dr.gather(mi.UInt32, self._shapes, row, arguments[-1])
+        return getattr(dr.reinterpret_array(mi.ShapePtr, index), method)(*arguments)
+
+    def emitted_in_front(self, row, sample, active=True):
+        """Radiance that a position sample (or direction sample) on the emitter of ``row`` sends to its front."""
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(row))
+        si.p, si.n, si.uv, si.wi = sample.p, sample.n, sample.uv, mi.Vector3f(0, 0, 1)
+        return self.emitted(row, si, active)
+
+    def emitted(self, row, si, active=True):
+        """Radiance emitted at ``si`` towards ``si.wi`` by the emitter of ``row`` (counted from 0)."""
+        active = active & (mi.Frame3f.cos_theta(si.wi) > 0)
+        radiance = rgb_to_spectrum(dr.gather(mi.Color3f, self._radiance, row, active)) & active
+        for textured_row, emitter in self.textured:
+            here = active & (row == textured_row)
+            radiance = dr.select(here, emitter.eval(si, here), radiance)
+        return finite_or_zero(radiance)
+
+
+@dataclass
+class Emitters:
+    """All emitters of a scene, sorted by what can be done with them.
+
+    ``points``, ``spots``, ``directional``: virtual lights; ``area``: rows; ``environment``: the environment emitter or
+    None; ``others``: (name, emitter) of emitters that only their own sampling routines know.
+    """
+
+    points: VirtualLights
+    spots: VirtualLights
+    directional: VirtualLights
+    area: AreaEmitters
+    environment: object | None
+    others: list
+    dropped: int
+
+    def extended_only(self) -> Emitters:
+        """These emitters without points, spots and directional ones."""
+        none = {name: getattr(self, name).select(slice(0)) for name in ("points", "spots", "directional")}
+        return replace(self, **none)
+
+    @property
+    def count(self) -> int:
+        return (
+            self.points.count + self.spots.count + self.directional.count + self.area.count + len(self.others)
+            + (self.environment is not None)
+        )  # fmt: skip
+
+
+def _constant_rgb(parameters, name):
+    """A spectrum parameter as RGB if it is the same everywhere, else None."""
+    value = parameters.get(f"{name}.value")
+    if value is None:
+        return None
+    components = numbers(value)
+    return components * 3 if len(components) == 1 else components[:3]
+
+
+def _frame_of(to_world):
+    """Origin and z axis of an emitter's frame, as float64 vectors."""
+    matrix = matrix_of(to_world)
+    return matrix[:3, 3], matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
+
+
+def _textured_radiance(emitter, shape) -> np.ndarray:
+    """Mean radiance of a textured area emitter, from a regular grid of surface samples."""
+    side = 64
+    u, v = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
+    sample = mi.Point2f(upload(mi.Float, u), upload(mi.Float, v))
+    position = shape.sample_position(0, sample)
+    si = dr.zeros(mi.SurfaceInteraction3f, side * side)
+    si.p, si.n, si.uv, si.wi = position.p, position.n, position.uv, mi.Vector3f(0, 0, 1)
+    radiance = download(finite_or_zero(emitter.eval(si))).reshape(side * side, -1)
+    return np.broadcast_to(radiance.mean(0, dtype=np.float64), (3,)).astype(np.float32)
+
+
+def registered_shapes(scene) -> list:
+    """(Registry index, shape) of all shapes of a scene."""
+    registry = download(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())) if scene.shapes() else []
+    return [(int(index), shape) for index, shape in zip(registry, scene.shapes(), strict=True)]
+
+
+def _can_be_sampled(shape) -> bool:
+    return shape.is_mesh() or shape.class_name() in SAMPLED_SHAPES
+
+
+def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
+    """Area emitters, the number of rows with values that are not finite, and emitters that only look like areas."""
+    indices, radiances, textured, unusual = [], [], [], []
+    glowing = [(index, shape) for index, shape in registered_shapes(scene) if shape.is_emitter()]
+    # Mitsuba loads shapes in parallel, in an order that changes from run to run; the same seed must give the same image
+    glowing.sort(key=lambda row: (row[1].id(), *map(float, (*row[1].bbox().min, *row[1].bbox().max))))
+    for index, shape in glowing:
+        emitter = shape.emitter()
+        if emitter.class_name() != "AreaLight":
+            unusual.append((emitter.class_name(), emitter))
+            continue
+        if not _can_be_sampled(shape):
+            raise ValueError(
+                f'shape "{shape.id()}" ({shape.class_name()}): an area emitter on a shape of this kind is not '
+                f"supported, because no point on it can be sampled; one on a mesh, {', '.join(SAMPLED_SHAPES)} is"
+            )
+        radiance = _constant_rgb(parameters_of(emitter), "radiance")
+        if radiance is None and "MeshAttribute[" in str(emitter):
+            raise ValueError(
+                f'shape "{shape.id()}" ({shape.class_name()}): the emitted radiance is a mesh attribute, which is '
+                "not supported; a constant or an image is"
+            )
+        if radiance is None:
+            textured.append((len(indices), emitter))
+            radiance = _textured_radiance(emitter, shape)
+        indices.append(index)
+        radiances.append(radiance)
+    radiance = np.array(radiances, np.float32).reshape(-1, 3)
+    bad = ~usable(radiance).all(1)
+    radiance[bad] = 0
+    shape_index = np.array(indices, np.uint32)
+    area, shapes = np.zeros(len(indices), np.float32), None
+    if len(indices) and all(_can_be_sampled(shape) for shape in scene.shapes()):
+        pointers = dr.reinterpret_array(mi.ShapePtr, upload(mi.UInt32, shape_index))
+        area = download(pointers.surface_area())
+    elif len(indices):
+        by_index = dict(glowing)
+        shapes = [by_index[index] for index in indices]
+        area = np.array([download(shape.surface_area())[0] for shape in shapes], np.float32)
+    return AreaEmitters(shape_index, radiance, area, textured, shapes), int(bad.sum()), unusual
+
+
+def _sorted_rows(rows: list, columns: int) -> np.ndarray:
+    """Rows of numbers in an order that depends on nothing else; see :func:`_read_areas`."""
+    array = np.array(rows, np.float64).reshape(-1, columns)
+    return array[np.lexsort(array.T[::-1])]
+
+
+def _read_environment(scene):
+    """The environment, or None where there is none or it is one colour that is not usable, and how many were dropped.
+
+    Raises a ValueError that names a texel of an environment map that is not finite: Mitsuba cannot sample the map.
+    """
+    environment = scene.environment()
+    if environment is None:
+        return None, 0
+    if environment.class_name() == "TimedSunskyEmitter":
+        raise ValueError(
+            f'the emitter "{environment.id()}" ({environment.class_name()}) is not supported: Mitsuba\'s compiled '
+            "variants cannot evaluate it; sunsky is"
+        )
+    parameters = parameters_of(environment)
+    radiance = _constant_rgb(parameters, "radiance")
+    if radiance is not None and not usable(np.array(radiance)).all():
+        return None, 1
+    if "data" in parameters:
+        # Mitsuba puts a copy of the last column first.  Negative texels, which filters leave in maps, are black here
+        texels = np.asarray(parameters["data"])[:, 1:]
+        if not usable(max(-texels.min(), texels.max())):
+            bad = np.argwhere(~usable(np.abs(texels)).all(-1))
+            row, column = bad[0].tolist()
+            raise ValueError(
+                f'the environment map "{environment.id()}" has {len(bad)} texel(s) that are not a number or above '
+                f"{LARGEST_VALUE:g}, such as that in row {row} and column {column}"
+            )
+    return environment, 0
+
+
+def read_emitters(scene) -> Emitters:
+    """Read all emitters of ``scene``.
+
+    Lights with values that are not finite or negative are dropped, counted and reported; a ValueError names an
+    environment map with texels that are not finite, and emitters on shapes that cannot be sampled.
+    """
+    points, spots, suns, others = [], [], [], []
+    environment, dropped = _read_environment(scene)
+    area, bad_areas, others_on_shapes = _read_areas(scene)
+    dropped += bad_areas
+    for emitter in scene.emitters():
+        name = emitter.class_name()
+        if emitter.is_environment() or name == "AreaLight":
+            continue
+        parameters = parameters_of(emitter)
+        intensity = _constant_rgb(parameters, "irradiance" if name == "DirectionalEmitter" else "intensity")
+        if name == "PointLight" and intensity is not None:
+            points.append([*numbers(parameters["position"]), *intensity])
+        elif name == "SpotLight" and intensity is not None and "texture.value" in parameters:
+            cone = np.deg2rad([*numbers(parameters["cutoff_angle"]), *numbers(parameters["beam_width"])])
+            spots.append([*np.concatenate(_frame_of(parameters["to_world"])), *intensity, *cone])
+        elif name == "DirectionalEmitter" and intensity is not None:
+            suns.append([*_frame_of(parameters["to_world"])[1], *intensity])
+        elif not any(emitter is known for _, known in others_on_shapes):
+            others.append((name, emitter))
+    points, spots, suns = (_sorted_rows(rows, n) for rows, n in ((points, 6), (spots, 11), (suns, 6)))
+    omni = VirtualLights.of("point", points[:, :3], np.tile([0, 0, 1], (len(points), 1)), points[:, 3:])
+    spot = VirtualLights.of("spot", spots[:, :3], spots[:, 3:6], spots[:, 6:9], 0, spots[:, 9:])
+    sun = VirtualLights.of("directional", None, suns[:, :3], suns[:, 3:])
+    kept = []
+    for lights in (omni, spot, sun):
+        lights, bad = lights.without_bad()
+        dropped += bad
+        kept.append(lights)
+    if dropped:
+        mi.Log(mi.LogLevel.Warn, f"{dropped} emitter(s) with values that are negative or not finite were dropped.")
+    others += others_on_shapes
+    others.sort(key=lambda row: (row[0], row[1].id(), str(row[1])))
+    return Emitters(*kept, area, environment, others, dropped)

@@ -1,0 +1,173 @@
+"""Everything that a method needs to know about the lights of one render: virtual lights, their trees, the clamp."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from time import perf_counter
+
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import channel_mean
+from ..core.sampling import derived_seed
+from .device_tree import DeviceTree
+from .emission import bounding_sphere
+from .emitter_lights import lights_of_emitters
+from .emitters import Emitters
+from .light_tree import CONE_COS, LightTree, build_light_tree
+from .tracing import PathLimits, trace_lights
+from .virtual_lights import KINDS, DeviceLights, VirtualLights
+
+
+@dataclass(frozen=True)
+class LightOptions:
+    """What lights to make: see the integrators' manual for ``vpl_count``, ``direct_count``, ``clamping``, ``direct``.
+
+    ``deepest``: edges of the longest light path that may store a light; ``trees``: whether trees are needed.
+    """
+
+    vpl_count: int
+    direct_count: int
+    clamping: float
+    direct: str
+    max_depth: float
+    rr_depth: int
+    lobe_limit: float
+    trees: bool
+
+
+@dataclass
+class LightGroup:
+    """Lights of one kind on the device, with their tree (None where the method asks for none)."""
+
+    kind: str
+    lights: DeviceLights
+    tree: DeviceTree | None
+
+    @property
+    def count(self) -> int:
+        return self.lights.count
+
+    def pick(self, index):
+        """Lights by their index, each standing for itself: the candidates of
+        :func:`vpl.transport.evaluation.evaluate_one_of`.
+        """
+        return [(self.lights.gather(index), 1)]
+
+    def representatives(self, nodes, second=False):
+        """The light that stands for each node, or its second one: see :meth:`standing_for`."""
+        return self.standing_for(self.tree.representative(nodes, second=second), self.tree.summed_intensity(nodes))
+
+    def standing_for(self, index, intensity):
+        """Lights by their index, and the factors from their intensities to those of the clusters they stand for.
+
+        A representative is drawn with probability intensity / cluster intensity; dividing by it, rather than taking the
+        cluster's colour, keeps the estimate unbiased where colours differ.  ``intensity``: the mean over channels.
+        """
+        light = self.lights.gather(index)
+        return light, intensity / channel_mean(light.intensity)
+
+
+@dataclass
+class LightSet:
+    """Groups that hold at least one light; ``smallest_distance``: the clamp on distances to oriented lights.
+
+    ``max_depth``: edges of the longest path from camera to emitter; ``paths``: light paths emitted; ``dropped``: lights
+    with values that were not finite; ``seconds``: time by stage.
+    """
+
+    groups: list[LightGroup]
+    smallest_distance: float
+    max_depth: float
+    paths: int
+    dropped: int
+    seconds: dict
+
+    @property
+    def count(self) -> int:
+        return sum(group.count for group in self.groups)
+
+    @property
+    def counts(self) -> dict:
+        return {group.kind: group.count for group in self.groups}
+
+    def allowed(self, point_depth, light_depth):
+        """Whether a path through a gather point and a light has no more edges than ``max_depth``."""
+        if math.isinf(self.max_depth):
+            return mi.Bool(True)
+        return point_depth + light_depth + 1 <= mi.UInt32(self.max_depth)
+
+
+def _leaf_ranges(tree: LightTree) -> np.ndarray:
+    """For every node, the first and one past the last of its lights in ``tree.leaf_order``: (2n - 1, 2)."""
+    node = np.arange(len(tree.records))
+    leaves_before = np.concatenate([[0], np.cumsum(tree.escape == node + 1)])
+    return np.stack([leaves_before[node], leaves_before[tree.escape]], axis=1)
+
+
+def _largest_below(tree: LightTree, values: np.ndarray) -> np.ndarray:
+    """For every node, the largest of a value over its lights: (2n - 1,) from (n,) in the lights' own order."""
+    in_order = np.append(values[tree.leaf_order], -np.inf)
+    return np.maximum.reduceat(in_order, _leaf_ranges(tree).reshape(-1))[::2]
+
+
+def _second_representatives(tree: LightTree, intensity: np.ndarray, generator) -> np.ndarray:
+    """For every node, one of its lights, drawn by intensity and independently of all others: (2n - 1,).
+
+    A threshold that was found with the same representatives that the final cut uses keeps bright ones and refines dark
+    ones, which biases the image upwards; estimates use these instead.
+    """
+    first, last = _leaf_ranges(tree).T
+    cumulative = np.concatenate([[0.0], np.cumsum(intensity[tree.leaf_order].astype(np.float64))])
+    wanted = cumulative[first] + generator.random(len(first)) * (cumulative[last] - cumulative[first])
+    chosen = np.searchsorted(cumulative, wanted, side="right") - 1
+    return tree.leaf_order[np.clip(chosen, first, last - 1)]
+
+
+def light_tree(lights: VirtualLights, seed: int) -> DeviceTree:
+    """The light tree of one kind; a spot tree's cones are widened by the cut-off angles below each node."""
+    direction = None if lights.kind == "point" else lights.direction
+    generator = np.random.default_rng(seed)
+    tree = build_light_tree(lights.position, direction, lights.intensity, generator)
+    if lights.kind == "spot":
+        half_angle = np.arccos(np.clip(tree.records[:, CONE_COS].astype(np.float64), -1, 1))
+        half_angle += _largest_below(tree, lights.cone[:, 0])
+        # Rounded down, as the tree's own cones are, so that no light is lost to float32
+        tree.records[:, CONE_COS] = np.cos(np.minimum(half_angle, np.pi)) - 2.0**-21
+    second = _second_representatives(tree, lights.intensity.mean(1), generator)
+    return DeviceTree(lights.kind, tree, second)
+
+
+def prepare_lights(scene, emitters: Emitters, options: LightOptions, seed: int) -> LightSet:
+    """Make the lights of one render: emitters that are points, extended emitters if asked, traced lights, trees.
+
+    Nothing is traced for ``max_depth`` up to 2, where light cannot bounce.
+    """
+    start = perf_counter()
+    found, traced = [], None
+    if options.direct != "none" and options.max_depth >= 2:
+        found += [emitters.points, emitters.spots, emitters.directional]
+        if options.direct == "vpl":
+            found += lights_of_emitters(scene, emitters, options.direct_count, derived_seed(seed, 20))
+    if options.max_depth > 2:
+        limits = PathLimits(options.max_depth - 2, options.rr_depth, options.lobe_limit)
+        traced = trace_lights(scene, emitters, options.vpl_count, derived_seed(seed, 21), limits)
+        found.append(traced.lights)
+    seconds = {"trace": perf_counter() - start}
+
+    start = perf_counter()
+    groups, dropped = [], 0
+    for number, kind in enumerate(KINDS):
+        of_kind = [lights for lights in found if lights.kind == kind]
+        if not of_kind:
+            continue
+        lights, bad = VirtualLights.concatenate(of_kind).without_bad()
+        dropped += bad
+        if lights.count:
+            tree = light_tree(lights, derived_seed(seed, 22, number)) if options.trees else None
+            groups.append(LightGroup(kind, DeviceLights(lights), tree))
+    seconds["tree"] = perf_counter() - start
+    clamp = options.clamping * float(bounding_sphere(scene).radius)
+    paths = traced.paths if traced else 0
+    return LightSet(groups, clamp, options.max_depth, paths, dropped + (traced.dropped if traced else 0), seconds)

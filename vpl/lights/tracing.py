@@ -1,0 +1,172 @@
+"""Light paths with the full BSDFs; a virtual point light at every diffuse bounce.
+
+A path that scatters by a diffuse lobe at a surface leaves a virtual point light there: the lobe was chosen by the
+BSDF's own sampling, so that its weight is the flux that leaves by that lobe, for any material, and glossy or specular
+bounces only carry the path on.  (Departure from the instant-radiosity papers, which store a light at every vertex and
+scale it by the diffuse albedo: it needs nothing but ``bsdf.sample``, and is equal in expectation for materials that
+weight a sample by its own lobe; those that weight it by all lobes, as ``principled`` does, share out the energy where
+lobes overlap.)  Glossy lobes that are broad enough are stored as diffuse ones: an approximation, with ``lobe_limit`` as
+its knob.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import download, ones, spectrum_to_rgb
+from ..core.sampling import derived_seed, independent_sampler, stratified
+from .emission import emission_groups
+from .emitters import Emitters
+from .virtual_lights import VirtualLights
+
+_PILOT_PATHS = 4096
+_LARGEST_WAVEFRONT = 1 << 20
+# A scene that stores a light on one path in a thousand gets an honest but bounded number of paths.
+_MOST_PATHS_PER_LIGHT = 16
+_DEFENSIVE_SHARE = 0.05
+
+
+@dataclass(frozen=True)
+class PathLimits:
+    """``deepest``: edges of the longest light path whose end may store a light (math.inf: no limit);
+    ``rr_depth``: edges after which Russian roulette begins, as in Mitsuba's ``path``;
+    ``lobe_limit``: a direction scattered by a glossy lobe with at most this probability density, per steradian, stores
+    a light too, as though the lobe were diffuse (whose density is at most 1 / pi); 0 stores diffuse lobes only."""
+
+    deepest: float
+    rr_depth: int
+    lobe_limit: float
+
+
+@dataclass
+class TracedLights:
+    """What tracing gives: the lights, how many paths were emitted for them, how many bad values were dropped."""
+
+    lights: VirtualLights
+    paths: int
+    dropped: int
+
+
+def _bounce(scene, sampler, ray, throughput, power, depth, limits: PathLimits):
+    """One edge of all paths, in one kernel that is the same at every depth.
+
+    ``throughput`` starts at 1 and ``power`` stays what the emitter gave, so that roulette sees relative values only.
+    Returns (stored mask, position, normal, flux / pi), (alive mask, origin, direction, throughput), all evaluated.
+    """
+    si = scene.ray_intersect(ray)
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+    sample, weight = si.bsdf().sample(context, si, sampler.next_1d(), sampler.next_2d(), si.is_valid())
+    direction = si.to_world(sample.wo)
+
+    # ---- Shading normals: Veach's correction for light paths [Veach 1997, eq. 5.19], no leaks through the surface
+    in_geometric, out_geometric = dr.dot(si.n, si.to_world(si.wi)), dr.dot(si.n, direction)
+    in_shading, out_shading = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(sample.wo)
+    valid = si.is_valid() & (in_geometric * in_shading > 0) & (out_geometric * out_shading > 0)
+    leaving = throughput * mi.unpolarized_spectrum(weight) * dr.abs(in_shading / in_geometric)
+    valid &= dr.any(leaving > 0)
+    bad = valid & ~dr.all(dr.isfinite(leaving))
+    valid &= ~bad
+
+    # ---- A light where the sampled lobe was diffuse, on the side to which it scatters
+    broad = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Glossy) & (sample.pdf <= limits.lobe_limit)
+    stored = valid & (mi.has_flag(sample.sampled_type, mi.BSDFFlags.Diffuse) | broad)
+    normal = si.n * dr.sign(out_geometric)
+    intensity = spectrum_to_rgb(leaving * power) * dr.inv_pi
+
+    # ---- Russian roulette, as in ``path``
+    following = leaving * dr.abs(out_geometric / out_shading)
+    survival = dr.minimum(dr.max(following), 0.95)
+    alive = valid & ((depth < limits.rr_depth) | (sampler.next_1d() < survival))
+    following = dr.select(depth < limits.rr_depth, following, following / survival)
+
+    next_ray = si.spawn_ray(direction)
+    # One kernel for everything; a count before would be a kernel of its own that does all the work twice
+    dr.eval(stored, si.p, normal, intensity, alive, next_ray.o, next_ray.d, following, bad)
+    return (stored, si.p, normal, intensity), (alive, next_ray.o, next_ray.d, following), int(dr.count(bad)[0])
+
+
+def _paths_of_group(scene, group, first: int, count: int, total: int, seed: int, limits: PathLimits):
+    """Trace the paths first .. first + count - 1 of the ``total`` that a group of emitters gets."""
+    sampler = independent_sampler(derived_seed(seed, 0), count)
+    chosen = stratified(sampler, count, first, total)
+    ray, power = group.sample(chosen, sampler.next_2d(), sampler.next_2d())
+    power = mi.unpolarized_spectrum(power) / dr.opaque(mi.Float, float(total))
+    origin, direction, throughput = ray.o, ray.d, ones(count)
+
+    parts, dropped, depth = [], 0, 1
+    while count > 0 and depth <= limits.deepest:
+        sampler.seed(derived_seed(seed, depth), count)
+        dr.make_opaque(origin, direction, throughput, power)  # or each depth would have a kernel of its own
+        ray = mi.Ray3f(origin, direction)
+        stored, alive, bad = _bounce(scene, sampler, ray, throughput, power, dr.opaque(mi.UInt32, depth), limits)
+        dropped += bad
+        kept = dr.compress(stored[0])
+        if len(kept):
+            columns = [download(dr.gather(type(column), column, kept)) for column in stored[1:]]
+            parts.append(VirtualLights.of("oriented", *columns, depth))
+        going = dr.compress(alive[0])
+        count, depth = len(going), depth + 1
+        origin, direction, throughput = (dr.gather(type(column), column, going) for column in alive[1:])
+        power = dr.gather(type(power), power, going)
+    return parts, dropped
+
+
+def _trace_group(scene, group, number: int, paths: int, seed: int, limits: PathLimits):
+    """Trace all ``paths`` of a group in bounded wavefronts."""
+    parts, dropped = [VirtualLights.of("oriented", [], [], [])], 0
+    for first in range(0, paths, _LARGEST_WAVEFRONT):
+        stream = derived_seed(seed, number, first)
+        count = min(_LARGEST_WAVEFRONT, paths - first)
+        new_parts, bad = _paths_of_group(scene, group, first, count, paths, stream, limits)
+        parts += new_parts
+        dropped += bad
+    return VirtualLights.concatenate(parts), dropped
+
+
+def _shares(scene, groups, count: int, seed: int, limits: PathLimits) -> list[int]:
+    """How many paths each group gets, from a pilot whose lights are thrown away.
+
+    Lights are wanted where flux arrives: a sky that shines on a closed building has nearly all the power and leaves
+    hardly a light.  So each group should leave lights in proportion to the flux that its pilot stored; a small part is
+    kept for groups whose pilot was unlucky.
+    """
+    flux, lights_per_path = np.zeros(len(groups)), np.zeros(len(groups))
+    for number, group in enumerate(groups):
+        lights, _ = _trace_group(scene, group, number, _PILOT_PATHS, derived_seed(seed, 1), limits)
+        lights, _ = lights.without_bad()
+        flux[number] = lights.intensity.sum(dtype=np.float64)
+        lights_per_path[number] = lights.count / _PILOT_PATHS
+    wanted = np.full(len(groups), count / len(groups))
+    if flux.sum() > 0:
+        wanted = count * ((1 - _DEFENSIVE_SHARE) * flux / flux.sum() + _DEFENSIVE_SHARE / len(groups))
+    paths = wanted / np.maximum(lights_per_path, 1 / _MOST_PATHS_PER_LIGHT)
+    return [max(round(share), 1) for share in paths]
+
+
+def trace_lights(scene, emitters: Emitters, count: int, seed: int, limits: PathLimits) -> TracedLights:
+    """Trace light paths from all emitters until about ``count`` virtual point lights are stored.
+
+    The number of paths is fixed before the first of them is traced, and intensities are divided by emitted paths, not
+    by stored lights, so that the estimate is unbiased.  Depth of a light: edges of its path (1 for the first surface).
+    Returns "oriented" lights.
+    """
+    groups = emission_groups(scene, emitters)
+    traced = TracedLights(VirtualLights.of("oriented", [], [], []), 0, 0)
+    if not groups or limits.deepest < 1:
+        return traced
+    shares = _shares(scene, groups, count, seed, limits)
+    parts = [traced.lights]
+    for number, (group, paths) in enumerate(zip(groups, shares, strict=True)):
+        lights, dropped = _trace_group(scene, group, number, paths, derived_seed(seed, 2), limits)
+        parts.append(lights)
+        traced.dropped += dropped
+        traced.paths += paths
+    traced.lights, bad = VirtualLights.concatenate(parts).without_bad()
+    traced.dropped += bad
+    if traced.dropped:
+        mi.Log(mi.LogLevel.Warn, f"{traced.dropped} virtual light(s) with values that are not finite were dropped.")
+    return traced

@@ -1,0 +1,156 @@
+"""Virtual lights: what is stored of them, how a kernel fetches them, and how their light arrives at a place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import upload, usable
+
+# Kinds of virtual light. "point" and "spot" radiate from a point that the scene really has and are never clamped;
+# "oriented" lights stand for a piece of surface. "directional" and "environment" lights lie at infinity; the latter
+# stand for a piece of sky that a camera path could reach, the former for an emitter that it could not.
+KINDS = ("point", "spot", "oriented", "directional", "environment")
+
+AT_INFINITY = ("directional", "environment")
+
+_RECORD = 16
+
+
+@dataclass
+class VirtualLights:
+    """Lights of one kind, as NumPy arrays of n rows.
+
+    ``position`` (n, 3) float32, world units (None for lights at infinity);
+    ``direction`` (n, 3) float32: surface normal, spot axis, or the direction in which the light travels;
+    ``intensity`` (n, 3) float32: radiant intensity of points and spots, exitant flux / pi of oriented lights (their
+    radiance times area), irradiance of lights at infinity;
+    ``depth`` (n,) uint32: edges of the light path that ends in the light, 0 for lights that stand for an emitter;
+    ``cone`` (n, 2) float32: cut-off angle and beam angle of spots in radians, (pi, pi) elsewhere.
+    """
+
+    kind: str
+    position: np.ndarray | None
+    direction: np.ndarray
+    intensity: np.ndarray
+    depth: np.ndarray
+    cone: np.ndarray
+
+    @property
+    def count(self) -> int:
+        return len(self.intensity)
+
+    @classmethod
+    def of(cls, kind, position, direction, intensity, depth=0, cone=None) -> VirtualLights:
+        """Convert any sequences to the documented shapes and types."""
+        intensity = np.asarray(intensity, np.float32).reshape(-1, 3)
+        count = len(intensity)
+        return cls(
+            kind,
+            None if position is None else np.asarray(position, np.float32).reshape(-1, 3),
+            np.asarray(direction, np.float32).reshape(-1, 3),
+            intensity,
+            np.broadcast_to(np.asarray(depth, np.uint32), (count,)).copy(),
+            np.full((count, 2), np.pi, np.float32) if cone is None else np.asarray(cone, np.float32).reshape(-1, 2),
+        )
+
+    def select(self, keep) -> VirtualLights:
+        """The rows picked by a mask or an index array."""
+        position = None if self.position is None else self.position[keep]
+        return VirtualLights(
+            self.kind, position, self.direction[keep], self.intensity[keep], self.depth[keep], self.cone[keep]
+        )
+
+    @staticmethod
+    def concatenate(parts: list[VirtualLights]) -> VirtualLights:
+        """Join lights of the same kind."""
+        columns = ("position", "direction", "intensity", "depth", "cone")
+        joined = [
+            None if getattr(parts[0], c) is None else np.concatenate([getattr(p, c) for p in parts]) for c in columns
+        ]
+        return VirtualLights(parts[0].kind, *joined)
+
+    def without_bad(self) -> tuple[VirtualLights, int]:
+        """Drop lights that carry nothing, and those with a value that is not finite (an intensity that is negative or
+        above ``LARGEST_VALUE``); returns how many of the latter."""
+        finite = usable(self.intensity).all(1) & np.isfinite(self.direction).all(1)
+        if self.position is not None:
+            finite &= np.isfinite(self.position).all(1)
+        keep = finite & (self.intensity > 0).any(1)
+        return (self if keep.all() else self.select(keep)), int((~finite).sum())
+
+
+@dataclass
+class Light:
+    """Lights in a kernel: one per lane.  Units as in :class:`vpl.lights.virtual_lights.VirtualLights`."""
+
+    position: object
+    direction: object
+    intensity: object
+    depth: object
+    cone: object
+
+
+class DeviceLights:
+    """Virtual lights of one kind on the device, as packed records that one gather fetches."""
+
+    def __init__(self, lights: VirtualLights):
+        records = np.zeros((lights.count, _RECORD), np.float32)
+        if lights.position is not None:
+            records[:, 0:3] = lights.position
+        records[:, 3] = lights.depth.view(np.float32)
+        records[:, 4:7] = lights.direction
+        records[:, 8:11] = lights.intensity
+        records[:, 12:14] = lights.cone
+        self.kind = lights.kind
+        self.count = lights.count
+        self.scalar_intensity = lights.intensity.mean(1, dtype=np.float64)
+        self._records = upload(mi.Float, records)
+
+    def gather(self, index, active=True) -> Light:
+        """Fetch one light per lane."""
+        first = dr.gather(mi.Vector4f, self._records, index * 4, active)
+        second = dr.gather(mi.Vector4f, self._records, index * 4 + 1, active)
+        third = dr.gather(mi.Vector4f, self._records, index * 4 + 2, active)
+        cone = mi.Vector2f(0)
+        if self.kind == "spot":
+            fourth = dr.gather(mi.Vector4f, self._records, index * 4 + 3, active)
+            cone = mi.Vector2f(fourth.x, fourth.y)
+        depth = dr.reinterpret_array(mi.UInt32, first.w)
+        return Light(first.xyz, second.xyz, mi.Color3f(third.x, third.y, third.z), depth, cone)
+
+
+def spot_falloff(cosine, cone):
+    """Mitsuba's spot profile: 1 inside the beam, linear in the angle down to the cut-off, 0 outside.
+
+    ``cosine``: of the angle to the axis; ``cone``: cut-off and beam angle in radians.
+    """
+    cutoff, beam = cone.x, cone.y
+    slope = (cutoff - dr.safe_acos(cosine)) / (cutoff - beam)
+    return dr.select(cosine >= dr.cos(beam), 1, dr.select(cosine > dr.cos(cutoff), slope, 0))
+
+
+def geometry(kind: str, position, light: Light, smallest_distance):
+    """Direction to the light and the factor by which its intensity arrives there.
+
+    Returns (unit vector from ``position`` to the light, factor).  The factor is 1/d² for points, times the falloff for
+    spots, cos/d² with d not smaller than ``smallest_distance`` for oriented lights ([IC] section 5: clamping), and 1
+    for lights at infinity.  A light exactly at ``position`` has no direction: its factor is 0.
+    """
+    if kind in AT_INFINITY:
+        return -light.direction, mi.Float(1)
+    offset = light.position - position
+    distance2 = dr.squared_norm(offset)
+    apart = distance2 > 0
+    to_light = offset * dr.select(apart, dr.rsqrt(distance2), 0)
+    if kind == "oriented":
+        cosine = dr.maximum(-dr.dot(light.direction, to_light), 0)
+        factor = cosine / dr.maximum(distance2, dr.square(smallest_distance))
+    else:
+        factor = dr.rcp(distance2)
+        if kind == "spot":
+            factor *= spot_falloff(-dr.dot(light.direction, to_light), light.cone)
+    return to_light, dr.select(apart, factor, 0)

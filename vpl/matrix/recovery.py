@@ -1,0 +1,199 @@
+"""Recovering the visibility of reduced matrices from the few entries that were traced [MSR 5, 6].
+
+First every entry that was not traced is predicted, column by column; then the matrix is separated into a part of low
+rank and sparse errors; and where errors lie dense, entries are traced after all.
+
+Departure from the paper: what is separated is visibility, V, rather than light, E V (``recover`` says which).  E needs
+no recovering, and makes the rank higher: separated light errs more than predictions (benchmarks/matrixrecovery.py).
+And what is recovered is D − Z, not XY, so that entries in which no error was found stay what they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import download, upload
+from ..core.sampling import HASH_ROUNDS
+from .matrix_block import MatrixBlock
+from .separation import Separation, SeparationLimits, separate
+from .visibility_prediction import Predictors
+
+# The Gaussian of the density of errors: 7 × 7 entries [MSR 6.2]
+_TAPS, _SIGMA = 7, 1.5
+# An error counts from this fraction of the whole entry on
+_LEAST_ERROR = 0.01
+
+
+@dataclass(frozen=True)
+class RecoveryOptions:
+    """Which steps are taken, and how [MSR 7.1].
+
+    ``prediction``: else what was not traced is taken to arrive; ``separation``; ``correction``, of errors denser than
+    ``density``; ``recover``: "visibility" or "light".
+    """
+
+    prediction: bool = True
+    separation: bool = True
+    correction: bool = True
+    density: float = 0.65
+    recover: str = "visibility"
+    limits: SeparationLimits = field(default_factory=SeparationLimits)
+
+
+@dataclass
+class Recovered:
+    """One block: arrays as :class:`vpl.matrix.matrix_block.MatrixBlock` lays them out, Float but for ``traced`` (Bool).
+
+    ``unoccluded``: E; ``predicted``: V̄; ``traced``: entries whose V a ray found; ``visibility``: V, recovered.
+    Where columns were separated: ``part``, the block that these make, and in its layout ``error``, Z in units
+    of whole entries, and ``density`` of errors (None without correction); ``separation``.
+    """
+
+    unoccluded: object
+    predicted: object
+    traced: object
+    visibility: object
+    part: MatrixBlock | None = None
+    separation: Separation | None = None
+    error: object = None
+    density: object = None
+
+    @property
+    def failed(self) -> int:
+        """How many slices could not be separated, so that what was in question there is traced."""
+        return int(self.separation.failed.sum()) if self.separation else 0
+
+
+def recover(
+    block: MatrixBlock, predictors: Predictors, best: np.ndarray, first: int, options: RecoveryOptions, seed: int,
+    lap: Callable[[str], None] = lambda stage: None,
+) -> Recovered:  # fmt: skip
+    """Recover a block: see :class:`Recovered`.
+
+    ``best``: the predictor of every column that has samples; those of the block are these from number ``first`` on.
+    ``lap``: called with the name of every stage as it ends.
+    """
+    predicted, traced = _predicted(block, predictors, best, first, options.prediction, seed)
+    lap("prediction")
+    found = Recovered(block.unoccluded(), predicted, traced, mi.Float(predicted))
+    lap("shading")
+    mixed = _mixed_columns(predictors, first, block.columns.count) if options.separation else []
+    if len(mixed):
+        wanted = _separate(found, block, mixed, options, seed)
+        lap("separation")
+        if len(wanted):
+            block.trace(found.visibility, wanted, dr.opaque(mi.UInt32, seed))
+        lap("correction")
+    return found
+
+
+def _mixed_columns(predictors: Predictors, first: int, count: int) -> np.ndarray:
+    """Which of ``count`` columns have samples that differ: the others have nothing that could be told apart."""
+    sums = (download(values)[first : first + count] for values in (predictors.in_light, predictors.in_shadow))
+    return np.flatnonzero(np.minimum(*sums) > _LEAST_ERROR)
+
+
+def _separate(found: Recovered, block: MatrixBlock, mixed: np.ndarray, options: RecoveryOptions, seed: int):
+    """Find and take off errors in some columns: the places where they lie dense, and of slices that failed, UInt32."""
+    part = MatrixBlock(block.entries, block.columns.select(mixed), block.begin, block.begin + block.slices)
+    source, present = _places(block, part, mixed)
+    predicted = dr.gather(mi.Float, found.predicted, source, present)
+    free = present & ~dr.gather(mi.Bool, found.traced, source, present)
+    unoccluded = dr.gather(mi.Float, found.unoccluded, source, present)
+    weight = _weight(unoccluded, present, options.recover)
+    whole = predicted * weight
+    dr.eval(whole, weight, free, predicted, unoccluded)
+    found.part, found.separation = part, separate(whole, free, weight, part.shape, options.limits, seed)
+    error = dr.select(free & (weight > 0), found.separation.error / weight, 0)
+    error = dr.select(dr.isfinite(error), dr.clip(error, -1, 1), 0)
+    found.error = error
+    wrong = dr.select(dr.abs(error) > _LEAST_ERROR, mi.Float(1), 0)
+    dr.eval(found.error, wrong)
+    wanted = failed = _of_slices(part, found.separation.failed)
+    dr.scatter(found.visibility, dr.clip(predicted - error, 0, 1), source, present & ~failed)
+    dr.eval(found.visibility)
+    if options.correction:
+        found.density = _blurred(part, wrong)
+        wanted |= found.density > options.density
+    return dr.gather(mi.UInt32, source, dr.compress(wanted & free & (unoccluded > 0)))
+
+
+def _places(block: MatrixBlock, part: MatrixBlock, columns: np.ndarray):
+    """For every entry of a block of some of the columns, its place in the whole block, and whether there is one."""
+    source, present = dr.zeros(mi.UInt32, part.size), dr.zeros(mi.Bool, part.size)
+    dr.eval(source, present)
+    column, inside, _, active, place = part.lanes(np.arange(part.columns.count))
+    slot = dr.gather(mi.UInt32, upload(mi.UInt32, block.slot[columns]), column)
+    dr.scatter(source, slot * dr.opaque(mi.UInt32, block.shape[2]) + inside, place, active)
+    dr.scatter(present, mi.Bool(True), place, active)
+    dr.eval(source, present)
+    return source, present
+
+
+def _predicted(block: MatrixBlock, predictors: Predictors, best: np.ndarray, first: int, prediction: bool, seed: int):
+    """(V̄ of all entries, which of them were traced)."""
+    samples, height = predictors.samples, dr.opaque(mi.UInt32, block.shape[2])
+    values, traced = dr.zeros(mi.Float, block.size), dr.zeros(mi.Bool, block.size)
+    dr.eval(values, traced)
+    for kind in predictors.kinds if prediction else ():
+        index = np.flatnonzero(best[first : first + block.columns.count] == kind)
+        if len(index):
+            column, inside, _, active, place = block.lanes(index)
+            draw = mi.sample_tea_float32(place, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)
+            row = dr.select(active, inside, 0)
+            value = predictors.predict(kind, column + dr.opaque(mi.UInt32, first), row, draw)
+            dr.scatter(values, value, place, active)
+            dr.eval(values)
+    if not prediction:
+        _, _, _, active, place = block.lanes(np.arange(block.columns.count))
+        dr.scatter(values, mi.Float(1), place, active)
+        dr.eval(values)
+    lane = dr.arange(mi.UInt32, block.columns.count * samples.most)
+    column, number = lane // dr.opaque(mi.UInt32, samples.most), lane % dr.opaque(mi.UInt32, samples.most)
+    known = number < dr.gather(mi.UInt32, samples.number, column + dr.opaque(mi.UInt32, first))
+    source = lane + dr.opaque(mi.UInt32, first * samples.most)
+    place = dr.gather(mi.UInt32, upload(mi.UInt32, block.slot), column) * height
+    place += dr.gather(mi.UInt32, samples.row, source, known)
+    dr.scatter(values, dr.gather(mi.Float, samples.value, source, known), place, known)
+    dr.scatter(traced, mi.Bool(True), place, known)
+    dr.eval(values, traced)
+    return values, traced
+
+
+def _weight(unoccluded, present, recover: str):
+    """What an entry is where all arrives: E in units of its mean, or 1; 0 where there is no entry."""
+    if recover == "visibility":
+        return dr.select(present, mi.Float(1), 0)
+    total = float(dr.sum(dr.float64_array_t(mi.Float)(unoccluded))[0])
+    return unoccluded * dr.opaque(mi.Float, dr.width(unoccluded) / total if total > 0 else 0.0)
+
+
+def _of_slices(block: MatrixBlock, chosen: np.ndarray):
+    """Mask of the entries of some slices."""
+    entries = dr.opaque(mi.UInt32, block.shape[1] * block.shape[2])
+    return dr.gather(mi.UInt32, upload(mi.UInt32, chosen), dr.arange(mi.UInt32, block.size) // entries) == 1
+
+
+def _blurred(block: MatrixBlock, values):
+    """A Gaussian over rows and columns of every matrix; nothing lies beyond their borders."""
+    offsets = np.arange(_TAPS) - _TAPS // 2
+    taps = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
+    taps /= taps.sum()
+    _, width, height = block.shape
+    lane = dr.arange(mi.UInt32, block.size)
+    for stride, length in ((1, height), (height, width)):
+        step = dr.opaque(mi.UInt32, stride)
+        at = mi.Int32((lane // step) % dr.opaque(mi.UInt32, length))
+        total = dr.zeros(mi.Float, block.size)
+        for offset, tap in zip(offsets.tolist(), taps.tolist(), strict=True):
+            inside = (at + offset >= 0) & (at + offset < dr.opaque(mi.Int32, length))
+            source = mi.UInt32(mi.Int32(lane) + offset * mi.Int32(step))
+            total += tap * dr.gather(mi.Float, values, source, inside)
+        dr.eval(total)
+        values = total
+    return values

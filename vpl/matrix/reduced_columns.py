@@ -1,0 +1,155 @@
+"""Columns of the reduced matrices: clusters of lights for every slice, split where they may send too much [MSR 4.2].
+
+A slice starts with the cut of its whole box through the light trees, by upper bounds [MSR 4.2.1].  Then every cluster
+whose estimated largest contribution (equation 7) is above a share of the sum of all (equation 8) is split, until none
+is (algorithm 1): no column is to dominate its matrix.  Few rows of each column are traced for it.
+
+Departures from the paper: all clusters that are too large are split at once, in rounds, instead of one by one; and the
+clusters that lend their samples to one another are those next to each other along the light tree.  (Its search by
+intensity is in a supplement that is not at hand.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import reduce
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import download, upload
+from ..cuts.light_cuts import collect_cuts, limited_cuts, upload_thresholds
+from ..lights.light_tree import ESCAPE, INTENSITY
+from ..points.point_clusters import PointClusters
+from .reduced_matrix import Columns, MatrixEntries
+from .visibility_samples import FirstSamples, VisibilitySamples
+
+# How far along the light tree, to either side, clusters lend their samples to each other
+_NEARBY = 2
+# Bounds that cuts of slices accept are searched for from this fraction of the mean radiance on
+_START = 1e-4
+
+
+@dataclass
+class _SliceBatch:
+    """Slices as :mod:`vpl.cuts.light_cuts` sees gather points: boxes of them."""
+
+    clusters: PointClusters
+    nodes: object
+
+    def __post_init__(self):
+        self.receiver = self.clusters.gather(self.nodes).receiver
+        dr.eval(vars(self.receiver), vars(self.receiver.proxy))
+
+    @property
+    def count(self) -> int:
+        return dr.width(self.nodes)
+
+    def select(self, index) -> _SliceBatch:
+        return _SliceBatch(self.clusters, dr.gather(mi.UInt32, self.nodes, index))
+
+
+def initial_columns(entries: MatrixEntries, mean: float, most: int) -> tuple[Columns, int]:
+    """At most ``most`` clusters for every slice, chosen by upper bounds [MDLC], and how many of these it took.
+
+    ``mean``: radiance of the image.
+    """
+    clusters = entries.rows.clusters
+    slices = _SliceBatch(clusters, upload(mi.UInt32, clusters.tree.leaves))
+    threshold = upload_thresholds(np.full(slices.count, max(_START * mean, np.finfo(np.float32).tiny)))
+    threshold, sizes, visits = limited_cuts(entries.lights, slices, threshold, most)
+    bounds, parts = int(dr.sum(mi.UInt64(visits))[0]), []
+    numbers = {id(group): number for number, group in enumerate(entries.lights.groups)}
+    for chunk in collect_cuts(entries.lights, slices, threshold, sizes):
+        piece, node = download(dr.gather(mi.UInt32, chunk.points, chunk.rows)), download(chunk.nodes)
+        parts.append(entries.columns_of(piece.astype(np.int64), numbers[id(chunk.group)], node.astype(np.int64)))
+    return reduce(Columns.joined, parts, Columns.none()).sorted()[0], bounds
+
+
+def split_columns(
+    entries: MatrixEntries, columns: Columns, alpha: float, most: int, count: int, seed: int
+) -> tuple[Columns, FirstSamples]:
+    """Split clusters until none may send more than ``alpha`` times the sum of what all may, and at most ``most`` are in
+    a slice [MSR algorithm 1].
+
+    ``count``: samples of every column.  Returns the columns whose representatives may send anything, and their samples.
+    """
+    largest, samples = entries.largest(columns), VisibilitySamples.first(entries, columns, count, seed)
+    while True:
+        records = _records(entries, columns)
+        gamma = _largest_contributions(columns, records[:, INTENSITY], largest, samples.values)
+        inner = records.view(np.uint32)[:, ESCAPE] > columns.node + 1
+        split = _to_split(columns, inner, gamma, alpha, most)
+        if not len(split):
+            lit = np.flatnonzero(largest > 0)
+            return columns.select(lit), samples.select(lit)
+        kept = np.delete(np.arange(columns.count), split)
+        children, parents = _children(entries, columns, split)
+        # What was found out about a light holds for the child that keeps it
+        other = np.flatnonzero(children.light != columns.light[parents])
+        source = np.concatenate([kept, parents])
+        source[len(kept) + other] = columns.count + np.arange(len(other))
+        fresh = children.select(other)
+        largest = np.concatenate([largest, entries.largest(fresh)])[source]
+        samples = samples.joined(VisibilitySamples.first(entries, fresh, count, seed)).select(source)
+        columns, order = columns.select(kept).joined(children).sorted()
+        largest, samples = largest[order], samples.select(order)
+
+
+def _records(entries: MatrixEntries, columns: Columns) -> np.ndarray:
+    """The records of the nodes of all columns: see :class:`vpl.lights.light_tree.LightTree`."""
+    found = np.zeros((columns.count, entries.records[0].shape[1]), np.float32)
+    for number, records in enumerate(entries.records):
+        inside = columns.group == number
+        found[inside] = records[columns.node[inside]]
+    return found
+
+
+def _children(entries: MatrixEntries, columns: Columns, split: np.ndarray):
+    """The two children of every cluster to be split, and its number among the columns."""
+    parts, parents = [], []
+    for number, records in enumerate(entries.records):
+        inside = split[columns.group[split] == number]
+        first = columns.node[inside] + 1
+        second = records.view(np.uint32)[first, ESCAPE].astype(np.int64)
+        for node in (first, second):
+            parts.append(entries.columns_of(columns.piece[inside], number, node))
+            parents.append(inside)
+    return reduce(Columns.joined, parts), np.concatenate(parents)
+
+
+def _largest_contributions(columns: Columns, intensity: np.ndarray, largest: np.ndarray, values: np.ndarray):
+    """Γ of every column [MSR equation 7], (c,) float64."""
+    known = values >= 0
+    seen = np.where(known, values, 0).max(1).astype(np.float64)
+    segment = columns.segment
+    near_seen = _nearby_largest(seen, segment)
+    # Where no sample says anything, all may arrive
+    near_seen[_nearby_largest(known.any(1).astype(np.float64), segment) == 0] = 1
+    return _nearby_largest(largest, segment) * near_seen * intensity
+
+
+def _nearby_largest(values: np.ndarray, segment: np.ndarray) -> np.ndarray:
+    """The largest value among the neighbours of each within its segment, its own among them."""
+    result = values.copy()
+    for shift in range(1, min(_NEARBY, len(values) - 1) + 1):
+        same = segment[shift:] == segment[:-shift]
+        np.maximum(result[shift:], np.where(same, values[:-shift], 0), out=result[shift:])
+        np.maximum(result[:-shift], np.where(same, values[shift:], 0), out=result[:-shift])
+    return result
+
+
+def _to_split(columns: Columns, inner: np.ndarray, gamma: np.ndarray, alpha: float, most: int) -> np.ndarray:
+    """Which columns are too large [MSR equation 8], and can be split without having more than ``most`` in a slice.
+
+    ``inner``: which of them are of several lights.
+    """
+    threshold = alpha * np.bincount(columns.piece, gamma)
+    over = np.flatnonzero(inner & (gamma > threshold[columns.piece]))
+    room = most - np.bincount(columns.piece)
+    # The largest of each slice first
+    over = over[np.lexsort((-gamma[over], columns.piece[over]))]
+    piece = columns.piece[over]
+    rank = np.arange(len(over)) - np.searchsorted(piece, piece)
+    return over[rank < room[piece]]

@@ -1,0 +1,193 @@
+"""Reduced light matrices, whose rows are pixels of a slice and whose columns are clusters of lights [MSR 3].
+
+An entry is E V: what the representative of a cluster would send to a row if nothing was between, times how much of it
+arrives.  E is evaluated at one point of the row, V traced at a random one [MSR 7.2].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import channel_mean, download, upload
+from ..core.sampling import HASH_ROUNDS
+from ..lights.light_set import LightGroup, LightSet
+from ..points.camera_paths import SceneTraits
+from ..points.point_clusters import PointClusters, unit_or_up
+from ..points.slice_rows import golden_steps, rows_of, tangent_places
+from ..transport.evaluation import probe_visibility, unoccluded
+
+
+class MatrixRows:
+    """The rows of all slices, one slice after another: ``slices`` of them, ``count`` rows.
+
+    ``first``: (slices + 1,) int64, where the rows of each begin; ``points``: UInt32, where the points of each row
+    begin along the tree, and the number of all points; ``shown``: UInt32, the point at which a row is shaded;
+    ``places``: two arrays, Float, where rows are in the plane of their slice, from 0 to 1.
+    """
+
+    def __init__(self, clusters: PointClusters, pixel: np.ndarray, seed: int):
+        self.clusters, tree = clusters, clusters.tree
+        begin = rows_of(pixel[tree.order], tree.leaf)
+        starts = tree.first[tree.leaves]
+        self.first = np.append(np.searchsorted(begin, starts), len(begin) - 1)
+        self.slices, self.count = len(starts), len(begin) - 1
+        size = np.diff(begin)
+        shown = begin[:-1] + (np.random.default_rng(seed).random(self.count) * size).astype(np.int64)
+        self.points, self.shown = upload(mi.UInt32, begin), upload(mi.UInt32, shown)
+        self._begin = upload(mi.UInt32, self.first)
+        self._row = upload(mi.UInt32, np.repeat(np.arange(self.count), size))
+        slice_of_row = np.repeat(np.arange(self.slices), np.diff(self.first))
+        self._slice = upload(mi.UInt32, slice_of_row)
+        self._step = upload(mi.UInt32, golden_steps(np.diff(self.first)))
+        surfaces = (clusters.batch.position, unit_or_up(clusters.batch.normal))
+        position, normal = (download(values)[shown] for values in surfaces)
+        places = tangent_places(position, normal, self.first[:-1], slice_of_row)
+        self.places = [upload(mi.Float, column) for column in places]
+
+    @property
+    def most(self) -> int:
+        """Rows of the largest slice."""
+        return int(np.diff(self.first).max())
+
+    def range(self, piece):
+        """(First row, number of rows) of slices."""
+        first = dr.gather(mi.UInt32, self._begin, piece)
+        return first, dr.gather(mi.UInt32, self._begin, piece + 1) - first
+
+    def step(self, piece):
+        """By how many rows, around the end, the samples of a column of slices follow each other."""
+        return dr.gather(mi.UInt32, self._step, piece)
+
+    def row_of(self, point):
+        """The row of points along the tree."""
+        return dr.gather(mi.UInt32, self._row, point)
+
+    def slice_of(self, row):
+        """The slice of rows."""
+        return dr.gather(mi.UInt32, self._slice, row)
+
+    def place(self, row):
+        """Where rows are in the plane of their slice, from 0 to 1: two arrays."""
+        return tuple(dr.gather(mi.Float, column, row) for column in self.places)
+
+    def shown_surface(self, row, active=True):
+        """The surfaces at which rows are shaded."""
+        return self.clusters.batch.surfaces_at(dr.gather(mi.UInt32, self.shown, row, active), active)
+
+    def random_surface(self, row, number, active=True):
+        """A surface of every row, drawn by two numbers."""
+        first = dr.gather(mi.UInt32, self.points, row, active)
+        size = dr.gather(mi.UInt32, self.points, row + 1, active) - first
+        draw, _ = mi.sample_tea_32(row, number, HASH_ROUNDS)
+        return self.clusters.batch.surfaces_at(first + draw % dr.maximum(size, 1), active)
+
+
+@dataclass
+class Columns:
+    """Columns of the matrices of some slices, sorted by slice, then group of lights, then node of its tree.
+
+    ``piece``, ``group``, ``node``, ``light``: (c,) int64: the slice, the group, the node, the light that stands for it.
+    """
+
+    piece: np.ndarray
+    group: np.ndarray
+    node: np.ndarray
+    light: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """Number of columns."""
+        return len(self.piece)
+
+    @property
+    def segment(self) -> np.ndarray:
+        """A number for every slice and group, (c,): columns that have the same follow each other along one tree."""
+        return self.piece * (self.group.max(initial=0) + 1) + self.group
+
+    def select(self, index: np.ndarray) -> Columns:
+        """Some of the columns."""
+        return Columns(*(column[index] for column in (self.piece, self.group, self.node, self.light)))
+
+    @classmethod
+    def none(cls) -> Columns:
+        """No column."""
+        return cls(*(np.zeros(0, np.int64) for _ in range(4)))
+
+    def joined(self, other: Columns) -> Columns:
+        """These columns, then others."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Columns(*(np.concatenate(pair) for pair in pairs))
+
+    def sorted(self) -> tuple[Columns, np.ndarray]:
+        """In the order that columns have, and from where each came."""
+        order = np.lexsort((self.node, self.group, self.piece))
+        return self.select(order), order
+
+
+class MatrixEntries:
+    """Evaluates entries: E without rays, V with them; ``rays``: how many were traced."""
+
+    def __init__(self, scene, traits: SceneTraits, lights: LightSet, rows: MatrixRows):
+        self._scene, self._traits, self.lights, self.rows, self.rays = scene, traits, lights, rows, 0
+        # Of the light trees, of NumPy
+        self.records = [group.tree.records() for group in lights.groups]
+
+    def columns_of(self, piece, group: int, node) -> Columns:
+        """Columns with the representatives of some nodes."""
+        if not len(node):
+            return Columns.none()
+        tree = self.lights.groups[group].tree
+        light = download(tree.representative(upload(mi.UInt32, node))).astype(np.int64)
+        return Columns(piece, np.full(len(node), group), node, light)
+
+    def by_group(self, columns: Columns):
+        """(Group of lights, which of the columns are in it) for every group that has any."""
+        for number, group in enumerate(self.lights.groups):
+            index = np.flatnonzero(columns.group == number)
+            if len(index):
+                yield group, index
+
+    def largest(self, columns: Columns, part: int = 32) -> np.ndarray:
+        """Of every column, the most that light of unit intensity would send to a row of its slice: (c,) float64."""
+        found = np.zeros(columns.count)
+        parts = -(-self.rows.most // part)
+        for group, index in self.by_group(columns):
+            piece, light = (upload(mi.UInt32, values[index]) for values in (columns.piece, columns.light))
+            lane = dr.arange(mi.UInt32, len(index) * parts)
+            column, number = lane // dr.opaque(mi.UInt32, parts), lane % dr.opaque(mi.UInt32, parts)
+            first, count = self.rows.range(dr.gather(mi.UInt32, piece, column))
+            begin = number * part
+            end = dr.minimum(begin + part, count)
+            record = group.lights.gather(dr.gather(mi.UInt32, light, column))
+            value = self._largest_of(group, record, first + begin, first + end)
+            value /= channel_mean(record.intensity)
+            dr.eval(value)
+            found[index] = download(value).reshape(len(index), parts).max(1)
+        return found
+
+    @dr.syntax
+    def _largest_of(self, group: LightGroup, light, first, last):
+        row, most = mi.UInt32(first), dr.zeros(mi.Float, dr.width(first))
+        while dr.hint(row < last, exclude=[self, group, light]):
+            surface = self.rows.shown_surface(row)
+            most = dr.maximum(most, channel_mean(unoccluded(self.lights, group, surface, light)))
+            row += 1
+        return most
+
+    def trace(self, group: LightGroup, light, row, number, active=True):
+        """V at some rows: (fraction of light that arrives, where it was asked for), one per lane, evaluated.
+
+        ``light``: index in the group; ``number``: draws the point of a row.  Where nothing would arrive anyway, nothing
+        is asked.
+        """
+        surface = self.rows.random_surface(row, number, active)
+        light = group.lights.gather(light, active)
+        passed, asked = probe_visibility(self._scene, self._traits, self.lights, group, surface, light, active)
+        passed = channel_mean(passed)
+        dr.eval(passed, asked)
+        self.rays += int(dr.count(asked)[0])
+        return passed, asked

@@ -1,0 +1,191 @@
+"""Separating matrices into a part of low rank and sparse errors, many of them at once [MSR 6].
+
+D = XY + Z with as small a sum of |Z| as can be [MSR equation 11], by alternating directions of an augmented Lagrangian
+[SWZ]: X and Y by least squares, Z by shrinking, multipliers by what is left over.  Z is known to be 0 where entries
+were traced.  Elsewhere an entry is either right or wrong altogether, which is relaxed to the sphere of equation 12.
+
+Products of matrices are NumPy's (BLAS), all that goes entry by entry is one kernel for all matrices.
+
+[SWZ] Shen, Wen and Zhang 2014, Augmented Lagrangian alternating direction method for matrix separation based on
+low-rank factorization.  [HMT] Halko, Martinsson and Tropp 2011, Finding structure with randomness.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from ..core.arrays import download, upload
+
+# Step of the multipliers, in units of the penalty; [SWZ] allows up to 1.6, which errs more here
+_STEP = 1.0
+# So many times further from D than after the first iteration, a separation has failed
+_DIVERGED = 2.0
+# Columns that a sketch has beyond the largest rank [HMT]
+_OVERSAMPLING = 8
+
+
+@dataclass(frozen=True)
+class SeparationLimits:
+    """When to stop: after ``iterations``, once a matrix is explained but for ``residual`` of its norm, or once that
+    falls by less than the fraction ``progress`` in an iteration.
+
+    ``rank``: the largest; ``relative``: singular values below this fraction of the largest one are not counted.
+    """
+
+    iterations: int = 20
+    residual: float = 0.1
+    progress: float = 0.1
+    rank: int = 32
+    relative: float = 0.05
+
+
+@dataclass
+class Separation:
+    """``error``: Z, Float, in the layout of D.  Of every matrix, of NumPy: ``rank``, ``iterations``, ``failed`` (bool:
+    not finite, or much further from D than it was at first), ``residual``: ‖XY + Z − D‖ / ‖D‖ after each iteration, a
+    list.
+    """
+
+    error: object
+    rank: np.ndarray
+    iterations: np.ndarray
+    failed: np.ndarray
+    residual: list
+
+
+@contextmanager
+def _one_core_each():
+    """A function that does some work for each of some numbers: one matrix to a core, rather than all cores to a matrix,
+    which is too small for that.  Threads of BLAS that wait for each other cost tenfold on a busy machine."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(cores) as pool:
+        yield lambda work, numbers: list(pool.map(work, numbers))
+
+
+def sketch(matrix: np.ndarray, test: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Leading singular values of a matrix (n, m), (r,), and right singular vectors times these, (r, m), by its product
+    with a random matrix, (m, r) [HMT]."""
+    basis, _ = np.linalg.qr(matrix @ test)
+    part = basis.T @ matrix
+    # The squares of r × r are as good where values far below the largest do not count
+    squares, vectors = np.linalg.eigh(part @ part.T)
+    return np.sqrt(np.maximum(squares[::-1], 0)), vectors[:, ::-1].T @ part
+
+
+def separate(whole, free, weight, shape: tuple[int, int, int], limits: SeparationLimits, seed: int = 0) -> Separation:
+    """Separate matrices of one size.
+
+    whole: D, Float, of s matrices of n × m, one after another, evaluated; what pads them is 0.  free: Bool, where
+    entries may be wrong.  weight: Float, what an entry would be if all arrived, E; an error is 0 or the whole of it.
+    """
+    count, n, m = shape
+    state = _State(whole, free, weight, shape)
+    matrices = state.target()
+    width = min(limits.rank + _OVERSAMPLING, n, m)
+    test = np.random.default_rng(seed).standard_normal((m, width)).astype(np.float32)
+    norm = np.sqrt(np.square(matrices).sum((1, 2), dtype=np.float64))
+    # What is zero altogether has no errors
+    active = np.flatnonzero(np.isfinite(norm) & (norm > 0))
+    rank, right, product = np.zeros(count, np.int64), [np.zeros((0, m))] * count, np.zeros(shape, np.float32)
+
+    def begin(number):
+        """The rank of a matrix, and Y."""
+        values, vectors = sketch(matrices[number], test)
+        rank[number] = np.clip((values > limits.relative * values[0]).sum(), 1, limits.rank)
+        right[number] = vectors[: rank[number]]
+
+    def fit(number):
+        """X, then Y, for what XY is to be now."""
+        left, _ = np.linalg.qr(target[number] @ right[number].T)
+        right[number] = left.T @ target[number]
+        np.matmul(left, right[number], out=product[number])
+
+    iterations, residual, first, history = np.zeros(count, np.int64), np.zeros(count), np.zeros(count), []
+    with _one_core_each() as each:
+        each(begin, active)
+        for number in range(limits.iterations):
+            if not len(active):
+                break
+            target = state.target()
+            each(fit, active)
+            iterations[active] += 1
+            before, residual = residual, residual.copy()
+            residual[active] = state.step(upload(mi.Float, product), active)[active] / norm[active]
+            if number == 0:
+                first, before = residual, np.full(count, np.inf)
+            history.append(residual)
+            falls = residual < (1 - limits.progress) * before
+            active = active[falls[active] & (residual[active] > limits.residual)]
+    failed = ~np.isfinite(norm + residual) | (residual > _DIVERGED * np.maximum(first, limits.residual))
+    return Separation(state.error, rank, iterations, failed, history)
+
+
+class _State:
+    """Z and the multipliers of all matrices, which each step changes for those that are still active."""
+
+    def __init__(self, whole, free, weight, shape):
+        self._whole, self._free, self._weight, self._shape = whole, free, weight, shape
+        self.error, self._multiplier = (dr.zeros(mi.Float, dr.width(whole)) for _ in range(2))
+        dr.eval(self.error, self._multiplier)
+        ones = [dr.select(mask, mi.Float(1), 0) for mask in (weight > 0, self._loose())]
+        rows = [dr.block_sum(values, shape[2]) for values in (dr.abs(whole), *ones)]
+        dr.eval(rows)
+        total, entries, self._number = (self._per_matrix(sums) for sums in rows)
+        # The penalty makes entries shrink by the mean entry [SWZ]
+        self._threshold = np.divide(total, entries, out=np.zeros(len(total)), where=entries > 0)
+        self._target = mi.Float(whole)
+
+    def _per_matrix(self, sums) -> np.ndarray:
+        """Sums over each matrix, (s,) float64, from those over its rows."""
+        return download(sums).reshape(self._shape[:2]).sum(1, dtype=np.float64)
+
+    def _loose(self):
+        return self._free & (self._weight > 0)
+
+    def target(self) -> np.ndarray:
+        """What XY is fitted to: D − Z less the multipliers, (s, n, m)."""
+        return download(self._target).reshape(self._shape)
+
+    def step(self, product, active: np.ndarray) -> np.ndarray:
+        """Z and multipliers for a new XY; norms of what is left over, per matrix."""
+        count, n, m = self._shape
+        live = np.zeros(count, np.float32)
+        live[active] = 1
+        lane = dr.arange(mi.UInt32, count * n * m) // dr.opaque(mi.UInt32, n * m)
+        threshold, live = (dr.gather(mi.Float, upload(mi.Float, x), lane) for x in (self._threshold, live))
+        normalized = self._normalized(product, threshold)
+        squares = self._per_matrix(dr.block_sum(dr.select(self._loose(), dr.square(normalized), 0), m))
+        # On the sphere of equation 12
+        scale = np.sqrt(np.divide(self._number, squares, out=np.ones(count), where=squares > 0))
+        scale = dr.gather(mi.Float, upload(mi.Float, scale), lane)
+        size = 0.5 * (dr.clip(normalized * scale, -1, 1) + 1)
+        error = dr.select(self._loose(), self._sign() * self._weight * size, 0)
+        rest = product + error - self._whole
+        # In units of one over the penalty
+        multiplier = self._multiplier + _STEP * rest
+        active_now = live > 0
+        self.error = dr.select(active_now, error, self.error)
+        self._multiplier = dr.select(active_now, multiplier, self._multiplier)
+        self._target = self._whole - self.error - self._multiplier
+        left = dr.block_sum(dr.square(rest), m)
+        dr.eval(self.error, self._multiplier, self._target, left)
+        return np.sqrt(self._per_matrix(left))
+
+    def _sign(self):
+        """An entry that was taken to arrive is too large if it is wrong, the others too small."""
+        return dr.select(self._whole > 0.5 * self._weight, mi.Float(1), -1)
+
+    def _normalized(self, product, threshold):
+        """H [MSR equation 12] of the shrunk errors: −1 where an entry is right, 1 where it is wrong."""
+        rest = self._whole - product - self._multiplier
+        shrunk = dr.maximum(self._sign() * rest - threshold, 0)
+        weight = dr.select(self._weight > 0, self._weight, 1)
+        return dr.clip(2 * shrunk / weight - 1, -1, 1)

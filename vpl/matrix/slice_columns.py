@@ -1,0 +1,245 @@
+"""Which lights light a slice: columns of the light matrix, clustered for all slices together, then for each [LS].
+
+First some rows of the matrix are sampled at clusters of lights that are as small as can be afforded, and of those only
+the clusters that matter for the image are kept apart: the columns that all slices share.  Then each slice gets a row of
+these, sampled at one of its points.  The rows of a slice and of its nearest neighbours tell which columns it can join.
+
+Departures from the paper: clusters are nodes of the light trees, the costliest (:mod:`vpl.matrix.light_matrix`) split
+first; the paper divides columns by where they project on a line.  A light is drawn for each cluster by norm, and counts
+with its own colour: the paper's ratios of norms, channel by channel, are biased where the colours of a cluster differ.
+And no light is lost for not having been seen: weights have a share of upper bounds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import channel_mean, chunks, download, upload
+from ..core.sampling import derived_seed, find_interval, independent_sampler
+from ..lights.device_tree import DeviceTree
+from ..lights.light_set import LightGroup, LightSet
+from ..lights.light_tree import ESCAPE, cluster_sizes
+from ..points.camera_paths import SceneTraits
+from ..points.point_clusters import PointClusters
+from ..points.slices import six_dimensional
+from .column_forest import ColumnForest, split_threshold
+from .light_matrix import ColumnWeights, DeviceForest, NearRows, SampledRows
+
+# For each column that all slices share: clusters that were compared; and of all slices, those whose rows decided
+_FINE, _DECIDING = 8, 1 / 8
+# How much bounds decide there: with 0.1 errors were a tenth larger (cornell)
+_SHARED_UNSEEN = 0.01
+
+
+@dataclass
+class SliceLights:
+    """Lights of one group that light slices: those of slice s in set r are ``first[r * slices + s]`` up to ``last``.
+
+    ``light``: index in the group, ``scale``: the factor on its intensity.
+    """
+
+    group: LightGroup
+    first: object
+    last: object
+    light: object
+    scale: object
+
+    def picker(self, entry, sets: int, count: int):
+        """A function from places to ``count`` candidates: the light in that place, and those that stand for the same
+        cluster in other ones of the ``sets``.
+
+        ``entry``: UInt32, the list of lights of each lane, r · slices + s.
+        """
+        slices, places = (dr.opaque(mi.UInt32, dr.width(values) // sets) for values in (self.first, self.light))
+        own, shifts = entry // slices, []
+        for k in range(1, count):
+            other = (own + dr.opaque(mi.UInt32, k * sets // count)) % dr.opaque(mi.UInt32, sets)
+            # Differences of places wrap around, as their sums do
+            shifts.append((other - own) * places)
+        dr.eval(shifts)
+
+        def candidates(j):
+            """Lights and their scales."""
+            return [
+                (self.group.lights.gather(dr.gather(mi.UInt32, self.light, at)), dr.gather(mi.Float, self.scale, at))
+                for at in [j, *(j + shift for shift in shifts)]
+            ]
+
+        return candidates
+
+
+def fine_forest(lights: LightSet, most: int) -> ColumnForest:
+    """The largest clusters of lights by size alone: about ``most``, shared out to the groups by number of lights."""
+    parts = []
+    for number, group in enumerate(lights.groups):
+        records = group.tree.records()
+        forest = ColumnForest.of_tree(records.view(np.uint32)[:, ESCAPE], number)
+        parts.append(forest.pruned(cluster_sizes(records), max(most * group.count // lights.count, 1)))
+    return ColumnForest.joined(parts)
+
+
+def shared_columns(
+    scene, traits: SceneTraits, lights: LightSet, clusters: PointClusters, points: np.ndarray, most: int, seed: int
+) -> tuple[ColumnForest, int, int]:
+    """At most ``most`` clusters of lights that all slices share [LS: global clustering], rays and bounds spent on them.
+
+    ``points``: one of each slice, along the slices; at some of them, drawn at random, rows are sampled.
+    """
+    fine = fine_forest(lights, _FINE * most)
+    if len(fine.columns) <= most:
+        return fine, 0, 0
+    forest = DeviceForest(fine, lights)
+    points = np.random.default_rng(seed).permutation(points)[: max(round(_DECIDING * len(points)), 1)]
+    rows = SampledRows(scene, traits, clusters.batch, forest, points)
+    rows.balance()
+    weights = ColumnWeights(rows, NearRows.all_of(rows.count), clusters, dr.zeros(mi.UInt32, 1), _SHARED_UNSEEN)
+    return fine.pruned(download(weights.cost), most), rows.rays, forest.columns
+
+
+def slice_places(clusters: PointClusters) -> np.ndarray:
+    """Where slices are, and where they face, as :func:`vpl.points.slices.six_dimensional` has it: (slices, 6)."""
+    receiver = clusters.gather(upload(mi.UInt32, clusters.tree.leaves)).receiver
+    return six_dimensional(download(receiver.position), download(receiver.normal))
+
+
+def slice_lights(
+    rows: SampledRows, near: NearRows, clusters: PointClusters, columns: int, unseen: float, sets: int, seed: int
+) -> list[SliceLights]:
+    """At most ``columns`` lights for each slice and set, but one of each kind at least; one entry for every kind.
+
+    ``rows``: one for each slice, ``near``: which of them tell about each; ``unseen``: see :class:`ColumnWeights`.
+    """
+    forest, leaves = rows.forest, upload(mi.UInt32, clusters.tree.leaves)
+    columns = min(columns, forest.columns)
+    chosen = _Chosen(rows.count, max(columns, len(forest.forest.roots)), sets)
+    for first, last in chunks(rows.count, forest.size):
+        part = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
+        weights = ColumnWeights(rows, near.part(first, last), clusters, dr.gather(mi.UInt32, leaves, part), unseen)
+        chosen.choose(forest, weights, columns, first)
+        chosen.draw_columns(forest, weights, first, derived_seed(seed, first))
+    return chosen.lights(forest, derived_seed(seed, 1 << 20))
+
+
+class _Chosen:
+    """Clusters of all slices, ``most`` places for each, and the column that stands for them in every set.
+
+    ``node``: of the forest; ``used``: how many places of a slice are; ``column``, ``scale``: set by set, the column
+    that was drawn and one over its probability.
+    """
+
+    def __init__(self, slices: int, most: int, sets: int):
+        self.slices, self.most, self.sets, self.places = slices, most, sets, slices * most
+        self.node, self.used = dr.zeros(mi.UInt32, self.places), dr.zeros(mi.UInt32, slices)
+        self.column, self.scale = dr.zeros(mi.UInt32, sets * self.places), dr.zeros(mi.Float, sets * self.places)
+        dr.eval(self.node, self.used, self.column, self.scale)
+
+    def choose(self, forest: DeviceForest, weights: ColumnWeights, columns: int, first: int) -> None:
+        """The clusters of some consecutive slices from ``first`` on: what costs more than fits is split."""
+        cost = download(weights.cost).reshape(weights.groups, -1)
+        splits = columns - len(forest.forest.roots)
+        threshold = split_threshold(cost[:, forest.forest.inner], splits)
+        self._walk(forest, weights, upload(mi.Float, threshold), first)
+
+    @dr.syntax
+    def _walk(self, forest: DeviceForest, weights: ColumnWeights, threshold, first: int):
+        """From the roots down, split what costs more than the threshold; leave out what has no weight."""
+        lane, size = dr.arange(mi.UInt32, weights.groups), dr.opaque(mi.UInt32, forest.size)
+        piece = lane + dr.opaque(mi.UInt32, first)
+        start = piece * dr.opaque(mi.UInt32, self.most)
+        node, at = dr.zeros(mi.UInt32, weights.groups), mi.UInt32(start)
+        while dr.hint(node < size, exclude=[self, forest, weights]):
+            escape = dr.gather(mi.UInt32, forest.escape, node)
+            split = (escape != node + 1) & (dr.gather(mi.Float, weights.cost, lane * size + node) > threshold)
+            taken = ~split & (forest.node_sum(weights.cumulative, lane, node) > 0)
+            dr.scatter(self.node, node, at, taken)
+            at += dr.select(taken, 1, 0)
+            node = dr.select(split, node + 1, escape)
+        dr.scatter(self.used, at - start, piece)
+        dr.eval(self.node, self.used)
+
+    def draw_columns(self, forest: DeviceForest, weights: ColumnWeights, first: int, seed: int) -> None:
+        """A column of every cluster of some consecutive slices in each set, drawn by weight."""
+        count, most, sums = weights.groups * self.most, dr.opaque(mi.UInt32, self.most), weights.cumulative
+        for begin, end in chunks(self.sets, count):
+            lane = dr.arange(mi.UInt32, (end - begin) * count)
+            inside, number = lane % dr.opaque(mi.UInt32, count), lane // dr.opaque(mi.UInt32, count)
+            row, place = inside // most, inside + dr.opaque(mi.UInt32, first * self.most)
+            active = inside % most < dr.gather(mi.UInt32, self.used, row + dr.opaque(mi.UInt32, first))
+            node = dr.gather(mi.UInt32, self.node, place, active)
+            start = row * dr.opaque(mi.UInt32, forest.columns)
+            low, high = (start + dr.gather(mi.UInt32, ends, node, active) for ends in (forest.first, forest.last))
+            sample = _precise_sample(derived_seed(seed, begin), (end - begin) * count)
+            chosen = find_interval(sums, low, high, sample)
+            whole, own = (
+                dr.gather(type(sums), sums, last, active) - dr.gather(type(sums), sums, one, active)
+                for one, last in ((low, high), (chosen, chosen + 1))
+            )
+            target = place + (number + dr.opaque(mi.UInt32, begin)) * dr.opaque(mi.UInt32, self.places)
+            dr.scatter(self.column, chosen - start, target, active)
+            # Rounding may pick a column without weight, where nothing arrives
+            dr.scatter(self.scale, mi.Float(dr.select(own > 0, whole / own, 0)), target, active)
+            dr.eval(self.column, self.scale)
+
+    def lights(self, forest: DeviceForest, seed: int) -> list[SliceLights]:
+        """For every group of lights: of each column that was drawn, a light by intensity."""
+        used = np.arange(self.most) < download(self.used)[:, None]
+        group = forest.forest.group[download(self.node)].reshape(used.shape)
+        light, found = dr.zeros(mi.UInt32, len(self.column)), []
+        dr.eval(light)
+        begin, shift = np.arange(self.slices) * self.most, np.arange(self.sets)[:, None] * self.places
+        for number, one in enumerate(forest.lights.groups):
+            # The clusters of a slice stand in the order of the groups
+            end = begin + (used & (group == number)).sum(1)
+            first, last = (upload(mi.UInt32, ends + shift) for ends in (begin, end))
+            for low, high in chunks(self.sets, self.places):
+                self._draw_lights(forest, one, first, last, light, (low, high), derived_seed(seed, number, low))
+            found.append(SliceLights(one, first, last, light, self.scale))
+            begin = end
+        return found
+
+    def _draw_lights(self, forest: DeviceForest, group: LightGroup, first, last, light, sets: tuple, seed: int) -> None:
+        """Replace the columns of a group by lights, and the factors by those on the intensities of these."""
+        lane = dr.arange(mi.UInt32, (sets[1] - sets[0]) * self.places) + dr.opaque(mi.UInt32, sets[0] * self.places)
+        piece = lane // dr.opaque(mi.UInt32, self.most)
+        active = (lane >= dr.gather(mi.UInt32, first, piece)) & (lane < dr.gather(mi.UInt32, last, piece))
+        node = dr.gather(mi.UInt32, forest.node, dr.gather(mi.UInt32, self.column, lane), active)
+        drawn, total = _drawn_lights(group.tree, node, _precise_sample(seed, dr.width(lane)), active)
+        factor = total / channel_mean(group.lights.gather(drawn, active).intensity)
+        scale = dr.gather(mi.Float, self.scale, lane) * factor
+        dr.eval(scale)
+        dr.scatter(light, drawn, lane, active)
+        dr.scatter(self.scale, scale, lane, active)
+        dr.eval(light, self.scale)
+
+
+def _precise_sample(seed: int, count: int):
+    """Uniform numbers of 46 bits in double precision."""
+    sampler = independent_sampler(seed, count)
+    precise = dr.float64_array_t(mi.Float)
+    return precise(sampler.next_1d()) + precise(sampler.next_1d()) * 2.0**-23
+
+
+@dr.syntax
+def _drawn_lights(tree: DeviceTree, nodes, sample, active=True):
+    """A light of each node, drawn by intensity, and the intensity of the node.
+
+    ``sample``: in double precision, for every level of the tree takes its part of it.
+    """
+    precise = type(sample)
+    node, sample, end = mi.UInt32(nodes), precise(sample), tree.escape(nodes, active)
+    end = dr.select(active, end, node + 1)
+    while dr.hint(end != node + 1, exclude=[tree]):
+        second = tree.escape(node + 1)
+        intensity = precise(tree.summed_intensity(node + 1))
+        share = intensity / (intensity + precise(tree.summed_intensity(second)))
+        stays = sample < share
+        sample = dr.minimum(dr.select(stays, sample / share, (sample - share) / (1 - share)), 1 - 1e-15)
+        end = dr.select(stays, second, end)
+        node = dr.select(stays, node + 1, second)
+    light, total = tree.representative(node, active), tree.summed_intensity(nodes, active)
+    dr.eval(light, total)
+    return light, total

@@ -1,0 +1,184 @@
+"""Predicting the visibility of rows from those that were traced, column by column [MSR 5].
+
+Three predictors know a column: by the nearest rows, by a line between light and shadow, and by what nearby columns and
+the same row show.  Each column is sampled until one of them errs on few enough of the new samples [MSR algorithm 2].
+
+Departures from the paper: nearest rows are found by looking at all samples of the column, which are tens, instead of
+along shifted Hilbert curves; the line lies in the plane of the slice, and its slope counts half (equation 10 would be
+certain of light where 3 of 4 samples are lit).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import download, upload
+from ..core.sampling import HASH_ROUNDS, derived_seed
+from .visibility_samples import VisibilitySamples
+
+NEAREST, LINEAR, BAYES = range(3)
+PREDICTORS = {"nearest": NEAREST, "linear": LINEAR, "bayes": BAYES}
+# Columns to either side along the light tree that the Bayes predictor looks at: five with its own [MSR 5.1]
+_BESIDE = 2
+# Samples that each class of visibility is taken to have had before any was seen
+_PRIOR = 0.1
+# How much the least squares of the line are held back where samples do not span the plane
+_RIDGE = 1e-3
+
+
+class Predictors:
+    """The three predictors of some columns, as their samples are now.
+
+    ``kinds``: which of them may be used; ``in_light``, ``in_shadow``: Float, the sums of V and 1 − V over the samples
+    of each column.
+    """
+
+    def __init__(self, samples: VisibilitySamples, kinds: tuple[int, ...] = (NEAREST, LINEAR, BAYES)):
+        self.samples, self.kinds = samples, kinds
+        columns = samples.columns
+        segment = columns.segment
+        number = np.arange(columns.count)
+        first, last = np.searchsorted(segment, segment), np.searchsorted(segment, segment, side="right")
+        self._first = upload(mi.UInt32, np.maximum(number - _BESIDE, first))
+        self._last = upload(mi.UInt32, np.minimum(number + _BESIDE + 1, last))
+        self._piece = upload(mi.UInt32, columns.piece)
+        self._line = [dr.zeros(mi.Float, columns.count) for _ in range(3)]
+        self.in_light, self.in_shadow = (dr.zeros(mi.Float, columns.count) for _ in range(2))
+        dr.eval(self._line, self.in_light, self.in_shadow)
+        self.learn(number)
+
+    def learn(self, index: np.ndarray) -> None:
+        """Take the present samples of some columns into account."""
+        column = upload(mi.UInt32, index)
+        line, lit, number = self._fit(column)
+        for target, value in zip(self._line, line, strict=True):
+            dr.scatter(target, value, column)
+        dr.scatter(self.in_light, lit, column)
+        dr.scatter(self.in_shadow, mi.Float(number) - lit, column)
+        dr.eval(self._line, self.in_light, self.in_shadow)
+
+    def predict(self, kind: int, column, row, draw):
+        """V of some rows of some columns, Float: 0 or 1, or between where it was traced so.
+
+        ``row``: within the slice; ``draw``: uniform numbers, for predictors answer with probabilities.
+        """
+        if kind == NEAREST:
+            return self._of_nearest(column, row, draw)
+        likely = self._by_line(column, row) if kind == LINEAR else self._by_bayes(column, row)
+        return dr.select(draw < likely, mi.Float(1), 0)
+
+    def _place(self, column, row):
+        first, _ = self.samples.entries.rows.range(dr.gather(mi.UInt32, self._piece, column))
+        return self.samples.entries.rows.place(first + row)
+
+    @dr.syntax
+    def _of_nearest(self, column, row, draw):
+        """V of one of the three nearest samples, drawn evenly; of rows without any, 1."""
+        begin = column * dr.opaque(mi.UInt32, self.samples.most)
+        count, k = dr.gather(mi.UInt32, self.samples.number, column), mi.UInt32(0)
+        x, y = self._place(column, row)
+        first, second, third = (dr.full(mi.Float, np.inf, dr.width(column)) for _ in range(3))
+        one, two, three = (dr.full(mi.Float, 1, dr.width(column)) for _ in range(3))
+        while dr.hint(k < count, exclude=[self, begin, x, y]):
+            value = dr.gather(mi.Float, self.samples.value, begin + k)
+            u, v = (dr.gather(mi.Float, side, begin + k) for side in (self.samples.x, self.samples.y))
+            distance = dr.square(u - x) + dr.square(v - y)
+            beats_first, beats_second, beats_third = distance < first, distance < second, distance < third
+            three = dr.select(beats_second, two, dr.select(beats_third, value, three))
+            third = dr.select(beats_second, second, dr.select(beats_third, distance, third))
+            two = dr.select(beats_first, one, dr.select(beats_second, value, two))
+            second = dr.select(beats_first, first, dr.select(beats_second, distance, second))
+            one, first = dr.select(beats_first, value, one), dr.minimum(first, distance)
+            k += 1
+        share = draw * mi.Float(dr.minimum(count, 3))
+        return dr.select(share < 1, one, dr.select(share < 2, two, three))
+
+    @dr.syntax
+    def _fit(self, column):
+        """(Three coefficients of the line, sum of V, number) of the samples of columns [MSR equation 9]."""
+        begin = column * dr.opaque(mi.UInt32, self.samples.most)
+        count, k = dr.gather(mi.UInt32, self.samples.number, column), mi.UInt32(0)
+        matrix, right = (dr.zeros(kind, dr.width(column)) for kind in (mi.Matrix3f, mi.Vector3f))
+        lit = dr.zeros(mi.Float, dr.width(column))
+        while dr.hint(k < count, exclude=[self, begin, column]):
+            value = dr.gather(mi.Float, self.samples.value, begin + k)
+            u, v = (dr.gather(mi.Float, side, begin + k) for side in (self.samples.x, self.samples.y))
+            point = mi.Vector3f(u - 0.5, v - 0.5, 1)
+            matrix += mi.Matrix3f(point.x * point, point.y * point, point)
+            right += point * (2 * value - 1)
+            lit += value
+            k += 1
+        ridge = _RIDGE * mi.Float(dr.maximum(count, 1))
+        line = dr.rcp(matrix + dr.identity(mi.Matrix3f) * ridge) @ right
+        return list(line), lit, count
+
+    def _by_line(self, column, row):
+        """Probability that light arrives [MSR equation 10].
+
+        The line was fitted to −1 and 1, so its slope counts half: where all samples agree, it is certain.
+        """
+        x, y = self._place(column, row)
+        a, b, c = (dr.gather(mi.Float, values, column) for values in self._line)
+        return dr.clip(0.5 + 0.5 * (a * (x - 0.5) + b * (y - 0.5) + c), 0, 1)
+
+    @dr.syntax
+    def _by_bayes(self, column, row):
+        """Probability that light arrives, from the samples of nearby columns: all of them, and those in this row."""
+        j, end = dr.gather(mi.UInt32, self._first, column), dr.gather(mi.UInt32, self._last, column)
+        width = dr.width(column)
+        light, shadow, row_light, row_shadow = (dr.full(mi.Float, _PRIOR, width) for _ in range(4))
+        while dr.hint(j < end, exclude=[self, row]):
+            light += dr.gather(mi.Float, self.in_light, j)
+            shadow += dr.gather(mi.Float, self.in_shadow, j)
+            seen, lit = self.samples.at(j, row)
+            row_light += mi.Float(lit)
+            row_shadow += mi.Float(seen - lit)
+            j += 1
+        _, rows = self.samples.entries.rows.range(dr.gather(mi.UInt32, self._piece, column))
+        prior = _PRIOR * mi.Float(rows)
+        # P(v) P(i | v), and what both share left out
+        odds_light, odds_shadow = light * row_light / (light + prior), shadow * row_shadow / (shadow + prior)
+        return odds_light / (odds_light + odds_shadow)
+
+
+def predict_columns(
+    samples: VisibilitySamples, kinds: tuple[int, ...], count: int, error: float, rounds: int, seed: int
+):
+    """Sample columns until a predictor errs on less than ``error`` of ``count`` new samples, or after ``rounds``.
+
+    Returns (the predictors, the best one of every column, (c,)).
+    """
+    predictors, columns = Predictors(samples, kinds), samples.columns.count
+    best, errors = np.zeros(columns, np.int64), np.zeros((columns, len(kinds)))
+    active = np.arange(columns)
+    for number in range(rounds):
+        if not len(active):
+            break
+        wrong, tested = _validate(predictors, active, count, derived_seed(seed, 2, number))
+        errors[active] += wrong
+        # Of those that err as little now, the one that did before
+        best[active] = (wrong + 1e-3 * errors[active]).argmin(1)
+        predictors.learn(active)
+        active = active[wrong.min(1) >= np.maximum(error * tested, 1e-9)]
+    return predictors, np.asarray(kinds)[best]
+
+
+def _validate(predictors: Predictors, index: np.ndarray, count: int, seed: int):
+    """Draw new samples and predict them before they are known: (errors of each predictor, (c, k), number, (c,))."""
+    samples = predictors.samples
+    rows = samples.draw(index, count)
+    lane = dr.arange(mi.UInt32, len(index) * count)
+    column = dr.gather(mi.UInt32, upload(mi.UInt32, index), lane // dr.opaque(mi.UInt32, count))
+    drawn = rows != 0xFFFFFFFF
+    inside, draw = dr.select(drawn, rows, 0), mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)
+    predicted = [predictors.predict(kind, column, inside, draw) for kind in predictors.kinds]
+    dr.eval(predicted)
+    value = samples.trace(index, rows, count)
+    known = value >= 0
+    wrong = [dr.select(known, dr.abs(one - value), 0) for one in predicted]
+    tested = dr.select(known, mi.Float(1), 0)
+    dr.eval(wrong, tested)
+    wrong, tested = (download(x).reshape(-1, count).sum(1) for x in wrong), download(tested).reshape(-1, count).sum(1)
+    return np.stack(list(wrong), axis=1), tested

@@ -1,0 +1,102 @@
+"""Upper bounds on what a cluster of lights can contribute to a gather point [LC section 4.1; IC section 4].
+
+bound = material × geometry × intensity, each factor at its largest over the cluster, and visibility taken as 1.
+
+Departure from the papers: the largest cosine between an axis and the vectors to a box is bounded without rotating the
+box.  With c the vector to the box centre and e its half extents, the largest component along a unit axis n is exactly
+z = n·c + |n|·e, the distance from the axis is at least ρ = |c - (n·c) n| - |e|, so that the cosine is at most
+z / sqrt(z² + ρ²) and at most z / d with d the distance to the box.  It is as tight for small boxes and costs half.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import channel_mean
+from ..lights.device_tree import Node
+from ..lights.virtual_lights import AT_INFINITY
+from ..points.bsdf_proxies import MaterialProxy
+from ..points.surfaces import Receiver
+
+
+def cosine_to_box(axis, center, extent, distance2, radius):
+    """Largest cosine between a unit axis and any vector to a point of a box; exact sign, see the module's note.
+
+    ``center``, ``extent``: vector to the box's centre and half extents; ``distance2``: squared distance to the box;
+    ``radius``: norm of ``extent``.  Negative when the whole box lies behind the axis.
+    """
+    along = dr.dot(axis, center)
+    z = along + dr.dot(dr.abs(axis), extent)
+    away = dr.sqrt(dr.maximum(dr.squared_norm(center) - dr.square(along), 0))
+    rho = dr.select(z >= 0, dr.maximum(away - radius, 0), away + radius)
+    length2 = dr.square(z) + dr.square(rho)
+    length2 = dr.select(z >= 0, dr.maximum(length2, distance2), length2)
+    return dr.select(length2 > 0, dr.minimum(z * dr.rsqrt(length2), 1), 1)
+
+
+def cosine_less_angle(cosine, cone_cosine):
+    """cos(max(φ - β, 0)) for angles given by their cosines; 1 inside the cone."""
+    sines = dr.sqrt(dr.maximum((1 - dr.square(cosine)) * (1 - dr.square(cone_cosine)), 0))
+    return dr.select(cosine >= cone_cosine, 1, cosine * cone_cosine + sines)
+
+
+def _nearest_cosine(cosine, cone_cosine):
+    """The larger cosine where an axis is only known to lie in a cone (None: it is exact)."""
+    return cosine if cone_cosine is None else cosine_less_angle(cosine, cone_cosine)
+
+
+def contribution_bound(kind: str, receiver: Receiver, node: Node, smallest_distance):
+    """Upper bound of the mean over channels of a cluster's contribution to gather points; 0 is exact.
+
+    For a box of points the vectors to a box of lights fill a box again, with the sum of both extents [IC section 3].
+    """
+    proxy, mirror = receiver.proxy, None
+    if kind in AT_INFINITY:
+        # Directions towards the lights fill a cone around -axis: no distance, and cosines against a cone
+
+        def largest_cosine(axis):
+            return cosine_less_angle(-dr.dot(axis, node.axis), node.cosine)
+
+    else:
+        center, extent = node.center - receiver.position, node.extent
+        if receiver.extent is not None:
+            extent += receiver.extent
+        radius = dr.norm(extent)
+        distance2 = dr.squared_norm(dr.maximum(dr.abs(center) - extent, 0))
+
+        def largest_cosine(axis):
+            return cosine_to_box(axis, center, extent, distance2, radius)
+
+    cosine = dr.maximum(_nearest_cosine(largest_cosine(receiver.normal), receiver.normal_cosine), 0)
+    if proxy.glossy:
+        mirror = dr.maximum(_nearest_cosine(largest_cosine(proxy.axis), receiver.mirror_cosine), 0)
+    factor = mi.Float(1)
+    if kind not in AT_INFINITY:
+        factor = _geometry_bound(kind, node, center, extent, distance2, radius, smallest_distance)
+    reflected = channel_mean(_material_bound(proxy, cosine, mirror) * node.intensity)
+    # A point inside a flat box has an infinite factor and no cosine: that is nothing, not NaN
+    return dr.select(reflected > 0, factor * reflected, 0)
+
+
+def _material_bound(proxy: MaterialProxy, cosine, mirror):
+    """Largest BSDF times cosine, given the largest cosines to the normal and to the mirror direction."""
+    if proxy.without_cosines:
+        cosine = dr.select(proxy.no_cosine, 1, cosine)
+    material = proxy.base * cosine
+    if proxy.glossy:
+        # The lobe exists only where the receiver's hemisphere can see the cluster
+        material += proxy.peak * dr.select(cosine > 0, dr.power(mirror, proxy.exponent), 0)
+    return material
+
+
+def _geometry_bound(kind: str, node: Node, center, extent, distance2, radius, smallest_distance):
+    """Largest emission cosine (or spot test) over squared distance."""
+    if kind == "point":
+        return dr.rcp(distance2)
+    emission = cosine_less_angle(cosine_to_box(node.axis, -center, extent, distance2, radius), node.cosine)
+    if kind == "spot":
+        # The node's cone already includes the spots' cut-off angle: nothing is emitted outside it
+        return dr.select(emission >= 1, dr.rcp(distance2), 0)
+    clamped2 = dr.maximum(distance2, dr.square(smallest_distance))
+    return dr.select(emission > 0, emission / clamped2, 0)
