@@ -36,9 +36,8 @@ from benchmarks import scenes  # noqa: E402
 from vpl.core.arrays import download, upload  # noqa: E402
 from vpl.cuts.product_cuts import BoundCounter, Pairs, find_pairs  # noqa: E402
 from vpl.points.point_clusters import PointClusters  # noqa: E402
-from vpl.transport.contribution import contribution  # noqa: E402
+from vpl.transport.contribution import contribution, shadow_ray  # noqa: E402
 from vpl.transport.evaluation import sum_all_lights  # noqa: E402
-from vpl.transport.visibility import shadow_ray  # noqa: E402
 
 NAMES = (*scenes.NAMES, "glossy")
 DEPTH, VPLS, WIDTH, SUBSET, RUNS = 6, 200_000, 512, 4000, 3

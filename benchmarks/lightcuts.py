@@ -30,9 +30,8 @@ import integrators  # noqa: E402, F401
 from benchmarks import scenes  # noqa: E402
 from vpl.core.arrays import download, upload  # noqa: E402
 from vpl.cuts.light_cuts import collect_cuts, limited_cuts  # noqa: E402
-from vpl.transport.contribution import contribution  # noqa: E402
+from vpl.transport.contribution import contribution, shadow_ray  # noqa: E402
 from vpl.transport.evaluation import sum_all_lights  # noqa: E402
-from vpl.transport.visibility import shadow_ray  # noqa: E402
 
 DEPTH, VPLS, SUBSET = 6, 200_000, 4000
 

@@ -10,11 +10,10 @@ import numpy as np
 
 from vpl.core.arrays import add_at, download, upload
 from vpl.cuts.adaptive_visibility import decide_visibility
-from vpl.cuts.cut_limits import raise_thresholds
 from vpl.cuts.light_cuts import upload_thresholds
 from vpl.cuts.pair_lists import evaluate_lists, list_pairs
 from vpl.cuts.phase_one import approximate_radiance
-from vpl.cuts.product_cuts import BoundCounter, Pairs, find_pairs, in_batches
+from vpl.cuts.product_cuts import BoundCounter, Pairs, find_pairs, in_batches, raise_thresholds
 from vpl.direct.shared_samples import share_samples
 from vpl.points.point_clusters import PointClusters
 from vpl.points.surfaces import Batch

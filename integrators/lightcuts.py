@@ -6,8 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.arrays import upload
-from vpl.cuts.light_cuts import evaluate_cuts, limited_cuts
-from vpl.cuts.radiance_estimate import estimate_radiance
+from vpl.cuts.light_cuts import estimate_radiance, evaluate_cuts, limited_cuts
 
 from . import properties
 from .common import ManyLightIntegrator, Shaded, Shading

@@ -9,10 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.arrays import download
-from vpl.cuts.cut_limits import raise_thresholds
+from vpl.cuts.light_cuts import Estimate, estimate_radiance
 from vpl.cuts.pixel_cuts import PixelCuts
-from vpl.cuts.product_cuts import BoundCounter, find_pairs, in_batches
-from vpl.cuts.radiance_estimate import Estimate, estimate_radiance
+from vpl.cuts.product_cuts import BoundCounter, find_pairs, in_batches, raise_thresholds
 from vpl.points.gather_tree import build_gather_tree
 from vpl.points.point_clusters import PointClusters
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from vpl.core.arrays import download, upload
-from vpl.lights.device_tree import DeviceTree
 from vpl.lights.light_set import light_tree
-from vpl.lights.light_tree import CONE_COS, build_light_tree
+from vpl.lights.light_tree import CONE_COS, DeviceTree, build_light_tree
 from vpl.lights.virtual_lights import VirtualLights
 from vpl.points.bsdf_proxies import MaterialProxy
 from vpl.points.surfaces import Receiver

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vpl.core.arrays import download, upload
-from vpl.points.node_bounds import NodeBounds
+from vpl.points.point_clusters import NodeBounds
 from vpl.points.point_tree import build_point_tree, point_codes
 
 from .conftest import examples

@@ -4,6 +4,9 @@ Lightcuts [LC section 4] refines the cluster with the largest bound until every 
 radiance of the point.  For a given radiance that cut does not depend on the order of refinement: from the root down,
 refine a node exactly while its bound is above the threshold.  So no heap and no stack is needed: nodes lie in preorder,
 and one walks on to ``i + 1`` to refine and to ``escape[i]`` to take or to skip.
+
+The paper compares bounds with the running total of the cut it is refining.  Here the radiance is estimated before, from
+coarse cuts at a few points (:func:`estimate_radiance`), so that thresholds are known in advance.
 """
 
 from __future__ import annotations
@@ -25,6 +28,8 @@ from ..transport.evaluation import evaluate_representatives
 _PAIRS_PER_CHUNK = 1 << 22
 # How the threshold that keeps a cut below its largest size is searched for
 _BRACKET, _BISECTIONS = 4.0, 3
+# Bounds of the coarse cuts are accepted up to this fraction of the image's mean
+_ESTIMATE_ERROR = 0.05
 
 
 @dataclass
@@ -230,3 +235,44 @@ def evaluate_cuts(scene, traits: SceneTraits, lights: LightSet, batch: Batch, th
         dr.scatter_add(visits, chunk.visits, chunk.points)
     dr.eval(radiance, rays, visits)
     return radiance, rays, visits
+
+
+@dataclass
+class Estimate:
+    """Per point: ``radiance``, (n,) float64, the mean over channels; ``shadow_rays`` and ``upper_bounds`` that finding
+    it took, UInt32."""
+
+    radiance: np.ndarray
+    shadow_rays: object
+    upper_bounds: object
+
+
+def estimate_radiance(
+    scene, traits: SceneTraits, lights: LightSet, batch: Batch, direct, mean: float, max_cut: int, stride: int
+) -> Estimate:
+    """Coarse cuts at every ``stride``-th point, averaged, with the direct light of all, over the blocks of 2 strides.
+
+    Points should lie along a curve, so that those of a block are neighbours.  ``direct``: radiance per point that is
+    known already; ``mean``: of the image; ``max_cut``: most clusters of a cut, 0 is no limit.
+    """
+    count = batch.count
+    rows = np.arange(0, count, stride)
+    index = upload(mi.UInt32, rows)
+    part = batch.select(index)
+    threshold = dr.opaque(mi.Float, _ESTIMATE_ERROR * mean, len(rows))
+    threshold, sizes, searched = limited_cuts(lights, part, threshold, max_cut)
+    # Second representatives: the thresholds must not depend on the lights that the final cuts are made of
+    radiance, rays, collected = evaluate_cuts(scene, traits, lights, part, threshold, sizes, second=True)
+    reflected = np.repeat(download(radiance).mean(1, dtype=np.float64), stride)[:count]
+    level = block_mean(reflected + download(direct).mean(1, dtype=np.float64), 2 * stride)
+    estimate = Estimate(level, *(dr.zeros(mi.UInt32, count) for _ in range(2)))
+    dr.scatter(estimate.shadow_rays, rays, index)
+    dr.scatter(estimate.upper_bounds, collected + searched, index)
+    return estimate
+
+
+def block_mean(values: np.ndarray, block: int) -> np.ndarray:
+    """Replace values by the mean over their block of consecutive ones; the last block may be shorter."""
+    start = np.arange(0, len(values), block)
+    length = np.diff(np.append(start, len(values)))
+    return np.repeat(np.add.reduceat(values, start) / length, length)

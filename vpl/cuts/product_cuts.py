@@ -8,6 +8,8 @@ Departure from the paper: what is compared when one node of a pair has to be spl
 boxes. Points are larger the more their normals and mirror directions spread, as seen from where the lights are.
 Otherwise lights are split, and never joined again, because of points that did not belong together: at the same error
 that took 1.1 (cornell) to 2.5 times (dining_room, glossy points) the shadow rays.
+
+Pairs know no cut of a single point, so a largest cut is held by thresholds: see :func:`raise_thresholds`.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from ..lights.light_set import LightGroup, LightSet
 from ..lights.virtual_lights import AT_INFINITY
 from ..points.point_clusters import PointClusters
 from ..transport.bounds import contribution_bound
+from .light_cuts import limited_cuts, upload_thresholds
 
 # Pairs that are judged at a time
 _FRONTIER = 1 << 22
@@ -195,3 +198,24 @@ def find_pairs(
             waiting.append(_children(pairs, verdict, second, split))
         if len(accepted):
             yield pairs.select(accepted)
+
+
+def raise_thresholds(
+    lights: LightSet, clusters: PointClusters, allowed: np.ndarray, max_cut: int, stride: int, counter: BoundCounter
+) -> np.ndarray:
+    """Largest bounds that points accept, raised where cuts would be about larger than ``max_cut`` (0: nowhere).
+
+    ``allowed``, (n,) float64: what each point along the tree would accept.  Cuts are tried at every ``stride``-th
+    point; those up to the next one take after it.  Cuts grow about as fast as thresholds fall at most, so one that is
+    not full leaves that much room below.  Returns the same for all points.
+    """
+    if max_cut == 0:
+        return allowed
+    rows = np.arange(0, clusters.count, stride)
+    # What is 0 could not be raised by any factor
+    tried = np.maximum(allowed[rows], np.finfo(np.float32).tiny)
+    index = upload(mi.UInt32, rows)
+    raised, sizes, visits = limited_cuts(lights, clusters.batch.select(index), upload_thresholds(tried), max_cut)
+    counter.add_at_points(index, visits)
+    least = download(raised).astype(np.float64) * np.minimum(sizes.total() / max_cut, 1)
+    return np.maximum(allowed, np.repeat(least, stride)[: clusters.count])

@@ -1,4 +1,7 @@
-"""Everything that a method needs to know about the lights of one render: virtual lights, their trees, the clamp."""
+"""Everything that a method needs to know about the lights of one render: virtual lights, their trees, the clamp.
+
+Emitters that have an extent become virtual lights here where that is asked for (``direct="vpl"``), as in the papers.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +9,15 @@ import math
 from dataclasses import dataclass
 from time import perf_counter
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean
-from ..core.sampling import derived_seed
-from .device_tree import DeviceTree
+from ..core.arrays import channel_mean, download, finite_or_zero, spectrum_to_rgb
+from ..core.sampling import Choice, derived_seed, independent_sampler, stratified
 from .emission import bounding_sphere
-from .emitter_lights import lights_of_emitters
 from .emitters import Emitters
-from .light_tree import CONE_COS, LightTree, build_light_tree
+from .light_tree import CONE_COS, DeviceTree, LightTree, build_light_tree
 from .tracing import PathLimits, trace_lights
 from .virtual_lights import KINDS, DeviceLights, VirtualLights
 
@@ -171,3 +173,39 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, seed: int) 
     clamp = options.clamping * float(bounding_sphere(scene).radius)
     paths = traced.paths if traced else 0
     return LightSet(groups, clamp, options.max_depth, paths, dropped + (traced.dropped if traced else 0), seconds)
+
+
+def area_lights(emitters: Emitters, count: int, seed: int) -> VirtualLights:
+    """``count`` points on area emitters as oriented lights, chosen by power and then by area."""
+    area = emitters.area
+    choice = Choice(area.power)
+    sampler = independent_sampler(seed, count)
+    row = choice.row(stratified(sampler, count, 0, count))
+    ps = area.on_shape("sample_position", row, mi.Float(0), sampler.next_2d(), mi.Bool(True))
+    intensity = spectrum_to_rgb(area.emitted_in_front(row, ps)) / (ps.pdf * choice.probability(row) * count)
+    return VirtualLights.of("oriented", download(ps.p), download(ps.n), download(intensity))
+
+
+def environment_lights(scene, emitters: Emitters, count: int, seed: int) -> VirtualLights:
+    """``count`` directions towards the environment as lights at infinity, by its own importance sampling."""
+    sampler = independent_sampler(seed, count)
+    reference = dr.zeros(mi.Interaction3f, count)
+    reference.p = mi.Point3f(bounding_sphere(scene).center)
+    ds, weight = emitters.environment.sample_direction(reference, sampler.next_2d())
+    irradiance = dr.zeros(mi.Color3f, count) + spectrum_to_rgb(finite_or_zero(mi.unpolarized_spectrum(weight))) / count
+    return VirtualLights.of("environment", None, download(-ds.d), download(irradiance))
+
+
+def lights_of_emitters(scene, emitters: Emitters, count: int, seed: int) -> list[VirtualLights]:
+    """Area emitters and the environment as ``count`` virtual lights each.
+
+    Raises a ValueError naming the first emitter that has no such form.
+    """
+    for name, _ in emitters.others:
+        raise ValueError(f'emitter of type "{name}" cannot become virtual lights: use direct="nee" with this scene')
+    lights = []
+    if np.any(emitters.area.power > 0):
+        lights.append(area_lights(emitters, count, seed))
+    if emitters.environment is not None:
+        lights.append(environment_lights(scene, emitters, count, seed))
+    return lights

@@ -1,4 +1,4 @@
-"""A binary tree over point-like lights, built bottom-up and laid out for a walk without a stack (NumPy only).
+"""A binary tree over point-like lights, built bottom-up with NumPy and laid out for a walk without a stack.
 
 Every node bounds its lights (box of positions, cone of directions), sums their flux and names one as representative
 [LC, section 3]. The tree is built by parallel locally-ordered clustering, which vpl/lights/clustering.py explains:
@@ -16,13 +16,20 @@ ellipsoids; see benchmarks/light_tree.py) by the mean size of a cut of 2% for a 
   paper's cost by 20 to 30%, but makes cuts 21% larger on ellipsoids, 35% on bumpy walls and 2% on flat ones.
 - The Morton code holds no directions: with them, cuts shrank by 7% on flat walls and grew by 40% on bumpy ones.
 
+Kernels see the tree as :class:`DeviceTree`: packed records of which one gather fetches a node.
+
 [LC] Walter et al. 2005, Lightcuts: a scalable approach to illumination.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
+from ..core.arrays import download, upload
 from .clustering import (
     accumulate,
     cluster,
@@ -247,3 +254,73 @@ def _cone_cosines(axis, directions, leaves, depth):
     reduce_over_leaves(directions, leaves, depth, product, np.minimum, cosine)
     # Eight roundings of 2^-24: 3 in a dot product of unit vectors, 1 each for these and the subtraction, 2 to spare
     return np.clip(cosine - np.float32(2.0**-21), -1, 1)
+
+
+@dataclass
+class Node:
+    """Nodes of a light tree in a kernel: one per lane."""
+
+    box_min: object
+    box_max: object
+    axis: object
+    cosine: object
+    intensity: object
+    escape: object
+
+    @property
+    def center(self):
+        """Centre of the box of positions."""
+        return 0.5 * (self.box_min + self.box_max)
+
+    @property
+    def extent(self):
+        """Half extents of the box of positions."""
+        return 0.5 * (self.box_max - self.box_min)
+
+    @property
+    def radius(self):
+        """Radius of the ball around the box; 0 for lights at infinity."""
+        return dr.norm(self.extent)
+
+
+class DeviceTree:
+    """A light tree's packed records on the device.
+
+    ``second_representative``: (2n - 1,) another light per node, drawn independently of the tree's own.
+    """
+
+    def __init__(self, kind: str, tree: LightTree, second_representative):
+        self.kind = kind
+        self._second = upload(mi.UInt32, second_representative)
+        self.count = len(tree.records)
+        self._records = upload(mi.Float, tree.records)
+
+    def records(self) -> np.ndarray:
+        """The records again, of NumPy: see :class:`vpl.lights.light_tree.LightTree`."""
+        return download(self._records).reshape(self.count, -1)
+
+    def gather(self, index, active=True) -> Node:
+        """Fetch one node per lane; see :mod:`vpl.lights.light_tree` for the layout of the record."""
+        a, b, c, d = (dr.gather(mi.Vector4f, self._records, index * 4 + k, active) for k in range(4))
+        return Node(
+            mi.Point3f(a.x, a.y, a.z),
+            mi.Point3f(a.w, b.x, b.y),
+            mi.Vector3f(b.z, b.w, c.x),
+            c.y,
+            mi.Color3f(c.w, d.x, d.y),
+            dr.reinterpret_array(mi.UInt32, d.z),
+        )
+
+    def escape(self, index, active=True):
+        """The node that follows a node's subtree."""
+        return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._records, index * 16 + 14, active))
+
+    def summed_intensity(self, index, active=True):
+        """Scalar intensity of a node: the mean over channels of the sum over its lights."""
+        return dr.gather(mi.Float, self._records, index * 16 + 10, active)
+
+    def representative(self, index, active=True, second=False):
+        """Index of a node's representative light, or of its second one."""
+        if second:
+            return dr.gather(mi.UInt32, self._second, index, active)
+        return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._records, index * 16 + 15, active))

@@ -1,9 +1,19 @@
-"""What one virtual light contributes to one gather point, without visibility: the only such formula in the project."""
+"""What one virtual light contributes to one gather point, and how much of it arrives: the only place for both.
+
+Opaque surfaces block.  Surfaces that let light pass unscattered (masks, thin glass) dim it by their transmission, but
+only for lights that a camera path could also reach by passing through them; towards point lights, spots and directional
+emitters they block, because no path that Mitsuba's ``path`` counts passes there.
+
+Emitters that are no virtual lights are sampled, and their shadow rays traced, in :mod:`vpl.direct`.
+"""
 
 from __future__ import annotations
 
+import drjit as dr
+import mitsuba as mi
+
 from ..core.arrays import finite_or_zero, rgb_to_spectrum
-from ..lights.virtual_lights import Light, geometry
+from ..lights.virtual_lights import AT_INFINITY, Light, geometry
 
 
 def contribution(kind: str, surface, light: Light, smallest_distance, active=True):
@@ -15,3 +25,46 @@ def contribution(kind: str, surface, light: Light, smallest_distance, active=Tru
     active = active & (factor > 0)
     reflected = surface.reflected(to_light, active)
     return finite_or_zero(reflected * rgb_to_spectrum(light.intensity) * factor) & active
+
+
+def shadow_ray(kind: str, interaction, light):
+    """Ray from a surface to a light that ends just before it; for lights at infinity it has no end."""
+    if kind in AT_INFINITY:
+        return interaction.spawn_ray(-light.direction)
+    return interaction.spawn_ray_to(light.position)
+
+
+def transmittance(scene, traits, kind: str, ray, active):
+    """Fraction of light that reaches the ray's origin: 0 or 1, or a spectrum where surfaces are partly transparent.
+
+    Lanes that are not ``active`` give 0.
+    """
+    passed = mi.Float(1) & active & ~scene.ray_test(ray, active)
+    if not traits.null or kind in ("point", "spot", "directional"):
+        return passed
+    through = active & (passed == 0)
+    if traits.open_scene is not None:
+        # Few blocked rays meet an open surface at all, and a scene of only those is tested quickly
+        through &= traits.open_scene.ray_test(ray, through)
+    return passed + _through_null_surfaces(scene, traits, ray, through)
+
+
+@dr.syntax
+def _through_null_surfaces(scene, traits, ray, active):
+    """Walk from surface to surface while they let light pass unscattered."""
+    ray = mi.Ray3f(ray)
+    active = mi.Bool(active)
+    passed = dr.select(active, mi.UnpolarizedSpectrum(1), 0)
+    while dr.hint(active, exclude=[traits]):
+        hit = scene.ray_intersect_preliminary(ray, active=active)
+        # Most surfaces are opaque: only those that are not are worth a full intersection record
+        crossed = active & hit.is_valid() & traits.is_null(hit.shape)
+        passed = dr.select(active & hit.is_valid() & ~crossed, 0, passed)
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, crossed)
+        share = finite_or_zero(mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, crossed)))
+        passed = dr.select(crossed, passed * share, passed)
+        active = crossed & dr.any(passed > 0)
+        onward = si.spawn_ray(ray.d)
+        onward.maxt = ray.maxt - si.t
+        ray = dr.select(active, onward, ray)
+    return passed

@@ -10,8 +10,7 @@ from ..core.sampling import Choice, independent_sampler
 from ..lights.light_set import LightGroup, LightSet
 from ..points.camera_paths import SceneTraits
 from ..points.surfaces import Batch, Surface
-from .contribution import contribution
-from .visibility import shadow_ray, transmittance
+from .contribution import contribution, shadow_ray, transmittance
 
 # Lights whose contributions one kernel adds up in single precision; between kernels sums are in double precision
 _LIGHTS_PER_KERNEL = 4096
