@@ -1,4 +1,4 @@
-"""The order of the packages of vpl/: imports run one way, so that what is below can be read without what is above."""
+"""The packages of vpl/: imports run one way, so that what is below can be read by itself; and their maps."""
 
 import ast
 from pathlib import Path
@@ -45,3 +45,18 @@ def test_imports_run_one_way(package):
         if name in others
     ]
     assert not wrong
+
+
+@pytest.mark.parametrize("package", BELOW)
+def test_a_map_names_every_module(package):
+    """So that one look at the folder says where something is."""
+    folder = ROOT / "vpl" / package
+    text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text()))
+    modules = {file.stem for file in folder.glob("*.py")} - {"__init__"}
+    assert not [name for name in sorted(modules) if f"``{name}``" not in text]
+
+
+def test_the_map_of_all_names_every_package():
+    """And says what is in it."""
+    text = ast.get_docstring(ast.parse((ROOT / "vpl" / "__init__.py").read_text()))
+    assert not [package for package in BELOW if f"``{package}``" not in text]

@@ -1,0 +1,10 @@
+"""What all other packages stand on: no light, no gather point, no method.
+
+- ``arrays``: the only safe ways between NumPy and Dr.Jit (``upload``, ``download``); which values count as numbers
+  (``usable``, ``finite_or_zero``); rows worked off in chunks that fit in memory (``chunks``)
+- ``sampling``: seeds derived from seeds, samplers of any width, rows chosen by weight (``Choice``,
+  ``find_interval``), evenly spread samples (``SpreadSamples``)
+- ``morton``: codes and orders along a Morton curve
+- ``parameters``: parameters of scene objects, read without ``mitsuba.traverse``
+- ``backend``: what has to be right underneath Mitsuba, checked before it goes wrong
+"""
