@@ -1,4 +1,4 @@
-"""Uploads never read beyond NumPy's memory, and never share it."""
+"""Uploads never read beyond NumPy's memory, and never share it; chunks, and orders along a Morton curve."""
 
 import ctypes
 import mmap
@@ -8,7 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.core.arrays import download, upload
+from vpl.core.arrays import chunks, download, even_chunks, upload
+from vpl.core.morton import interleave, morton_order
 
 
 def array_before_guard_page(count: int) -> np.ndarray:
@@ -45,3 +46,30 @@ def test_shapes_and_types():
     assert type(upload(mi.UInt32, [1, 2])) is mi.UInt32
     assert download(mi.Point3f([1, 2, 3, 4], 0, 1)).shape == (4, 3)
     assert len(upload(mi.Float, np.zeros((0, 3)))) == 0
+
+
+def test_chunks_hold_as_many_rows_as_fit_and_at_least_one():
+    assert list(chunks(np.array([3, 4, 3, 20, 0, 0, 9, 1]), 10)) == [(0, 3), (3, 4), (4, 8)]
+    assert list(chunks(np.zeros(0), 10)) == []
+
+
+@pytest.mark.parametrize(("rows", "width"), [(7, 3), (9, 3), (1, 50), (4, 10), (0, 3)])
+def test_even_chunks_are_chunks_of_equal_rows(rows, width):
+    assert list(even_chunks(rows, width, 10)) == list(chunks(np.full(rows, width), 10))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_morton_order_follows_the_codes_of_the_cells(dtype):
+    cells = np.random.default_rng(1).permutation(16**3)[:500]
+    cells = np.stack([cells % 16, cells // 16 % 16, cells // 256], axis=1)
+    cells[0], cells[1] = 0, 15
+    order = morton_order((2 * cells - 5).astype(dtype), bits=4)
+    codes = interleave(cells)[order]
+    assert (codes[1:] >= codes[:-1]).all() and sorted(order.tolist()) == list(range(500))
+
+
+@pytest.mark.parametrize("extent", [0.0, 1e-45, 1e-39])
+def test_points_next_to_each_other_keep_their_order(extent):
+    """An extent whose inverse is infinite is as good as none."""
+    points = np.float32([[extent, 0, 0], [0, 0, 0], [extent, 0, 0]])
+    assert morton_order(points, bits=10).tolist() == [0, 1, 2]

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
+from vpl.core import arrays
 from vpl.core.arrays import download, upload
 from vpl.matrix import light_matrix
 from vpl.matrix.column_forest import ColumnForest, split_threshold
@@ -209,7 +210,7 @@ def test_a_value_that_is_not_finite_counts_as_none(monkeypatch, bad):
 
 
 def test_weights_and_costs_are_what_they_are_said_to_be(monkeypatch):
-    monkeypatch.setattr(light_matrix, "ENTRIES", 4000)  # so that there are several chunks
+    monkeypatch.setattr(arrays, "ENTRIES", 4000)  # so that there are several chunks
     job = prepared(glossy_room(), vpl_count=300, direct="vpl", direct_count=64)[1][0]
     clusters, rows, _ = sampled(job, 7)
     forest, unseen = rows.forest.forest, 0.3
@@ -313,7 +314,7 @@ def test_a_light_of_a_node_is_drawn_by_intensity(place):
 
 
 def test_near_rows_are_the_nearest_and_their_own(monkeypatch):
-    monkeypatch.setattr(light_matrix, "ENTRIES", 300_000)  # so that there are several chunks
+    monkeypatch.setattr(arrays, "ENTRIES", 300_000)  # so that there are several chunks
     places = np.random.default_rng(0).random((1100, 6))
     near = NearRows.nearest(places, 5)
     distance = cdist(places, places)

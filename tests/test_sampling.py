@@ -18,8 +18,7 @@ SEQUENCES, MEMBERS = 2000, 64
 def members(variant):
     """The first members of many sequences, (sequences, members, 3)."""
     lane = dr.arange(mi.UInt32, SEQUENCES * MEMBERS)
-    x, pair = SpreadSamples(lane // MEMBERS, 5).at(lane % MEMBERS)
-    return np.stack([download(x), *download(pair).T], axis=1).reshape(SEQUENCES, MEMBERS, 3)
+    return download(SpreadSamples.of(lane // MEMBERS, 5).at(lane % MEMBERS)).reshape(SEQUENCES, MEMBERS, 3)
 
 
 def test_every_number_alone_is_uniform_and_below_one(members):
@@ -45,7 +44,7 @@ def test_means_have_far_less_noise_than_those_of_independent_numbers(members, co
 
 def test_other_seeds_give_other_sequences(variant):
     lane = dr.arange(mi.UInt32, 8)
-    first, second = (download(SpreadSamples(lane, seed).at(mi.UInt32(0))[0]) for seed in (1, 2))
+    first, second = (download(SpreadSamples.of(lane, seed).at(mi.UInt32(0))[0]) for seed in (1, 2))
     assert np.abs(first - second).min() > 0
 
 

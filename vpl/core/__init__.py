@@ -5,6 +5,7 @@
 - ``sampling``: seeds derived from seeds, samplers of any width, rows chosen by weight (``Choice``,
   ``find_interval``), evenly spread samples (``SpreadSamples``)
 - ``morton``: codes and orders along a Morton curve
+- ``cones``: axes of cones around directions, and how their cosines are rounded
 - ``parameters``: parameters of scene objects, read without ``mitsuba.traverse``
 - ``backend``: what has to be right underneath Mitsuba, checked before it goes wrong
 """

@@ -95,7 +95,7 @@ def select_record(mask, chosen, otherwise):
 # Radiances and intensities above count as infinite: sums over lights and samples must stay in single precision's range
 LARGEST_VALUE = 1e30
 
-# Entries of a matrix that are worked on at a time
+# Entries of matrices, or pairs, that are worked on at a time: bounds the memory whatever the size of the image
 ENTRIES = 1 << 23
 
 
@@ -110,7 +110,18 @@ def finite_or_zero(spectrum):
     return dr.select(usable(spectrum), spectrum, 0)
 
 
-def chunks(rows: int, width: int):
-    """Ranges of rows of a matrix that hold at most ENTRIES entries (or one row that alone has more)."""
-    step = max(ENTRIES // width, 1)
-    return [(first, min(first + step, rows)) for first in range(0, rows, step)]
+def chunks(sizes: np.ndarray, most: int):
+    """Yield ranges of consecutive rows, (first, one past the last), of at most ``most`` entries together, or of one row
+    that alone has more.  ``sizes`` (n,): entries of each row."""
+    ends, first = np.cumsum(sizes), 0
+    while first < len(ends):
+        before = ends[first - 1] if first else 0
+        last = max(int(np.searchsorted(ends, before + most, side="right")), first + 1)
+        yield first, last
+        first = last
+
+
+def even_chunks(rows: int, width: int = 1, most: int | None = None):
+    """The same for ``rows`` rows of ``width`` entries each; by default at most ENTRIES of them together."""
+    step = max((most or ENTRIES) // width, 1)
+    return ((first, min(first + step, rows)) for first in range(0, rows, step))

@@ -22,3 +22,16 @@ def interleave(cells: np.ndarray) -> np.ndarray:
             bits &= np.uint64(mask)
         code |= bits << np.uint64(axis)
     return code
+
+
+def morton_order(points: np.ndarray, bits: int = 21) -> np.ndarray:
+    """Indices of points, (n, 3), along a Morton curve through a cube around them, with ``bits`` an axis: (n,) int64.
+
+    Cells are found in the points' own precision.
+    """
+    low = points.min(axis=0)
+    extent = float((points.max(axis=0) - low).max())
+    cells = 2**bits - 1
+    # Of an extent next to nothing, which is as good as none, the inverse is infinite
+    scale = cells / extent if extent > cells * float(np.finfo(points.dtype).tiny) else 0.0
+    return np.argsort(interleave(np.minimum((points - low) * scale, cells)), kind="stable")

@@ -43,23 +43,30 @@ class SpreadSamples:
     independent ones, the less the more are taken.
 
     An additive recurrence [Roberts 2018, "The unreasonable effectiveness of quasirandom sequences"] from a random start
-    [Cranley and Patterson 1976]: every number alone is uniform.  ``sequence``: UInt32, which one a lane takes from;
-    ``seed``: another one, other sequences.
+    [Cranley and Patterson 1976]: every number alone is uniform.  ``start``: Vector3u, fractions of 2^32.
     """
 
-    def __init__(self, sequence, seed: int):
+    def __init__(self, start):
+        self.start = start
+
+    @classmethod
+    def of(cls, sequence, seed: int) -> SpreadSamples:
+        """Lanes that have the same ``sequence`` (UInt32) take from the same one; another seed, other sequences."""
         first, second = (dr.opaque(mi.UInt32, derived_seed(seed, stream)) for stream in (0, 1))
         x, y = mi.sample_tea_32(sequence, first, HASH_ROUNDS)
         z, _ = mi.sample_tea_32(sequence, second, HASH_ROUNDS)
-        self._start = (x, y, z)
+        return cls(mi.Vector3u(x, y, z))
 
-    def at(self, number):
-        """Member ``number`` (UInt32) of each sequence, from [0, 1): (a number, a pair of numbers)."""
+    @classmethod
+    def random(cls, sampler) -> SpreadSamples:
+        """A sequence of its own for each lane of a sampler."""
+        return cls(mi.Vector3u(*(mi.UInt32(sampler.next_1d() * 2.0**24) << 8 for _ in range(3))))
+
+    def at(self, number) -> mi.Point3f:
+        """Member ``number`` (UInt32) of each sequence, from [0, 1)."""
         # Wrapping integers are fractions that lose nothing; 24 bits of them are a float below 1
-        x, y, z = (
-            mi.Float((start + number * step) >> 8) * 2**-24 for start, step in zip(self._start, _STEPS, strict=True)
-        )
-        return x, mi.Point2f(y, z)
+        members = (start + number * mi.UInt32(step) for start, step in zip(self.start, _STEPS, strict=True))
+        return mi.Point3f(*(mi.Float(member >> 8) * 2.0**-24 for member in members))
 
 
 def running_sums(values):

@@ -20,7 +20,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import add_at
+from ..core.arrays import add_at, even_chunks
 from ..lights.light_set import LightGroup, LightSet
 from ..points.camera_paths import SceneTraits
 from ..points.point_clusters import PointClusters
@@ -72,9 +72,9 @@ def decide_visibility(scene, traits: SceneTraits, lights: LightSet, group: Light
         dr.eval(small, many)
         traced.append(pairs.select(dr.compress(small)))
         for chosen, probes, levels in ((~small & ~many, _FEW_PROBES, 3), (~small & many, _MANY_PROBES, 4)):
-            chosen_pairs, step = pairs.select(dr.compress(chosen)), _PROBES_PER_KERNEL // probes
-            for first in range(0, chosen_pairs.count, step):
-                part = chosen_pairs.slice(first, step)
+            chosen_pairs = pairs.select(dr.compress(chosen))
+            for first, last in even_chunks(chosen_pairs.count, probes, _PROBES_PER_KERNEL):
+                part = chosen_pairs.slice(first, last - first)
                 union = _probe(scene, traits, lights, group, clusters, part, probes, rays)
                 opened.append(part.select(dr.compress(union == _OPEN)))
                 traced.append(part.select(dr.compress(union == 0)))

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import download, upload
+from ..core.arrays import chunks, download, upload
 from ..lights.light_set import LightGroup, LightSet
 from ..points.camera_paths import SceneTraits
 from ..points.surfaces import Batch
@@ -167,17 +167,6 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
     return threshold, sizes, visits
 
 
-def _chunks(count: np.ndarray):
-    """Ranges of points whose cuts hold at most _PAIRS_PER_CHUNK nodes together (or one point that alone has more)."""
-    ends = np.cumsum(count)
-    first = 0
-    while first < len(count):
-        before = ends[first - 1] if first else 0
-        last = max(int(np.searchsorted(ends, before + _PAIRS_PER_CHUNK, side="right")), first + 1)
-        yield first, last
-        first = last
-
-
 @dataclass
 class CutChunk:
     """Part of the cuts of a batch in one group of lights: ``rows`` (in ``batch``) and ``nodes``, point by point.
@@ -200,7 +189,7 @@ def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
     """Yield the cuts of a batch as :class:`CutChunk`, evaluated, each of bounded size."""
     for group, group_count in zip(lights.groups, sizes.count, strict=True):
         count = download(group_count).astype(np.int64)
-        for first, last in _chunks(count):
+        for first, last in chunks(count, _PAIRS_PER_CHUNK):
             total = int(count[first:last].sum())
             if total == 0:
                 continue

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import download, upload
+from ..core.arrays import chunks, download, upload
 from ..core.sampling import derived_seed
 from ..points.bsdf_proxies import probe_materials
 from ..points.camera_paths import GatherPoints, PixelGrid
@@ -203,12 +203,8 @@ class _BatchLight:
         else:
             size = self._held if self._single else self._cuts.size
             entries = size[groups] * self.sites.per_group[groups]
-        entries, first = np.cumsum(entries), 0
-        while first < len(groups):
-            before = entries[first - 1] if first else 0
-            last = max(first + 1, int(np.searchsorted(entries, before + _ENTRIES, side="right")))
+        for first, last in chunks(entries, _ENTRIES):
             yield groups[first:last]
-            first = last
 
     def _light(self, groups, summed: bool, level, seed, halted):
         """Light some groups: (their sites, what :meth:`SitePasses.result` says of them)."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.arrays import ranges
+from ..core.arrays import even_chunks, ranges
 from .sources import Nodes
 
 # Sources without neighbours that fill more than this, in steradians, are hard to sample by area alone
@@ -83,9 +83,9 @@ def cut_clusters(nodes: Nodes, groups: PointGroups, solid_angle: float, faint_sh
     """
     roots, pairs = _roots(nodes), [np.zeros((2, 0), np.int64)]
     # How far cuts go down is not known: few groups at a time where there are many nodes
-    step = max(1, _PAIRS // max(1, min(nodes.count, _USUAL_CUT) if solid_angle > 0 else nodes.count))
-    for first in range(0, groups.count, step):
-        chosen = np.arange(first, min(first + step, groups.count))
+    width = max(1, min(nodes.count, _USUAL_CUT) if solid_angle > 0 else nodes.count)
+    for first, last in even_chunks(groups.count, width, _PAIRS):
+        chosen = np.arange(first, last)
         group, node = np.repeat(chosen, len(roots)), np.tile(roots, len(chosen))
         if faint_share > 0 and 0 < solid_angle < _FAINT_ANGLE:
             group, node = _descend(nodes, groups, group, node, _FAINT_ANGLE)

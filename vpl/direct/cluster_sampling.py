@@ -8,12 +8,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import channel_mean, finite_or_zero
-from ..core.sampling import independent_sampler
+from ..core.sampling import SpreadSamples, independent_sampler
 from .emitter_sampling import emission_beyond_delta, power_heuristic
 from .site_table import SEEN, Lanes, Scenery, SiteTable
-
-# Steps of the additive recurrence of Martin Roberts in three dimensions ("R3"), as 32-bit fixed-point numbers
-_STEPS = tuple(int(2**32 / 1.2207440846057596**k) & 0xFFFFFFFF for k in (1, 2, 3))
 
 
 @dataclass
@@ -52,7 +49,7 @@ def draw_samples(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
     table, statistics, sources = scenery.table, scenery.statistics, scenery.sources
     count = dr.width(lanes.site)
     random = independent_sampler(seed, count)
-    shift = mi.Vector3u(*(mi.UInt32(random.next_1d() * 2.0**24) << 8 for _ in range(3)))
+    points = SpreadSamples.random(random)
     site = _Site.of(table, lanes)
     own = lanes.half * dr.opaque(mi.UInt32, table.entries) + site.entry
     total, last, differences = dr.zeros(mi.UnpolarizedSpectrum, count), mi.Float(0), mi.Float(0)
@@ -62,7 +59,7 @@ def draw_samples(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
     precise = dr.float64_array_t(mi.Float)
     below = dr.zeros(precise, count)
     p = dr.gather(mi.Float, scenery.probability, site.entry)
-    while dr.hint(i < lanes.samples, exclude=[scenery, table, statistics, sources, lanes, site, own, shift]):
+    while dr.hint(i < lanes.samples, exclude=[scenery, table, statistics, sources, lanes, site, own, points]):
         # ---- Cluster: strata are equal parts of the sum of probabilities
         target = (precise(i) + precise(random.next_1d())) / precise(site.samples)
         while dr.hint((below + precise(p) <= target) & (k + 1 < site.size), exclude=[scenery, site, target]):
@@ -70,7 +67,7 @@ def draw_samples(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
             k += 1
             p = dr.gather(mi.Float, scenery.probability, site.entry + k)
         inside = dr.clip(mi.Float((target - below) / precise(p)), 0, dr.one_minus_epsilon(mi.Float))
-        value, weight, arrives, visible = _emitter_sample(scenery, site, k, p, inside, _recurrence(shift, i))
+        value, weight, arrives, visible = _emitter_sample(scenery, site, k, p, inside, points.at(i))
         # ---- Statistics: lanes never share an entry, so nothing has to be locked. The weight is left out, or a cluster
         # that BSDF samples find more often would be sampled ever less
         gain = channel_mean(value) * p / dr.gather(mi.Float, scenery.importance, site.entry + k)
@@ -202,12 +199,6 @@ def _probability_of(scenery: Scenery, site: _Site, rank, active):
 
 def _cluster(scenery: Scenery, site: _Site, k, active):
     return scenery.sources.node(dr.gather(mi.UInt32, scenery.table.node, site.cut + k, active), active)
-
-
-def _recurrence(shift, i):
-    """The i-th point of an additive recurrence in three dimensions, in [0, 1)."""
-    fixed = (shift[k] + i * mi.UInt32(_STEPS[k]) for k in range(3))
-    return mi.Point3f(*(mi.Float(x >> 8) * 2.0**-24 for x in fixed))
 
 
 def _member(table: SiteTable, site: _Site, sample):

@@ -29,12 +29,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..core.morton import morton_order
 from ..lights.clustering import (
     accumulate,
     cluster,
     cone_axes,
     layout,
-    morton_order,
     nearest_in_window,
     nearest_of_all,
     reduce_over_leaves,

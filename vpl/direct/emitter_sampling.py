@@ -132,12 +132,13 @@ def direct_light(
     total, of_pixel = dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, rays_per_pixel)
     pixel = points.ray // of_pixel
     first = (points.ray - pixel * of_pixel) * total
-    to_emitters, to_directions = (SpreadSamples(pixel, derived_seed(seed, stream)) for stream in (1, 2))
+    to_emitters, to_directions = (SpreadSamples.of(pixel, derived_seed(seed, stream)) for stream in (1, 2))
     radiance, rays = dr.zeros(mi.UnpolarizedSpectrum, points.count), dr.zeros(mi.UInt32, points.count)
     k = mi.UInt32(0)
     while dr.hint(k < total, exclude=[traits]):
         # ---- Emitter sampling
-        ds, weight, density = extended.sample(si, *to_emitters.at(first + k), mi.Bool(True))
+        choice, *sample = to_emitters.at(first + k)
+        ds, weight, density = extended.sample(si, choice, mi.Point2f(*sample), mi.Bool(True))
         active = dr.any(weight > 0)
         wo = si.to_local(ds.d)
         value, pdf = bsdf.eval_pdf(context, si, wo, active)
@@ -149,7 +150,8 @@ def direct_light(
         radiance += dr.select(active & ~blocked, finite_or_zero(arriving * mis), 0)
 
         # ---- BSDF sampling
-        sample, value = bsdf.sample(context, si, *to_directions.at(first + k))
+        choice, *sample = to_directions.at(first + k)
+        sample, value = bsdf.sample(context, si, choice, mi.Point2f(*sample))
         smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Smooth) & dr.any(mi.unpolarized_spectrum(value) > 0)
         found = _scattered_emission(scene, extended, traits, si, sample, points.depth, limit, sampler, smooth)
         radiance += dr.select(smooth, finite_or_zero(mi.unpolarized_spectrum(value) * found), 0)

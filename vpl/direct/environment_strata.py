@@ -35,6 +35,8 @@ from numbers import Integral
 
 import numpy as np
 
+from ..core.cones import mean_axes
+
 _LEVELS = 6
 _AREA_EXPONENT, _LEAST_SOLID_ANGLE = 0.25, 0.01
 # Cells whose distances to all centres are compared at a time: the table fits in a second-level cache
@@ -95,10 +97,7 @@ def cones(labels) -> tuple[np.ndarray, np.ndarray]:
     unit, solid_angle = (of_cells[used] for of_cells in _cells(*labels.shape))
     total = np.bincount(label, solid_angle, size)
     axis = np.stack([np.bincount(label, solid_angle * unit[:, k], size) for k in range(3)], axis=1, dtype=np.float64)
-    length = np.linalg.norm(axis, axis=1)
-    balanced = length <= _BALANCED * total
-    axis /= np.where(balanced, 1, length)[:, None]
-    axis[balanced] = (0, 0, 1)
+    axis, balanced = mean_axes(axis, (0, 0, 1), _BALANCED * total)
     cosine = np.ones(size)
     np.minimum.at(cosine, label, _lowest_cosine(axis[label], *np.divmod(used, labels.shape[1]), labels.shape))
     cosine[balanced] = -1

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.arrays import ranges
+from ..core.cones import mean_axes
 from .cluster_cuts import PointGroups
 
 BLOCK = 8  # pixels along the side of a block [IAS section 4]
@@ -157,8 +158,7 @@ def bound_groups(sites: Sites, position, normal, two_sided: np.ndarray) -> Point
     first = sites.first[sites.group_first[:-1]]
     position, normal = position[sites.order], normal[sites.order]
     total = np.add.reduceat(normal, first, dtype=np.float64)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    axis = np.where(length > 0, total / np.where(length > 0, length, 1), normal[first])
+    axis, _ = mean_axes(total, normal[first])
     points = np.diff(np.append(first, len(position)))
     cosine = np.einsum("ij,ij->i", normal, np.repeat(axis, points, axis=0))
     least = np.clip(np.minimum.reduceat(cosine, first) - _SLACK, -1, 1)

@@ -17,8 +17,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..core.morton import interleave
-
 # Clusters compared at a time: a chunk and its temporaries fit in a second-level cache. Even, as parity breaks ties.
 _CHUNK = 8192
 
@@ -28,15 +26,6 @@ def require_rows(good, name, array, quality):
     if not good.all():
         row = int(np.argmin(good))
         raise ValueError(f"{name} must be {quality}, but row {row} is {array[row].tolist()}")
-
-
-def morton_order(points):
-    """Indices of (n, 3) points along a Morton curve, 21 bits an axis, (n,) int64."""
-    low = points.min(axis=0).astype(np.float64)
-    extent = (points.max(axis=0) - low).max()
-    # An extent so small that its inverse is infinite is as good as none
-    scale = (2**21 - 1) / extent if extent > 1e-300 else 0.0
-    return np.argsort(interleave((points - low) * scale), kind="stable")
 
 
 def cluster(clusters, nearest, join, rare=16):

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import channel_mean, download, finite_or_zero, spectrum_to_rgb
+from ..core.cones import COSINE_ROUNDING
 from ..core.sampling import Choice, derived_seed, independent_sampler, stratified
 from .emission import bounding_sphere
 from .emitters import Emitters
@@ -135,8 +136,7 @@ def light_tree(lights: VirtualLights, seed: int) -> DeviceTree:
     if lights.kind == "spot":
         half_angle = np.arccos(np.clip(tree.records[:, CONE_COS].astype(np.float64), -1, 1))
         half_angle += _largest_below(tree, lights.cone[:, 0])
-        # Rounded down, as the tree's own cones are, so that no light is lost to float32
-        tree.records[:, CONE_COS] = np.cos(np.minimum(half_angle, np.pi)) - 2.0**-21
+        tree.records[:, CONE_COS] = np.maximum(np.cos(np.minimum(half_angle, np.pi)) - COSINE_ROUNDING, -1)
     second = _second_representatives(tree, lights.intensity.mean(1), generator)
     return DeviceTree(lights.kind, tree, second)
 

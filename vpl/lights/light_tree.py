@@ -30,12 +30,13 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import download, upload
+from ..core.cones import COSINE_ROUNDING
+from ..core.morton import morton_order
 from .clustering import (
     accumulate,
     cluster,
     cone_axes,
     layout,
-    morton_order,
     nearest_in_window,
     reduce_over_leaves,
     require_rows,
@@ -142,7 +143,7 @@ def _validate(position, direction, flux):
 def _sort_lights(position, direction):
     """Indices of the lights along a Morton curve, 21 bits an axis, (n,) int64."""
     by_direction = position is None or (direction is not None and (position == position[0]).all())
-    return morton_order(direction if by_direction else position)
+    return morton_order((direction if by_direction else position).astype(np.float64))
 
 
 def _start_clusters(position, direction, flux, order, angular_weight):
@@ -252,8 +253,7 @@ def _cone_cosines(axis, directions, leaves, depth):
 
     cosine = np.ones(len(leaves), np.float32)
     reduce_over_leaves(directions, leaves, depth, product, np.minimum, cosine)
-    # Eight roundings of 2^-24: 3 in a dot product of unit vectors, 1 each for these and the subtraction, 2 to spare
-    return np.clip(cosine - np.float32(2.0**-21), -1, 1)
+    return np.clip(cosine - np.float32(COSINE_ROUNDING), -1, 1)
 
 
 @dataclass

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import download, ones, spectrum_to_rgb
+from ..core.arrays import download, even_chunks, ones, spectrum_to_rgb
 from ..core.sampling import derived_seed, independent_sampler, stratified
 from .emission import emission_groups
 from .emitters import Emitters
@@ -118,10 +118,9 @@ def _paths_of_group(scene, group, first: int, count: int, total: int, seed: int,
 def _trace_group(scene, group, number: int, paths: int, seed: int, limits: PathLimits):
     """Trace all ``paths`` of a group in bounded wavefronts."""
     parts, dropped = [VirtualLights.of("oriented", [], [], [])], 0
-    for first in range(0, paths, _LARGEST_WAVEFRONT):
+    for first, last in even_chunks(paths, most=_LARGEST_WAVEFRONT):
         stream = derived_seed(seed, number, first)
-        count = min(_LARGEST_WAVEFRONT, paths - first)
-        new_parts, bad = _paths_of_group(scene, group, first, count, paths, stream, limits)
+        new_parts, bad = _paths_of_group(scene, group, first, last - first, paths, stream, limits)
         parts += new_parts
         dropped += bad
     return VirtualLights.concatenate(parts), dropped

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, chunks, finite_or_zero, upload
+from ..core.arrays import channel_mean, even_chunks, finite_or_zero, upload
 from ..core.sampling import running_sums
 from ..lights.light_set import LightSet
 from ..points.camera_paths import SceneTraits
@@ -52,7 +52,7 @@ class DeviceForest:
         matrix = dr.empty(mi.Float, rows * self.columns)
         for group, (first, count) in zip(self.lights.groups, self.parts, strict=True):
             width, columns = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, self.columns)
-            for begin, end in chunks(rows, count):
+            for begin, end in even_chunks(rows, count):
                 lane = dr.arange(mi.UInt32, (end - begin) * count)
                 row, column = lane // width, lane % width + dr.opaque(mi.UInt32, first)
                 row += dr.opaque(mi.UInt32, begin)
@@ -103,7 +103,7 @@ class SampledRows:
         self.values *= dr.opaque(mi.Float, self.scale)
         dr.eval(self.values)
         self.sums = dr.empty(mi.Float, self.count * forest.size)
-        for first, last in chunks(self.count, forest.size):
+        for first, last in even_chunks(self.count, forest.size):
             rows = last - first
             part = dr.arange(mi.UInt32, rows * forest.columns) + dr.opaque(mi.UInt32, first * forest.columns)
             cumulative = running_sums(dr.gather(mi.Float, self.values, part))
@@ -151,7 +151,7 @@ class NearRows:
         """
         most = min(most, len(places))
         squares, rows, found = (places**2).sum(1), [], []
-        for first, last in chunks(len(places), len(places)):
+        for first, last in even_chunks(len(places), len(places)):
             part = np.arange(first, last)
             distance2 = np.maximum(squares + squares[part, None] - 2 * places[part] @ places.T, 0)
             distance2[np.arange(len(part)), part] = -1

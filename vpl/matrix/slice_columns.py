@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, chunks, download, upload
+from ..core.arrays import channel_mean, download, even_chunks, upload
 from ..core.sampling import derived_seed, find_interval, independent_sampler
 from ..lights.light_set import LightGroup, LightSet
 from ..lights.light_tree import ESCAPE, DeviceTree, cluster_sizes
@@ -115,7 +115,7 @@ def slice_lights(
     forest, leaves = rows.forest, upload(mi.UInt32, clusters.tree.leaves)
     columns = min(columns, forest.columns)
     chosen = _Chosen(rows.count, max(columns, len(forest.forest.roots)), sets)
-    for first, last in chunks(rows.count, forest.size):
+    for first, last in even_chunks(rows.count, forest.size):
         part = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
         weights = ColumnWeights(rows, near.part(first, last), clusters, dr.gather(mi.UInt32, leaves, part), unseen)
         chosen.choose(forest, weights, columns, first)
@@ -163,7 +163,7 @@ class _Chosen:
     def draw_columns(self, forest: DeviceForest, weights: ColumnWeights, first: int, seed: int) -> None:
         """A column of every cluster of some consecutive slices in each set, drawn by weight."""
         count, most, sums = weights.groups * self.most, dr.opaque(mi.UInt32, self.most), weights.cumulative
-        for begin, end in chunks(self.sets, count):
+        for begin, end in even_chunks(self.sets, count):
             lane = dr.arange(mi.UInt32, (end - begin) * count)
             inside, number = lane % dr.opaque(mi.UInt32, count), lane // dr.opaque(mi.UInt32, count)
             row, place = inside // most, inside + dr.opaque(mi.UInt32, first * self.most)
@@ -194,7 +194,7 @@ class _Chosen:
             # The clusters of a slice stand in the order of the groups
             end = begin + (used & (group == number)).sum(1)
             first, last = (upload(mi.UInt32, ends + shift) for ends in (begin, end))
-            for low, high in chunks(self.sets, self.places):
+            for low, high in even_chunks(self.sets, self.places):
                 self._draw_lights(forest, one, first, last, light, (low, high), derived_seed(seed, number, low))
             found.append(SliceLights(one, first, last, light, self.scale))
             begin = end

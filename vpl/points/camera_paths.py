@@ -14,12 +14,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import channel_mean, download, finite_or_zero, ones, upload
-from ..core.morton import interleave
+from ..core.morton import morton_order
 from ..core.sampling import derived_seed, independent_sampler
 from ..lights.emitters import Emitters, registered_shapes
 
 # Neither side of a choice between a delta and a smooth lobe gets less than this unless it carries nothing.
 _LEAST_PROBABILITY = 0.05
+# Cells along each axis of the curve that orders gather points, as a power of two
+_CURVE_BITS = 10
 
 
 @dataclass(frozen=True)
@@ -195,14 +197,6 @@ def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughpu
     return emission, hit, (gathered, si, weight), (goes_on, next_ray, following)
 
 
-def _morton_order(position: np.ndarray) -> np.ndarray:
-    """Order of points, (n, 3) float32, along a Morton curve through their bounding box."""
-    low, high = position.min(0), position.max(0)
-    extent = float((high - low).max())
-    cell = (position - low) * (1023.0 / extent if extent > 0 else 0.0)
-    return np.argsort(interleave(np.minimum(cell, 1023)), kind="stable")
-
-
 def follow_camera_rays(
     scene, emitters, traits, sampler, seed, ray, active, max_depth, rr_depth, skip=None, along_curve=True
 ):
@@ -256,7 +250,7 @@ def _collect(mask, si, weight, depth, along_curve: bool) -> GatherPoints:
     """Compact the lanes that hold a gather point, and put them in Morton order if that is asked for."""
     lanes = dr.compress(mask)
     if len(lanes) and along_curve:
-        order = _morton_order(download(dr.gather(mi.Point3f, si.p, lanes)))
+        order = morton_order(download(dr.gather(mi.Point3f, si.p, lanes)), _CURVE_BITS)
         lanes = dr.gather(mi.UInt32, lanes, upload(mi.UInt32, order))
     points = GatherPoints(*(dr.gather(type(x), x, lanes) for x in (si, lanes, weight, depth)))
     points.ray = lanes

@@ -15,14 +15,13 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import download, upload
+from ..core.cones import COSINE_ROUNDING
 from .bsdf_proxies import MaterialProxy
 from .point_tree import PointTree, build_point_tree
 from .surfaces import Batch, Receiver
 
 # Most points of a leaf: a few make a smaller tree at 1 to 3% more shadow rays, but lobes need points of their own
 _LAMBERTIAN_LEAF, _GLOSSY_LEAF = 4, 1
-# A cosine is lowered by this much before it is stored in single precision, so that no cone loses a vector to rounding
-_COSINE_ROUNDING = 2.0**-21
 
 
 @dataclass
@@ -177,7 +176,7 @@ class NodeBounds:
             return dr.minimum(dr.maximum(*reach), dr.pi)
 
         angles = self._towards_root(angle, enclose)
-        return mi.Vector3f(axes), mi.Float(dr.maximum(dr.cos(angles) - _COSINE_ROUNDING, -1))
+        return mi.Vector3f(axes), mi.Float(dr.maximum(dr.cos(angles) - COSINE_ROUNDING, -1))
 
     def _towards_root(self, at_leaves, join: Callable):
         """``join``: function of (values of the first children, of the second ones, nodes, their first children)."""

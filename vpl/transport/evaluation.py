@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import channel_mean, download, select_record
+from ..core.arrays import channel_mean, download, even_chunks, select_record
 from ..core.sampling import Choice, independent_sampler
 from ..lights.light_set import LightGroup, LightSet
 from ..points.camera_paths import SceneTraits
@@ -126,10 +126,9 @@ def sum_all_lights(scene, traits: SceneTraits, lights: LightSet, batch: Batch, s
     precise = dr.float64_array_t(mi.UnpolarizedSpectrum)
     total, rays = dr.zeros(precise, batch.count), dr.zeros(mi.UInt32, batch.count)
     for group in lights.groups:
-        for first in range(0, group.count, _LIGHTS_PER_KERNEL):
+        for first, last in even_chunks(group.count, most=_LIGHTS_PER_KERNEL):
             if stopped():
                 break
-            last = min(first + _LIGHTS_PER_KERNEL, group.count)
             begin, end = dr.opaque(mi.UInt32, first, batch.count), dr.opaque(mi.UInt32, last)
             radiance, traced = sum_lights(scene, traits, lights, group, batch.surfaces, begin, end, group.pick)
             total += precise(radiance)
