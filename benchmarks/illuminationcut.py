@@ -34,6 +34,7 @@ mi.set_variant("llvm_ad_rgb")
 import integrators  # noqa: E402, F401
 from benchmarks import scenes  # noqa: E402
 from vpl.core.arrays import download, upload  # noqa: E402
+from vpl.core.stages import Stage  # noqa: E402
 from vpl.cuts.product_cuts import BoundCounter, Pairs, find_pairs  # noqa: E402
 from vpl.points.point_clusters import PointClusters  # noqa: E402
 from vpl.transport.contribution import contribution, shadow_ray  # noqa: E402
@@ -206,7 +207,7 @@ def many_lights(names) -> None:
                     for _ in range(RUNS + 1)
                 ]
                 seconds.append(float(np.median(runs[1:])))
-            tree = prepared.clock.seconds["tree"]
+            tree = prepared.clock.seconds[Stage.TREE]
             print(f"{name} | {count} | {tree:.2f} | {seconds[0]:.2f} | {seconds[1]:.2f}", flush=True)
     print("\n## peak memory above the scene, 1600×1200, 1.2 M VPLs, 1 sample a pixel")
     for name in names:
@@ -248,7 +249,7 @@ def public_settings() -> None:
             start = time.process_time()
             found = problem.shade(plugin)
             render = time.process_time() - start
-            tree = problem.prepared.clock.seconds["tree"]
+            tree = problem.prepared.clock.seconds[Stage.TREE]
             print(
                 f"{label}, {100 * error:.2g}% | {tree:.2f} s | {render:.2f} s | {found.rays:.0f} | "
                 f"{found.bounds:.0f} | {100 * found.relative:.2f}% | {published}",

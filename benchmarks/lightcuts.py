@@ -29,11 +29,14 @@ import compare  # noqa: E402
 import integrators  # noqa: E402, F401
 from benchmarks import scenes  # noqa: E402
 from vpl.core.arrays import download, upload  # noqa: E402
+from vpl.core.stages import Stage  # noqa: E402
 from vpl.cuts.light_cuts import collect_cuts, limited_cuts  # noqa: E402
 from vpl.transport.contribution import contribution, shadow_ray  # noqa: E402
 from vpl.transport.evaluation import sum_all_lights  # noqa: E402
 
 DEPTH, VPLS, SUBSET = 6, 200_000, 4000
+# What summing over all lights takes too
+COMMON_STAGES = (Stage.SCENE, Stage.GATHER, Stage.TRACE, Stage.DIRECT, Stage.PROBE)
 
 
 def lightcuts(**more):
@@ -55,7 +58,7 @@ def brute_force(names) -> None:
             seconds.append(scenes.timed(lambda: mi.render(scene, integrator=plugin, spp=1, seed=0))[1])  # noqa: B023
         found, ours = plugin.statistics, float(np.median(seconds))
         error, brute = _error_and_brute_seconds(scene, plugin)
-        common = sum(found["seconds"].get(stage, 0) for stage in ("scene", "gather", "trace", "direct", "probe"))
+        common = sum(found["seconds"].get(stage, 0) for stage in COMMON_STAGES)
         points = found["gather_points"]
         ratios.append((common + brute) / ours)
         print(

@@ -33,6 +33,7 @@ mi.set_variant("llvm_ad_rgb")
 
 from benchmarks import scenes  # noqa: E402
 from benchmarks.baselines import QUALITY, VPLS, Found, Problem  # noqa: E402
+from vpl.core.stages import Stage  # noqa: E402
 
 METHOD = "matrixrecovery"
 # With other properties that suit images of this size; of several, those that take the fewest rays for the same error
@@ -134,7 +135,7 @@ def _show(name: str, label: str, one: Found, ours: Found, problem: Problem) -> N
     )
     if label == METHOD:
         stages = ", ".join(f"{stage} {spent:.2f}" for stage, spent in one.stages.items())
-        share = (one.stages["prediction"] + one.stages["separation"]) / one.seconds
+        share = (one.stages[Stage.PREDICTION] + one.stages[Stage.SEPARATION]) / one.seconds
         print(f"  stages: {stages}; prediction and separation {100 * share:.0f}%; counted: {one.counts}", flush=True)
 
 

@@ -6,15 +6,17 @@ Shadow rays and upper bounds are those per pixel, of all its samples; seconds ar
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from vpl.core.stages import Stage
+
 from . import analysis
 
 # What is made before a method begins: virtual lights and their trees
-LIGHT_STAGES = ("trace", "tree")
+LIGHT_STAGES = (Stage.TRACE, Stage.TREE)
 CHOOSING_STAGES = {
-    "matrixrecovery": ("slices", "initial_cut", "columns", "prediction"),
-    "lightslice": ("slices", "shared_columns", "rows", "columns"),
+    "matrixrecovery": (Stage.SLICES, Stage.INITIAL_CUT, Stage.COLUMNS, Stage.PREDICTION),
+    "lightslice": (Stage.SLICES, Stage.SHARED_COLUMNS, Stage.ROWS, Stage.COLUMNS),
 }
-SEPARATION_STAGES = ("shading", "separation", "correction")
+SEPARATION_STAGES = (Stage.SHADING, Stage.SEPARATION, Stage.CORRECTION)
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,14 @@ import mitsuba as mi
 
 from vpl.core.arrays import download
 from vpl.core.sampling import derived_seed
+from vpl.core.stages import Stage
 from vpl.direct.adaptive import FIELDS, DirectOptions, light_directly
 from vpl.direct.sources import Sources
 from vpl.points.camera_paths import PixelGrid
 
 from . import properties
 from .bands import fits_one_band, random_rays, render_in_bands
-from .gathering import GatheringIntegrator, Start, add_statistics, whole_sum
+from .gathering import CameraPass, GatheringIntegrator, add_statistics, whole_sum
 from .manual import direct_manual_page
 
 _LEVEL_RAYS = 4096
@@ -197,12 +198,12 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
 
     def _find_level(self, scene, sensor, seed: int) -> float:
         """Mean radiance of direct light over the film, from one pass at few points."""
-        start = self.begin(scene, *random_rays(sensor, seed, _LEVEL_RAYS))
-        if start.dark or self.max_depth < 2:
+        camera = self.begin(scene, *random_rays(sensor, seed, _LEVEL_RAYS))
+        if camera.dark or self.max_depth < 2:
             return 0.0
         quick = replace(self.options(), max_passes=1, lights="clusters")
         found = light_directly(
-            scene, start.traits, Sources(scene, start.emitters, self.regions), start.paths.points, PixelGrid(8, 1),
+            scene, camera.traits, Sources(scene, camera.emitters, self.regions), camera.paths.points, PixelGrid(8, 1),
             self.max_depth, quick, derived_seed(seed, 1), level=0.0,
         )  # fmt: skip
         return float(download(found.radiance).sum(dtype="float64")) / (3 * _LEVEL_RAYS)
@@ -211,24 +212,24 @@ class AdaptiveDirectIntegrator(GatheringIntegrator):
         """How the camera rays of this pass or band lie in the image."""
         return self._band.grid if self._band else super().pixel_grid(scene, sampler)
 
-    def light(self, scene, sampler, start: Start):
+    def light(self, scene, sampler, camera: CameraPass):
         """Direct light of all emitters; see :func:`vpl.direct.adaptive.light_directly`."""
-        points = start.paths.points
-        if start.dark or self.max_depth < 2:
+        points = camera.paths.points
+        if camera.dark or self.max_depth < 2:
             return mi.UnpolarizedSpectrum(0), {}, {"shadow_rays": 0}
-        sources = Sources(scene, start.emitters, self.regions)
-        start.clock.lap("sources")
+        sources = Sources(scene, camera.emitters, self.regions)
+        camera.clock.lap(Stage.SOURCES)
         options, level = self.options(), None
         if self._band:
             options, level = replace(options, time=self._band.time), self._band.level
         found = light_directly(
-            scene, start.traits, sources, points, self.pixel_grid(scene, sampler), self.max_depth, options,
-            derived_seed(start.seed, 30), self.should_stop, level,
+            scene, camera.traits, sources, points, self.pixel_grid(scene, sampler), self.max_depth, options,
+            derived_seed(camera.seed, 30), self.should_stop, level,
         )  # fmt: skip
-        start.clock.lap("direct")
+        camera.clock.lap(Stage.DIRECT)
         counts = {"sources": sources.count, "shadow_rays": whole_sum(found.shadow_rays)}
         counts |= {"passes": whole_sum(found.passes), "clusters": found.clusters}
-        return found.radiance, vars(found), counts | {"dropped": start.emitters.dropped}
+        return found.radiance, vars(found), counts | {"dropped": camera.emitters.dropped}
 
     def describe(self):
         """All properties and their values."""

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from vpl.core.arrays import download
 from vpl.core.sampling import derived_seed
+from vpl.core.stages import Stage
 from vpl.direct.adaptive import DirectOptions, light_directly
 from vpl.direct.emitter_sampling import ExtendedEmitters, direct_light
 from vpl.direct.sources import Sources
@@ -20,15 +21,15 @@ from vpl.points.surfaces import Batch, make_batches
 from vpl.transport.evaluation import mean_radiance
 
 from . import properties
-from .gathering import GatheringIntegrator, Start, whole_sum
+from .gathering import CameraPass, GatheringIntegrator, whole_sum
 
 AOVS = ("shadow_rays", "upper_bounds", "cut_size")
 REGIONS = 300  # of an environment [IAS section 4.3.1]
 
 
 @dataclass
-class Shading:
-    """What a method is asked to shade: one batch of gather points.
+class ShadeJob:
+    """Job of one ``shade`` call: a batch of gather points, and what is known of them.
 
     ``direct``: radiance per point that is known already (direct light of extended emitters); ``mean``: an estimate of
     the mean radiance over all gather points of the render and over channels; ``share``: the fraction of them that is in
@@ -51,8 +52,8 @@ class Shading:
 
 
 @dataclass
-class Shaded:
-    """What a method answers: radiance due to the lights, and counters, per point of the batch.
+class ShadeResult:
+    """Result of one ``shade`` call: radiance due to the lights, and counters, per point of the batch.
 
     ``shadow_rays``, ``upper_bounds``, ``cut_size``: UInt32, or Float where several points share one; ``seconds``: time
     by stage; ``phase_one``: radiance that a first phase assumed, where the method has one; ``dropped``: values left out
@@ -70,14 +71,14 @@ class Shaded:
 
 
 @dataclass
-class Prepared(Start):
+class Prepared(CameraPass):
     """A render before its method has worked.
 
     ``direct``: radiance per gather point; ``counts``: for statistics.
     """
 
     direct: object = None
-    jobs: list[Shading] = field(default_factory=list)
+    jobs: list[ShadeJob] = field(default_factory=list)
     counts: dict = field(default_factory=dict)
 
 
@@ -97,7 +98,7 @@ class ManyLightIntegrator(GatheringIntegrator):
         self.direct_error = properties.number(props, "direct_error", 0.05, 1e-4)
         self.lobe_limit = properties.number(props, "lobe_limit", 1.0, 0)
 
-    def shade(self, job: Shading) -> Shaded:
+    def shade(self, job: ShadeJob) -> ShadeResult:
         """Light of ``job.lights`` at the points of ``job.batch``: the one thing that a method defines."""
         raise NotImplementedError
 
@@ -112,70 +113,70 @@ class ManyLightIntegrator(GatheringIntegrator):
         """Everything before the method's own work: camera paths, lights, direct light, batches of gather points."""
         return self._prepare(scene, sampler, self.begin(scene, sampler, ray, active))
 
-    def _prepare(self, scene, sampler, start: Start) -> Prepared:
-        points, emitters, clock = start.paths.points, start.emitters, start.clock
-        prepared = Prepared(**vars(start), direct=dr.zeros(mi.UnpolarizedSpectrum, points.count))
-        if start.dark or self.max_depth < 2:
+    def _prepare(self, scene, sampler, camera: CameraPass) -> Prepared:
+        points, emitters, clock = camera.paths.points, camera.emitters, camera.clock
+        prepared = Prepared(**vars(camera), direct=dr.zeros(mi.UnpolarizedSpectrum, points.count))
+        if camera.dark or self.max_depth < 2:
             return prepared
-        lights = prepare_lights(scene, emitters, self.light_options(), start.seed)
+        lights = prepare_lights(scene, emitters, self.light_options(), camera.seed)
         clock.split(lights.seconds)
         grid = self.pixel_grid(scene, sampler)
         if self.direct in ("nee", "adaptive"):
             light = self._nee if self.direct == "nee" else self._adaptive
-            direct, rays = light(scene, start, grid)
+            direct, rays = light(scene, camera, grid)
             prepared.direct += direct
             prepared.counts["emitter_rays"] = rays
-            clock.lap("direct")
+            clock.lap(Stage.DIRECT)
         prepared.counts |= {
             "lights": lights.counts,
             "light_paths": lights.paths,
             "dropped": lights.dropped + emitters.dropped,
         }
         if lights.groups:
-            prepared.jobs = self._jobs(scene, start.traits, lights, prepared, start.seed, grid)
+            prepared.jobs = self._jobs(scene, camera.traits, lights, prepared, camera.seed, grid)
         return prepared
 
-    def _nee(self, scene, start: Start, grid):
+    def _nee(self, scene, camera: CameraPass, grid):
         """Direct light of extended emitters by a fixed number of samples: (radiance, rays)."""
         return direct_light(
-            scene, ExtendedEmitters(scene, start.emitters), start.traits, start.paths.points, self.max_depth,
-            self.emitter_samples, grid.samples, derived_seed(start.seed, 30),
+            scene, ExtendedEmitters(scene, camera.emitters), camera.traits, camera.paths.points, self.max_depth,
+            self.emitter_samples, grid.samples, derived_seed(camera.seed, 30),
         )  # fmt: skip
 
-    def _adaptive(self, scene, start: Start, grid):
+    def _adaptive(self, scene, camera: CameraPass, grid):
         """Direct light of extended emitters by adaptive sampling: (radiance, rays)."""
         # Points, spots and directional emitters are virtual lights already
-        sources = Sources(scene, start.emitters.extended_only(), REGIONS)
+        sources = Sources(scene, camera.emitters.extended_only(), REGIONS)
         options = DirectOptions(error=self.direct_error)
         found = light_directly(
-            scene, start.traits, sources, start.paths.points, grid, self.max_depth, options,
-            derived_seed(start.seed, 30), self.should_stop,
+            scene, camera.traits, sources, camera.paths.points, grid, self.max_depth, options,
+            derived_seed(camera.seed, 30), self.should_stop,
         )  # fmt: skip
         return found.radiance, whole_sum(found.shadow_rays)
 
-    def light(self, scene, sampler, start: Start):
+    def light(self, scene, sampler, camera: CameraPass):
         """Prepare, ask the method, and put its batches together."""
-        prepared = self._prepare(scene, sampler, start)
+        prepared = self._prepare(scene, sampler, camera)
         radiance, totals = prepared.direct, {}
         for job in prepared.jobs:
             part = self.shade(job)
             dr.scatter_add(radiance, part.radiance, job.batch.index)
             for name in self.offered_aovs:
                 values = getattr(part, name)
-                total = totals.setdefault(name, dr.zeros(type(values), start.paths.points.count))
+                total = totals.setdefault(name, dr.zeros(type(values), camera.paths.points.count))
                 dr.scatter(total, values, job.batch.index)
-            start.clock.split(part.seconds)
+            camera.clock.split(part.seconds)
             for name, number in (part.counts | {"dropped": part.dropped}).items():
                 prepared.counts[name] = prepared.counts.get(name, 0) + number
         names = {"shadow_rays": "shadow_rays", "upper_bounds": "bound_computations", "cut_size": "cut_size"}
         found = {label: whole_sum(totals.get(name)) for name, label in names.items()}
         return radiance, totals, found | {"lights": {}, "light_paths": 0, "emitter_rays": 0} | prepared.counts
 
-    def _jobs(self, scene, traits, lights: LightSet, prepared: Prepared, seed: int, grid: PixelGrid) -> list[Shading]:
+    def _jobs(self, scene, traits, lights: LightSet, prepared: Prepared, seed: int, grid: PixelGrid) -> list[ShadeJob]:
         """One job per batch of gather points, each knowing the mean radiance over all of them."""
         points, jobs, mean = prepared.paths.points, [], 0.0
         batches = make_batches(points, probe_materials(points, traits))
-        prepared.clock.lap("probe")
+        prepared.clock.lap(Stage.PROBE)
         for number, batch in enumerate(batches):
             direct = dr.gather(type(prepared.direct), prepared.direct, batch.index)
             stream = derived_seed(seed, 31, number)
@@ -183,14 +184,14 @@ class ManyLightIntegrator(GatheringIntegrator):
             weight = dr.gather(type(points.weight), points.weight, batch.index)
             share = batch.count / points.count
             jobs.append(
-                Shading(scene, traits, lights, batch, direct, 0.0, share, stream, ray, weight, grid, self.should_stop)
+                ShadeJob(scene, traits, lights, batch, direct, 0.0, share, stream, ray, weight, grid, self.should_stop)
             )
             if self.needs_trees:
                 level = mean_radiance(scene, traits, lights, batch, derived_seed(seed, 32, number))
                 mean += (level + float(download(direct).mean(dtype="float64"))) * share
         for job in jobs:
             job.mean = mean
-        prepared.clock.lap("pilot")
+        prepared.clock.lap(Stage.PILOT)
         return jobs
 
     def describe(self) -> dict:

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.arrays import download, usable
+from vpl.core.stages import Stage
 from vpl.lights.emitters import Emitters, read_emitters
 from vpl.points.camera_paths import CameraPaths, PixelGrid, SceneTraits, follow_camera_rays, refuse_media, scene_traits
 
@@ -24,7 +25,7 @@ class Clock:
         self.seconds: dict[str, float] = {}
         self._start = perf_counter()
 
-    def lap(self, stage: str) -> None:
+    def lap(self, stage: Stage) -> None:
         """End the current stage and name it."""
         dr.sync_thread()
         now = perf_counter()
@@ -33,7 +34,8 @@ class Clock:
     def split(self, seconds: dict[str, float]) -> None:
         """Add the times of stages that were taken elsewhere; the current stage begins now."""
         for stage, spent in seconds.items():
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
+            # By plain text, as statistics are printed
+            self.seconds[str(stage)] = self.seconds.get(stage, 0.0) + spent
         self._start = perf_counter()
 
 
@@ -52,10 +54,11 @@ def add_statistics(totals: dict, more: dict) -> None:
 
 
 @dataclass
-class Start:
-    """What every render begins with: a seed drawn from the sampler, the scene's emitters, and the camera's paths.
+class CameraPass:
+    """Result of following the camera rays of one pass, with which every render begins.
 
-    ``valid``: camera rays that are opaque in the film's alpha, where an environment counts, as in ``path``.
+    ``seed``: drawn from the sampler; ``emitters``, ``traits``: of the scene; ``paths``: of the camera rays;
+    ``valid``: rays that are opaque in the film's alpha, where an environment counts, as in ``path``.
     """
 
     seed: int
@@ -91,8 +94,8 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         self.samples_per_pass = properties.integer(props, "samples_per_pass", 2**32 - 1, 1)
         self.statistics: dict = {}
 
-    def light(self, scene, sampler, start: Start):
-        """Light the gather points of ``start``: (radiance, {channel: values}, {name: statistic}).
+    def light(self, scene, sampler, camera: CameraPass):
+        """Light the gather points of ``camera.paths``: (radiance, {channel: values}, {name: statistic}).
 
         All per gather point; a channel that nobody offers is not shown.
         """
@@ -110,27 +113,27 @@ class GatheringIntegrator(mi.SamplingIntegrator):
             )
         refuse_media(scene)
         with dr.suspend_grad():
-            start = self.begin(scene, sampler, mi.Ray3f(ray), active)
-            radiance, channels, found = self.light(scene, sampler, start)
-            image, counters = self._assemble(start, radiance, channels, found)
+            camera = self.begin(scene, sampler, mi.Ray3f(ray), active)
+            radiance, channels, found = self.light(scene, sampler, camera)
+            image, counters = self._assemble(camera, radiance, channels, found)
         finite = dr.all(usable(image)) & (self.max_depth > 0)
-        return dr.select(finite, mi.Spectrum(image), 0), start.valid, counters
+        return dr.select(finite, mi.Spectrum(image), 0), camera.valid, counters
 
-    def begin(self, scene, sampler, ray, active=True) -> Start:
+    def begin(self, scene, sampler, ray, active=True) -> CameraPass:
         """Emitters and camera paths."""
         clock = Clock()
         seed = int(dr.reinterpret_array(mi.UInt32, dr.detach(sampler.next_1d()))[0])
         emitters, traits = read_emitters(scene), scene_traits(scene)
         if emitters.count == 0:
             mi.Log(mi.LogLevel.Warn, "The scene has no emitters: the image will be black.")
-        clock.lap("scene")
+        clock.lap(Stage.SCENE)
         skip = self.skip_area_emitters if self.hide_emitters else None
         paths = follow_camera_rays(
             scene, emitters, traits, sampler, seed, ray, active, self.max_depth, self.rr_depth, skip, self.along_curve
         )
-        clock.lap("gather")
+        clock.lap(Stage.GATHER)
         sky = emitters.environment is not None and not self.hide_emitters
-        return Start(seed, emitters, traits, paths, paths.valid | (active & sky), clock)
+        return CameraPass(seed, emitters, traits, paths, paths.valid | (active & sky), clock)
 
     def pixel_grid(self, scene, sampler) -> PixelGrid:
         """How the camera rays of this pass lie in the image.
@@ -147,11 +150,11 @@ class GatheringIntegrator(mi.SamplingIntegrator):
                 return PixelGrid(int(size[0]), samples)
         return PixelGrid(8, 1, known=samples == 1)
 
-    def _assemble(self, start: Start, radiance, channels: dict, found: dict):
+    def _assemble(self, camera: CameraPass, radiance, channels: dict, found: dict):
         """Bring what gather points found to their camera rays: (radiance, requested channels); fills ``statistics``."""
-        points = start.paths.points
-        image, bad_samples = mi.UnpolarizedSpectrum(start.paths.emission), 0
-        counters = [dr.zeros(mi.Float, dr.width(start.paths.valid)) for _ in self.aovs]
+        points = camera.paths.points
+        image, bad_samples = mi.UnpolarizedSpectrum(camera.paths.emission), 0
+        counters = [dr.zeros(mi.Float, dr.width(camera.paths.valid)) for _ in self.aovs]
         if points.count:
             lit = points.weight * radiance
             bad = ~dr.all(usable(lit))
@@ -163,8 +166,8 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         dr.eval(image, counters)
         if bad_samples:
             mi.Log(mi.LogLevel.Warn, f"{bad_samples} sample(s) with values that are not finite were dropped.")
-        self.statistics = {"gather_points": points.count, **found, "seconds": start.clock.seconds}
-        self.statistics["dropped"] = self.statistics.get("dropped", start.emitters.dropped) + bad_samples
+        self.statistics = {"gather_points": points.count, **found, "seconds": camera.clock.seconds}
+        self.statistics["dropped"] = self.statistics.get("dropped", camera.emitters.dropped) + bad_samples
         return image, counters
 
     def describe(self) -> dict:

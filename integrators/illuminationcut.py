@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.arrays import add_at, download, upload
+from vpl.core.stages import Stage
 from vpl.cuts.adaptive_visibility import decide_visibility
 from vpl.cuts.light_cuts import upload_thresholds
 from vpl.cuts.pair_lists import evaluate_lists, list_pairs
@@ -19,7 +20,7 @@ from vpl.points.point_clusters import PointClusters
 from vpl.points.surfaces import Batch
 
 from . import properties
-from .common import AOVS, ManyLightIntegrator, Shaded, Shading
+from .common import AOVS, ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
 from .manual import manual_page
 
@@ -127,26 +128,26 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         self.share_samples = properties.boolean(props, "share_samples", False)
         self.phase_one_error = properties.number(props, "phase_one_error", 0.5, 0)
 
-    def shade(self, job: Shading) -> Shaded:
+    def shade(self, job: ShadeJob) -> ShadeResult:
         """Phase I, Phase II and the evaluation of the pairs, for one batch ([IC] section 3)."""
         clock = Clock()
         clusters = PointClusters(job.batch)
-        clock.lap("point_tree")
+        clock.lap(Stage.POINT_TREE)
         counter = BoundCounter(clusters, "upper_bounds" in self.aovs)
         bright, rays = self._approximate(job, clusters, counter)
         threshold = self._threshold(job, clusters, bright, counter)
-        clock.lap("phase_one")
+        clock.lap(Stage.PHASE_ONE)
 
-        shaded = Shaded(
+        shaded = ShadeResult(
             dr.zeros(mi.UnpolarizedSpectrum, clusters.count), rays, None, dr.zeros(mi.UInt32, clusters.count)
         )
         shown = self._choose_shown(job, clusters)
         for group, pairs in self._pairs(job, clusters, threshold, counter):
-            clock.lap("phase_two")
+            clock.lap(Stage.PHASE_TWO)
             if job.stopped():
                 break
             self._evaluate(job, group, clusters, shown, pairs, shaded, clock)
-        clock.lap("phase_two")
+        clock.lap(Stage.PHASE_TWO)
         shaded.upper_bounds = counter.per_point()
         shaded.phase_one = upload(mi.Float, bright[clusters.tree.leaf])
         shaded.seconds = clock.seconds
@@ -154,7 +155,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         found = clusters.in_batch_order([getattr(shaded, name) for name in names])
         return replace(shaded, **dict(zip(names, found, strict=True)))
 
-    def _approximate(self, job: Shading, clusters: PointClusters, counter: BoundCounter):
+    def _approximate(self, job: ShadeJob, clusters: PointClusters, counter: BoundCounter):
         """Phase I: approximate radiance at every leaf, (m,) float64, and the shadow rays it took, per point."""
         negligible = self.phase_one_error * job.mean
         generator = np.random.default_rng(job.seed)
@@ -165,7 +166,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         direct = tree.reduce(download(job.direct).mean(1, dtype=np.float64), np.minimum)
         return reflected + direct, rays
 
-    def _threshold(self, job: Shading, clusters: PointClusters, bright: np.ndarray, counter: BoundCounter):
+    def _threshold(self, job: ShadeJob, clusters: PointClusters, bright: np.ndarray, counter: BoundCounter):
         """Largest bound that a pair may have, per point node: error × least radiance of its points ([IC] eq. 4)."""
         tree, leaves = clusters.tree, clusters.tree.leaves
         allowed = self.error * np.maximum(bright[leaves], self.dark_floor * job.mean)
@@ -174,7 +175,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         allowed = allowed[tree.first[leaves]]
         return upload_thresholds(tree.gather_up(allowed, leaves, np.minimum))
 
-    def _pairs(self, job: Shading, clusters: PointClusters, threshold, counter: BoundCounter):
+    def _pairs(self, job: ShadeJob, clusters: PointClusters, threshold, counter: BoundCounter):
         """Phase II: yield (group of lights, illumination-aware pairs), about _PAIRS_HELD of them at a time."""
 
         def illumination_aware(points, lights, bound, index):
@@ -184,7 +185,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
             for pairs in in_batches(find_pairs(clusters, job.lights, group, illumination_aware, counter), _PAIRS_HELD):
                 yield group, pairs
 
-    def _choose_shown(self, job: Shading, clusters: PointClusters) -> Shown:
+    def _choose_shown(self, job: ShadeJob, clusters: PointClusters) -> Shown:
         """All points, or with ``share_samples`` those that stand for others of their pixel."""
         rows = of = dr.arange(mi.UInt32, clusters.count)
         if not self.share_samples or job.grid.samples == 1:
@@ -195,14 +196,14 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         rows = upload(mi.UInt32, chosen)
         return Shown(clusters.batch.select(rows), rows, upload(mi.UInt32, stands_for))
 
-    def _evaluate(self, job: Shading, group, clusters, shown: Shown, pairs: Pairs, shaded: Shaded, clock: Clock):
+    def _evaluate(self, job: ShadeJob, group, clusters, shown: Shown, pairs: Pairs, shaded: ShadeResult, clock: Clock):
         """Add the light of some pairs to ``shaded``."""
         seen, traced = [], [pairs]
         if self.visibility == "adaptive":
             seen, traced = decide_visibility(
                 job.scene, job.traits, job.lights, group, clusters, pairs, shaded.shadow_rays
             )
-            clock.lap("visibility")
+            clock.lap(Stage.VISIBILITY)
         if not seen and not traced:
             return
         lists = list_pairs(group, clusters, traced, seen)
@@ -211,7 +212,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         add_at(shaded.shadow_rays, rays, shown.rows)
         add_at(shaded.cut_size, dr.gather(mi.UInt32, lists.length, shown.rows), shown.rows)
         dr.eval(shaded.radiance, shaded.shadow_rays, shaded.cut_size)
-        clock.lap("evaluate")
+        clock.lap(Stage.EVALUATE)
 
     def describe(self):
         """All properties and their values."""

@@ -6,10 +6,11 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.arrays import upload
+from vpl.core.stages import Stage
 from vpl.cuts.light_cuts import estimate_radiance, evaluate_cuts, limited_cuts
 
 from . import properties
-from .common import ManyLightIntegrator, Shaded, Shading
+from .common import ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
 from .manual import manual_page
 
@@ -78,20 +79,20 @@ class LightcutsIntegrator(ManyLightIntegrator):
         self.dark_floor = properties.number(props, "dark_floor", 0.5, 0)
         self.max_cut = properties.integer(props, "max_cut", 1000, 0)
 
-    def shade(self, job: Shading) -> Shaded:
+    def shade(self, job: ShadeJob) -> ShadeResult:
         """Choose a cut for every point of a batch and evaluate it."""
         clock = Clock()
         spent = estimate_radiance(
             job.scene, job.traits, job.lights, job.batch, job.direct, job.mean, self.max_cut, _ESTIMATE_STRIDE
         )
-        clock.lap("estimate")
+        clock.lap(Stage.ESTIMATE)
         wanted = upload(mi.Float, self.error * np.maximum(spent.radiance, self.dark_floor * job.mean))
         threshold, sizes, searched = limited_cuts(job.lights, job.batch, wanted, self.max_cut)
-        clock.lap("cut")
+        clock.lap(Stage.CUT)
         radiance, rays, collected = evaluate_cuts(job.scene, job.traits, job.lights, job.batch, threshold, sizes)
-        clock.lap("evaluate")
+        clock.lap(Stage.EVALUATE)
         bounds = searched + collected + spent.upper_bounds
-        return Shaded(radiance, rays + spent.shadow_rays, bounds, sum(sizes.count), clock.seconds)
+        return ShadeResult(radiance, rays + spent.shadow_rays, bounds, sum(sizes.count), clock.seconds)
 
     def describe(self):
         """All properties and their values."""

@@ -11,6 +11,7 @@ import numpy as np
 from vpl.core.arrays import download, upload
 from vpl.core.morton import interleave
 from vpl.core.sampling import derived_seed
+from vpl.core.stages import Stage
 from vpl.matrix.light_matrix import DeviceForest, NearRows, SampledRows
 from vpl.matrix.slice_columns import SliceLights, shared_columns, slice_lights, slice_places
 from vpl.points.point_clusters import PointClusters
@@ -18,7 +19,7 @@ from vpl.points.slices import build_slices
 from vpl.transport.evaluation import sum_lights
 
 from . import properties
-from .common import ManyLightIntegrator, Shaded, Shading
+from .common import ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
 from .manual import manual_page
 
@@ -123,7 +124,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
         self.sets = properties.integer(props, "sets", 16, 1)
         self.candidates = properties.integer(props, "candidates", 4, 1)
 
-    def shade(self, job: Shading) -> Shaded:
+    def shade(self, job: ShadeJob) -> ShadeResult:
         """Slices, the lights of each, and what these send to its points, for one batch."""
         clock, turn = Clock(), self._turns(job)
         slices, seeds = max(round(self.slices * job.share), 1), [derived_seed(job.seed, k) for k in range(4)]
@@ -132,26 +133,26 @@ class LightSliceIntegrator(ManyLightIntegrator):
         first, size = (of_node[tree.leaves].astype(np.int64) for of_node in (tree.first, tree.count))
         # A row of the light matrix is sampled at one random point of each slice
         points = first + (np.random.default_rng(seeds[1]).random(len(size)) * size).astype(np.int64)
-        clock.lap("slices")
+        clock.lap(Stage.SLICES)
         forest, rays, bounds = shared_columns(
             job.scene, job.traits, job.lights, clusters, points, self.shared_columns, seeds[2]
         )
-        clock.lap("shared_columns")
+        clock.lap(Stage.SHARED_COLUMNS)
         rows = SampledRows(job.scene, job.traits, clusters.batch, DeviceForest(forest, job.lights), points)
-        clock.lap("rows")
+        clock.lap(Stage.ROWS)
         near = NearRows.nearest(slice_places(clusters), self.neighbours)
         chosen = slice_lights(rows, near, clusters, self.columns, self.unseen, self.sets, seeds[3])
-        clock.lap("columns")
+        clock.lap(Stage.COLUMNS)
         entry = upload(mi.UInt32, turn[tree.order] * rows.count + np.repeat(np.arange(rows.count), size))
         radiance, traced, columns = self._light(job, clusters, chosen, entry)
-        clock.lap("evaluate")
+        clock.lap(Stage.EVALUATE)
         radiance, traced, columns = clusters.in_batch_order([radiance, traced, columns])
         # What was spent on choosing is shared by all points
         shared = [(rays + rows.rays) / clusters.count, (bounds + rows.count * rows.forest.columns) / clusters.count]
         rays, bounds = (dr.opaque(mi.Float, number, clusters.count) for number in shared)
-        return Shaded(radiance, traced + rays, bounds, columns, clock.seconds, counts={"slices": rows.count})
+        return ShadeResult(radiance, traced + rays, bounds, columns, clock.seconds, counts={"slices": rows.count})
 
-    def _turns(self, job: Shading) -> np.ndarray:
+    def _turns(self, job: ShadeJob) -> np.ndarray:
         """The set of lights that each point takes, (n,): another one for each sample, then each pixel of a block."""
         ray, grid = download(job.ray).astype(np.int64), job.grid
         pixel = ray // grid.samples
@@ -161,7 +162,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
         block = (tile & np.uint64(3) | (tile >> np.uint64(1)) & np.uint64(12)).astype(np.int64)
         return (ray % grid.samples + grid.samples * block) % self.sets
 
-    def _light(self, job: Shading, clusters: PointClusters, chosen: list[SliceLights], entry):
+    def _light(self, job: ShadeJob, clusters: PointClusters, chosen: list[SliceLights], entry):
         """(Radiance, shadow rays, columns) of all points along the slices; ``entry``: the list of lights of each."""
         radiance = dr.zeros(mi.UnpolarizedSpectrum, clusters.count)
         traced, columns = dr.zeros(mi.UInt32, clusters.count), dr.zeros(mi.UInt32, clusters.count)

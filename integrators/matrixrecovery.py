@@ -11,6 +11,7 @@ import numpy as np
 
 from vpl.core.arrays import ENTRIES, download
 from vpl.core.sampling import derived_seed
+from vpl.core.stages import Stage
 from vpl.matrix.matrix_block import MatrixBlock
 from vpl.matrix.recovery import RecoveryOptions, recover
 from vpl.matrix.reduced_columns import initial_columns, split_columns
@@ -22,7 +23,7 @@ from vpl.points.point_clusters import PointClusters
 from vpl.points.slice_rows import build_row_slices
 
 from . import properties
-from .common import ManyLightIntegrator, Shaded, Shading
+from .common import ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
 from .manual import manual_page
 
@@ -155,7 +156,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
         self.iterations = properties.integer(props, "iterations", 20, 1)
         self.rank = properties.integer(props, "rank", 32, 1)
 
-    def shade(self, job: Shading) -> Shaded:
+    def shade(self, job: ShadeJob) -> ShadeResult:
         """Slices, their columns, what is traced of their matrices, and what these send to the points of one batch."""
         if job.traits.null:
             mi.Log(mi.LogLevel.Warn, "Light that passes through coloured glass or masks loses its colour there.")
@@ -169,22 +170,22 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
         radiance, used = clusters.in_batch_order([work.radiance, work.columns])
         spent = (work.entries.rays, work.bounds)
         rays, bounds = (dr.opaque(mi.Float, count / clusters.count, clusters.count) for count in spent)
-        return Shaded(radiance, rays, bounds, used, work.clock.seconds, counts=work.counts)
+        return ShadeResult(radiance, rays, bounds, used, work.clock.seconds, counts=work.counts)
 
-    def start(self, job: Shading) -> Work:
+    def start(self, job: ShadeJob) -> Work:
         """The slices of a batch."""
         clock = Clock()
         pixel = download(job.ray).astype(np.int64) // job.grid.samples
         clusters = PointClusters(job.batch, partial(build_row_slices, pixel, self.slice_rows))
         rows = MatrixRows(clusters, pixel, job.seed)
-        clock.lap("slices")
+        clock.lap(Stage.SLICES)
         return Work(MatrixEntries(job.scene, job.traits, job.lights, rows), clock)
 
-    def recovered(self, job: Shading, work: Work):
+    def recovered(self, job: ShadeJob, work: Work):
         """Yield the matrices of all slices, recovered: (block, what was found), block by block."""
         rows = work.entries.rows
         columns, work.bounds = initial_columns(work.entries, job.mean, min(self.initial_columns, self.max_columns))
-        work.lap("initial_cut")
+        work.lap(Stage.INITIAL_CUT)
         for number, begin in enumerate(range(0, rows.slices, _SLICES)):
             if job.stopped():
                 break
@@ -193,20 +194,20 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
             seed = derived_seed(job.seed, number)
             count = min(math.ceil(self.sampling * rows.count / rows.slices), rows.most)
             part, first = split_columns(work.entries, part, self.alpha, self.max_columns, count, seed)
-            work.lap("columns")
+            work.lap(Stage.COLUMNS)
             if part.count:
                 samples = VisibilitySamples(work.entries, part, min(count * (self.rounds + 1), rows.most), seed)
                 samples.resume(first)
                 yield from self._blocks(job, work, samples, count, slices, seed)
 
     def _blocks(
-        self, job: Shading, work: Work, samples: VisibilitySamples, count: int, slices: tuple[int, int], seed: int
+        self, job: ShadeJob, work: Work, samples: VisibilitySamples, count: int, slices: tuple[int, int], seed: int
     ):
         """Predict the columns of some slices, and recover their matrices as many at a time as memory allows."""
         entries, columns = work.entries, samples.columns
         kinds, rounds = tuple(PREDICTORS[name] for name in self.predictors), self.rounds if self.prediction else 0
         predictors, best = predict_columns(samples, kinds, count, self.prediction_error, rounds, seed)
-        work.lap("prediction")
+        work.lap(Stage.PREDICTION)
         for name, kind in PREDICTORS.items():
             work.add(f"{name}_columns", int(self.prediction and (best == kind).sum()))
         for begin, end in _chunks(entries, columns, slices):
@@ -220,7 +221,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
                 work.add("failed_slices", found.failed)
                 work.add("entries", int(block.counts.prod(1).sum()))
                 yield block, found
-                work.lap("evaluate")
+                work.lap(Stage.EVALUATE)
 
     def options(self) -> RecoveryOptions:
         """How matrices are recovered."""
@@ -250,13 +251,13 @@ class Work:
         self.radiance, self.columns = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UInt32, count)
         dr.eval(self.radiance, self.columns)
         self.counts = {"slices": rows.slices, "rows": rows.count, "entries": 0, "failed_slices": 0}
-        self.counts |= {f"{stage}_rays": 0 for stage in ("columns", "prediction", "correction")}
+        self.counts |= {f"{stage}_rays": 0 for stage in (Stage.COLUMNS, Stage.PREDICTION, Stage.CORRECTION)}
 
     def add(self, name: str, number: int) -> None:
         """Count something."""
         self.counts[name] = self.counts.get(name, 0) + number
 
-    def lap(self, stage: str) -> None:
+    def lap(self, stage: Stage) -> None:
         """A stage has ended: its time, and its shadow rays."""
         self.clock.lap(stage)
         before = sum(number for name, number in self.counts.items() if name.endswith("_rays"))

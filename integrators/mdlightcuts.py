@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.arrays import download
+from vpl.core.stages import Stage
 from vpl.cuts.light_cuts import Estimate, estimate_radiance
 from vpl.cuts.pixel_cuts import PixelCuts
 from vpl.cuts.product_cuts import BoundCounter, find_pairs, in_batches, raise_thresholds
@@ -16,7 +17,7 @@ from vpl.points.gather_tree import build_gather_tree
 from vpl.points.point_clusters import PointClusters
 
 from . import properties
-from .common import ManyLightIntegrator, Shaded, Shading
+from .common import ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
 from .manual import manual_page
 
@@ -99,7 +100,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
         self.max_cut = properties.integer(props, "max_cut", 1000, 0)
         self.leaf_points = properties.integer(props, "leaf_points", 4, 1)
 
-    def shade(self, job: Shading) -> Shaded:
+    def shade(self, job: ShadeJob) -> ShadeResult:
         """Gather trees, thresholds, and the cut of every pixel, for one batch."""
         clock = Clock()
         if not job.grid.known:
@@ -110,31 +111,31 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
             job.scene, job.traits, job.lights, job.batch, job.direct, job.mean, self.max_cut,
             round(_ESTIMATE_PIXELS * per_pixel),
         )  # fmt: skip
-        clock.lap("estimate")
+        clock.lap(Stage.ESTIMATE)
         leaf_size = 1 if job.batch.proxy.glossy else self.leaf_points
         clusters = PointClusters(job.batch, partial(build_gather_tree, pixel, job.grid.width, leaf_size))
         order = clusters.tree.order
         weight = dr.gather(type(job.weight), job.weight, clusters.order)
         cuts = PixelCuts(clusters, pixel[order], weight, job.grid.samples, job.seed)
-        clock.lap("gather_tree")
+        clock.lap(Stage.GATHER_TREE)
         counter = BoundCounter(clusters, "upper_bounds" in self.aovs)
         allowed = self._allowed(job, estimate, pixel)[order]
         stride = round(_TRIED_PIXELS * per_pixel)
         rule = cuts.rule(raise_thresholds(job.lights, clusters, allowed, self.max_cut, stride, counter))
-        clock.lap("threshold")
+        clock.lap(Stage.THRESHOLD)
         for group, pairs in self._pairs(job, clusters, rule, counter):
-            clock.lap("pairs")
+            clock.lap(Stage.PAIRS)
             if job.stopped():
                 break
             cuts.evaluate(job.scene, job.traits, job.lights, group, pairs)
-            clock.lap("evaluate")
+            clock.lap(Stage.EVALUATE)
         radiance, pairs = cuts.per_point()
         radiance, rays, bounds, pairs = clusters.in_batch_order([radiance, cuts.rays, counter.per_point(), pairs])
-        clock.lap("sum")
+        clock.lap(Stage.SUM)
         rays, bounds = rays + estimate.shadow_rays, bounds + mi.Float(estimate.upper_bounds)
-        return Shaded(radiance, rays, bounds, pairs, clock.seconds, dropped=cuts.dropped)
+        return ShadeResult(radiance, rays, bounds, pairs, clock.seconds, dropped=cuts.dropped)
 
-    def _pairs(self, job: Shading, clusters: PointClusters, rule, counter: BoundCounter):
+    def _pairs(self, job: ShadeJob, clusters: PointClusters, rule, counter: BoundCounter):
         """Yield (group of lights, pairs), at least _PAIRS_PER_KERNEL of them at a time but for the last."""
         accept, points_first = rule
         for group in job.lights.groups:
@@ -142,7 +143,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
             for pairs in in_batches(found, _PAIRS_PER_KERNEL):
                 yield group, pairs
 
-    def _allowed(self, job: Shading, estimate: Estimate, pixel: np.ndarray) -> np.ndarray:
+    def _allowed(self, job: ShadeJob, estimate: Estimate, pixel: np.ndarray) -> np.ndarray:
         """What a pair may add to the radiance of its pixel at most, for every point, (n,) float64."""
         weighted = estimate.radiance * download(job.weight).mean(1, dtype=np.float64)
         radiance = np.bincount(pixel, weighted)[pixel] / job.grid.samples

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from vpl.transport.evaluation import sum_all_lights
 
-from .common import ManyLightIntegrator, Shaded, Shading
+from .common import ManyLightIntegrator, ShadeJob, ShadeResult
 from .manual import manual_page
 
 
@@ -45,11 +45,11 @@ class VPLIntegrator(ManyLightIntegrator):
 
     needs_trees = False
 
-    def shade(self, job: Shading) -> Shaded:
+    def shade(self, job: ShadeJob) -> ShadeResult:
         """Sum over all lights; see :func:`vpl.transport.evaluation.sum_all_lights`."""
         count = job.batch.count
         radiance, rays = sum_all_lights(job.scene, job.traits, job.lights, job.batch, job.stopped)
-        return Shaded(radiance, rays, dr.zeros(mi.UInt32, count), dr.full(mi.UInt32, job.lights.count, count))
+        return ShadeResult(radiance, rays, dr.zeros(mi.UInt32, count), dr.full(mi.UInt32, job.lights.count, count))
 
 
 mi.register_integrator("vpl", VPLIntegrator)

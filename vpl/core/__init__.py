@@ -6,6 +6,7 @@
   ``find_interval``), evenly spread samples (``SpreadSamples``)
 - ``morton``: codes and orders along a Morton curve
 - ``cones``: axes of cones around directions, and how their cosines are rounded
+- ``stages``: names of a render's stages, by which its seconds are kept
 - ``parameters``: parameters of scene objects, read without ``mitsuba.traverse``
 - ``backend``: what has to be right underneath Mitsuba, checked before it goes wrong
 """

@@ -16,6 +16,7 @@ import numpy as np
 from ..core.arrays import channel_mean, download, finite_or_zero, spectrum_to_rgb
 from ..core.cones import COSINE_ROUNDING
 from ..core.sampling import Choice, derived_seed, independent_sampler, stratified
+from ..core.stages import Stage
 from .emission import bounding_sphere
 from .emitters import Emitters
 from .light_tree import CONE_COS, DeviceTree, LightTree, build_light_tree
@@ -156,7 +157,7 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, seed: int) 
         limits = PathLimits(options.max_depth - 2, options.rr_depth, options.lobe_limit)
         traced = trace_lights(scene, emitters, options.vpl_count, derived_seed(seed, 21), limits)
         found.append(traced.lights)
-    seconds = {"trace": perf_counter() - start}
+    seconds = {Stage.TRACE: perf_counter() - start}
 
     start = perf_counter()
     groups, dropped = [], 0
@@ -169,7 +170,7 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, seed: int) 
         if lights.count:
             tree = light_tree(lights, derived_seed(seed, 22, number)) if options.trees else None
             groups.append(LightGroup(kind, DeviceLights(lights), tree))
-    seconds["tree"] = perf_counter() - start
+    seconds[Stage.TREE] = perf_counter() - start
     clamp = options.clamping * float(bounding_sphere(scene).radius)
     paths = traced.paths if traced else 0
     return LightSet(groups, clamp, options.max_depth, paths, dropped + (traced.dropped if traced else 0), seconds)

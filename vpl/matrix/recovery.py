@@ -19,6 +19,7 @@ import numpy as np
 
 from ..core.arrays import download, upload
 from ..core.sampling import HASH_ROUNDS
+from ..core.stages import Stage
 from .matrix_block import MatrixBlock
 from .separation import Separation, SeparationLimits, separate
 from .visibility_prediction import Predictors
@@ -71,24 +72,24 @@ class Recovered:
 
 def recover(
     block: MatrixBlock, predictors: Predictors, best: np.ndarray, first: int, options: RecoveryOptions, seed: int,
-    lap: Callable[[str], None] = lambda stage: None,
+    lap: Callable[[Stage], None] = lambda stage: None,
 ) -> Recovered:  # fmt: skip
     """Recover a block: see :class:`Recovered`.
 
     ``best``: the predictor of every column that has samples; those of the block are these from number ``first`` on.
-    ``lap``: called with the name of every stage as it ends.
+    ``lap``: called with every stage as it ends.
     """
     predicted, traced = _predicted(block, predictors, best, first, options.prediction, seed)
-    lap("prediction")
+    lap(Stage.PREDICTION)
     found = Recovered(block.unoccluded(), predicted, traced, mi.Float(predicted))
-    lap("shading")
+    lap(Stage.SHADING)
     mixed = _mixed_columns(predictors, first, block.columns.count) if options.separation else []
     if len(mixed):
         wanted = _separate(found, block, mixed, options, seed)
-        lap("separation")
+        lap(Stage.SEPARATION)
         if len(wanted):
             block.trace(found.visibility, wanted, dr.opaque(mi.UInt32, seed))
-        lap("correction")
+        lap(Stage.CORRECTION)
     return found
 
 
