@@ -99,6 +99,15 @@ LARGEST_VALUE = 1e30
 ENTRIES = 1 << 23
 
 
+# Of a count on the device: as good as no limit
+NO_LIMIT = 0xFFFFFFFF
+
+
+def upload_limit(limit: float):
+    """A largest count, math.inf for none, as an opaque UInt32: the kernel is the same whatever it is."""
+    return dr.opaque(mi.UInt32, int(min(limit, NO_LIMIT)))
+
+
 def usable(value):
     """Where a radiance, an intensity or a density is a number from 0 to ``LARGEST_VALUE``; NumPy or Dr.Jit."""
     return (value >= 0) & (value <= LARGEST_VALUE)

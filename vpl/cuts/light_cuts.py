@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import chunks, download, upload
+from ..core.arrays import NO_LIMIT, chunks, download, upload, upload_limit
 from ..lights.light_set import LightGroup, LightSet
 from ..points.camera_paths import SceneTraits
 from ..points.surfaces import Batch
@@ -56,7 +56,7 @@ def _step(group: LightGroup, batch: Batch, threshold, smallest_distance, i):
 @dr.syntax
 def _count_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: float, most: int):
     """Walk a group's tree for every point: (nodes taken, nodes visited).  Gives up beyond ``most`` nodes (0: never)."""
-    end, limit = dr.opaque(mi.UInt32, group.tree.count), dr.opaque(mi.UInt32, most or 0xFFFFFFFF)
+    end, limit = dr.opaque(mi.UInt32, group.tree.count), upload_limit(most or NO_LIMIT)
     clamp = dr.opaque(mi.Float, smallest_distance)
     i, count, visits = mi.UInt32(0), dr.zeros(mi.UInt32, batch.count), dr.zeros(mi.UInt32, batch.count)
     while dr.hint((i < end) & (count <= limit), exclude=[group, batch]):

@@ -27,6 +27,9 @@ from ..transport.evaluation import evaluate_pairs
 from .light_cuts import upload_thresholds
 from .product_cuts import Pairs
 
+# A threshold that no bound is below
+_NONE = -1.0
+
 
 class PixelCuts:
     """Light of some pixels, found pair by pair, and what it took: ``pairs``, ``rays``, and how many values were
@@ -58,17 +61,18 @@ class PixelCuts:
         """
         tree = self.clusters.tree
         least = tree.gather_up(allowed[tree.first[tree.leaves]], tree.leaves, np.minimum)
-        # Bounds hold for one point of unit weight. Blocks of pixels are marked by a sign: they accept nothing
+        # Bounds hold for one point of unit weight
         share = np.maximum(self._share, np.finfo(np.float64).tiny)
-        threshold = upload_thresholds(np.where(self._of_pixel, least / share, -least))
+        of_pixels = upload_thresholds(np.where(self._of_pixel, least / share, _NONE))
+        of_blocks = upload_thresholds(np.where(self._of_pixel, _NONE, least))
 
         def accept(points, lights, bound, index):
-            """Whether a pair is fine enough."""
-            return bound <= dr.gather(mi.Float, threshold, index)
+            """Whether a pair is fine enough; with a block of pixels, none is."""
+            return bound <= dr.gather(mi.Float, of_pixels, index)
 
         def points_first(points, lights, bound, index):
             """Whether the lights of a pair are fine enough for every pixel of a block."""
-            return bound <= -dr.gather(mi.Float, threshold, index)
+            return bound <= dr.gather(mi.Float, of_blocks, index)
 
         return accept, points_first
 

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import chunks, download, upload
+from ..core.arrays import chunks, download, upload, upload_limit
 from ..core.sampling import derived_seed
 from ..points.bsdf_proxies import probe_materials
 from ..points.camera_paths import GatherPoints, PixelGrid
@@ -113,7 +113,7 @@ class _BatchLight:
     def __init__(self, scene, traits, sources, points, batch: Batch, grid, max_depth, options, seed: int):
         self.batch, self.options, self.grid, self.nodes = batch, options, grid, sources.nodes
         self._common = scene, traits, sources, batch
-        self._beyond = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF))) if traits.delta and max_depth > 2 else None
+        self._beyond = upload_limit(max_depth) if traits.delta and max_depth > 2 else None
         self.rows = download(batch.index)
         pixel = download(points.ray)[self.rows].astype(np.int64) // grid.samples
         position, normal = download(batch.position), download(batch.normal)

@@ -37,7 +37,7 @@ def cluster_importance(surface, normal, two_sided, node):
     From the point of its bounding sphere that stands highest above the surface, so that what is partly below the
     horizon counts; facing as much as any of its sources could.
     """
-    infinite, radius = node.radius < 0, dr.maximum(node.radius, 0)
+    infinite, radius = node.infinite, dr.maximum(node.radius, 0)
     lift = dr.select(two_sided, mi.Vector3f(0), mi.Vector3f(normal))
     half_sine = dr.safe_sqrt(1 - dr.square(dr.maximum(node.cone_cos, 0)))
     offset = node.centroid - surface.interaction.p + lift * radius

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import finite_or_zero
+from ..core.arrays import finite_or_zero, upload_limit
 from ..core.sampling import Choice, SpreadSamples, derived_seed, independent_sampler
 from ..lights.emission import bounding_sphere, other_power
 from ..lights.emitters import Emitters
@@ -128,7 +128,7 @@ def direct_light(
         return dr.zeros(mi.UnpolarizedSpectrum, points.count), 0
     sampler = independent_sampler(seed, points.count)
     context = mi.BSDFContext()
-    limit = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF)))
+    limit = upload_limit(max_depth)
     total, of_pixel = dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, rays_per_pixel)
     pixel = points.ray // of_pixel
     first = (points.ray - pixel * of_pixel) * total

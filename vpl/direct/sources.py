@@ -23,17 +23,20 @@ from .emitter_clusters import build_cluster_forest
 from .emitter_pieces import EmitterPieces
 from .environment_regions import EnvironmentRegions
 
+# In place of the radius of a node that has no place
+RADIUS_AT_INFINITY = -1.0
+
 
 @dataclass
 class Nodes:
     """Clusters as NumPy arrays of m rows.
 
-    ``center`` (m, 3), ``radius`` (m,): bounding spheres, world units; for nodes at infinity the radius is negative and
-    the centre means nothing. ``axis`` (m, 3), ``cone_cos`` (m,): cone of the directions that sources face (-1: all);
-    for nodes at infinity, of the directions from which their light comes. ``intensity`` (m,): radiant intensity, or
-    irradiance of nodes at infinity. ``centroid`` (m, 3): mean position by intensity. ``escape`` (m,): the node after
-    this node's subtree. ``first``, ``last`` (m,): ranks of its sources. All float64 or uint32. ``extended`` (m,): how
-    many of them have an extent.
+    ``center`` (m, 3), ``radius`` (m,): bounding spheres, world units; for nodes at infinity the radius is
+    RADIUS_AT_INFINITY and the centre means nothing. ``axis`` (m, 3), ``cone_cos`` (m,): cone of the directions that
+    sources face (-1: all); for nodes at infinity, of the directions from which their light comes. ``intensity`` (m,):
+    radiant intensity, or irradiance of nodes at infinity. ``centroid`` (m, 3): mean position by intensity. ``escape``
+    (m,): the node after this node's subtree. ``first``, ``last`` (m,): ranks of its sources. All float64 or uint32.
+    ``extended`` (m,): how many of them have an extent.
     """
 
     center: np.ndarray
@@ -53,7 +56,7 @@ class Nodes:
 
     @property
     def infinite(self) -> np.ndarray:
-        return self.radius < 0
+        return self.radius == RADIUS_AT_INFINITY
 
 
 @dataclass
@@ -79,6 +82,11 @@ class DeviceNode:
     intensity: object
     first: object
     last: object
+
+    @property
+    def infinite(self):
+        """Mask of the nodes at infinity."""
+        return self.radius == RADIUS_AT_INFINITY
 
 
 class Sources:
@@ -152,7 +160,7 @@ class Sources:
         count, nothing = len(keep), np.zeros((len(keep), 3))
         ranks = (rank + np.arange(count)).astype(np.uint32)
         nodes = Nodes(
-            nothing, -np.ones(count), axis[keep], cone_cos[keep], intensity[keep], nothing,
+            nothing, np.full(count, RADIUS_AT_INFINITY), axis[keep], cone_cos[keep], intensity[keep], nothing,
             np.zeros(count, np.uint32), ranks, ranks + np.uint32(1), (keep >= suns.count).astype(np.int64),
         )  # fmt: skip
         return nodes, self._begin[3] + keep

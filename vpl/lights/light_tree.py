@@ -44,9 +44,10 @@ from .clustering import (
 
 # Factor of the squared angular term of the metric: a quarter of the scene's diagonal, squared
 ANGULAR_WEIGHT = 1 / 16
-# Columns of LightTree.records
+# Columns of LightTree.records, and how many there are
 BOX_MIN, BOX_MAX, CONE_AXIS, CONE_COS = slice(0, 3), slice(3, 6), slice(6, 9), 9
 INTENSITY, FLUX, ESCAPE, REPRESENTATIVE = 10, slice(11, 14), 14, 15
+COLUMNS = 16
 
 
 @dataclass(frozen=True)
@@ -208,7 +209,7 @@ def _assemble(order, rounds, position, direction, flux, rng) -> LightTree:
     node_at, leaves, depth = layout(len(order), rounds)
     leaf_order = order[node_at[node_at < len(order)]]
 
-    records = np.zeros((len(node_at), 16), np.float32)
+    records = np.zeros((len(node_at), COLUMNS), np.float32)
     if position is not None:
         for columns, operation in ((BOX_MIN, np.minimum), (BOX_MAX, np.maximum)):
             records[:, columns] = accumulate(position.take(order, axis=0).T, rounds, operation).T
@@ -300,7 +301,7 @@ class DeviceTree:
         return download(self._records).reshape(self.count, -1)
 
     def gather(self, index, active=True) -> Node:
-        """Fetch one node per lane; see :mod:`vpl.lights.light_tree` for the layout of the record."""
+        """Fetch one node per lane; see :class:`LightTree` for the layout of the record."""
         a, b, c, d = (dr.gather(mi.Vector4f, self._records, index * 4 + k, active) for k in range(4))
         return Node(
             mi.Point3f(a.x, a.y, a.z),
@@ -311,16 +312,19 @@ class DeviceTree:
             dr.reinterpret_array(mi.UInt32, d.z),
         )
 
+    def _column(self, column: int, index, active):
+        return dr.gather(mi.Float, self._records, index * COLUMNS + column, active)
+
     def escape(self, index, active=True):
         """The node that follows a node's subtree."""
-        return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._records, index * 16 + 14, active))
+        return dr.reinterpret_array(mi.UInt32, self._column(ESCAPE, index, active))
 
     def summed_intensity(self, index, active=True):
         """Scalar intensity of a node: the mean over channels of the sum over its lights."""
-        return dr.gather(mi.Float, self._records, index * 16 + 10, active)
+        return self._column(INTENSITY, index, active)
 
     def representative(self, index, active=True, second=False):
         """Index of a node's representative light, or of its second one."""
         if second:
             return dr.gather(mi.UInt32, self._second, index, active)
-        return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._records, index * 16 + 15, active))
+        return dr.reinterpret_array(mi.UInt32, self._column(REPRESENTATIVE, index, active))

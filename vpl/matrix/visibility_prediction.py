@@ -16,7 +16,7 @@ import numpy as np
 
 from ..core.arrays import download, upload
 from ..core.sampling import HASH_ROUNDS, derived_seed
-from .visibility_samples import VisibilitySamples
+from .visibility_samples import NO_ROW, VisibilitySamples
 
 NEAREST, LINEAR, BAYES = range(3)
 PREDICTORS = {"nearest": NEAREST, "linear": LINEAR, "bayes": BAYES}
@@ -171,7 +171,7 @@ def _validate(predictors: Predictors, index: np.ndarray, count: int, seed: int):
     rows = samples.draw(index, count)
     lane = dr.arange(mi.UInt32, len(index) * count)
     column = dr.gather(mi.UInt32, upload(mi.UInt32, index), lane // dr.opaque(mi.UInt32, count))
-    drawn = rows != 0xFFFFFFFF
+    drawn = rows != NO_ROW
     inside, draw = dr.select(drawn, rows, 0), mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)
     predicted = [predictors.predict(kind, column, inside, draw) for kind in predictors.kinds]
     dr.eval(predicted)

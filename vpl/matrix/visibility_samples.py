@@ -19,6 +19,8 @@ from ..transport.evaluation import unoccluded
 from .reduced_matrix import Columns, MatrixEntries
 
 _WORD = 32
+# In place of a row where a column has no more of them
+NO_ROW = 0xFFFFFFFF
 
 
 @dataclass
@@ -80,8 +82,8 @@ class VisibilitySamples:
         self._remember(dr.arange(mi.UInt32, self.columns.count), rows, values, count)
 
     def draw(self, index: np.ndarray, count: int):
-        """The next ``count`` rows of some columns, UInt32, column by column; 0xFFFFFFFF where there are no more."""
-        found = dr.full(mi.UInt32, 0xFFFFFFFF, len(index) * count)
+        """The next ``count`` rows of some columns, UInt32, column by column; NO_ROW where there are no more."""
+        found = dr.full(mi.UInt32, NO_ROW, len(index) * count)
         dr.eval(found)
         for group, inside in self.entries.by_group(self.columns.select(index)):
             column, target = upload(mi.UInt32, index[inside]), upload(mi.UInt32, inside * count)
@@ -119,7 +121,7 @@ class VisibilitySamples:
             row = dr.gather(mi.UInt32, rows, place)
             light = dr.gather(mi.UInt32, self._light, column)
             first, _ = self.entries.rows.range(dr.gather(mi.UInt32, self._piece, column))
-            passed, asked = self.entries.trace(group, light, first + row, light, row != 0xFFFFFFFF)
+            passed, asked = self.entries.trace(group, light, first + row, light, row != NO_ROW)
             dr.scatter(value, passed, place, asked)
             dr.eval(value)
         self._remember(upload(mi.UInt32, index), rows, value, count)

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, download, finite_or_zero, ones, upload
+from ..core.arrays import channel_mean, download, finite_or_zero, ones, upload, upload_limit
 from ..core.morton import morton_order
 from ..core.sampling import derived_seed, independent_sampler
 from ..lights.emitters import Emitters, registered_shapes
@@ -211,7 +211,7 @@ def follow_camera_rays(
     ray.maxt += dr.zeros(mi.Float, count)
     lane = dr.arange(mi.UInt32, count)
     active = mi.Bool(active) & (lane < dr.opaque(mi.UInt32, count))
-    limits = (dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF))), dr.opaque(mi.UInt32, rr_depth))
+    limits = (upload_limit(max_depth), dr.opaque(mi.UInt32, rr_depth))
     throughput, depth = ones(count), 1
     found = None
     while True:
