@@ -99,7 +99,7 @@ class Problem:
         self._place[pixels] = np.arange(len(pixels))
         self._chosen = [self._rows_of(job) for job in self.prepared.jobs]
         self._exact = sum(
-            self._of_pixels(job, rows, download(sum_all_lights(job.scene, job.traits, job.lights, part)[0]))
+            self._of_pixels(job, rows, download(sum_all_lights(job.transport, part)[0]))
             for job, rows, part in self._chosen
         )
         direct = sum(self._of_pixels(job, rows, download(job.direct)[rows]) for job, rows, _ in self._chosen)

@@ -72,7 +72,7 @@ class Problem:
             share = max(round(SUBSET * job.batch.count / self.points), min(job.batch.count, 64))
             rows = np.random.default_rng(number).choice(job.batch.count, min(share, job.batch.count), replace=False)
             part = job.batch.select(upload(mi.UInt32, np.sort(rows)))
-            exact = download(sum_all_lights(job.scene, job.traits, job.lights, part)[0])
+            exact = download(sum_all_lights(job.transport, part)[0])
             self.exact.append((np.sort(rows), exact))
             direct = download(job.direct)[np.sort(rows)]
             self.mean += float((exact + direct).mean()) * job.batch.count / self.points
@@ -184,8 +184,8 @@ def _seconds_alone(plugin, job, most: int = 1 << 22) -> float:
         dr.eval(ray, active)
         rays = dr.gather(mi.Ray3f, ray, dr.compress(active))
         dr.eval(rays)
-        scenes.timed(lambda: job.scene.ray_test(rays))  # noqa: B023
-        seconds += scenes.timed(lambda: job.scene.ray_test(rays))[1]  # noqa: B023
+        scenes.timed(lambda: job.transport.scene.ray_test(rays))  # noqa: B023
+        seconds += scenes.timed(lambda: job.transport.scene.ray_test(rays))[1]  # noqa: B023
         count += dr.width(rays.d)
     return seconds / max(count, 1)
 

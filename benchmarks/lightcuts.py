@@ -81,8 +81,8 @@ def _error_and_brute_seconds(scene, plugin):
         rows = np.sort(np.random.default_rng(number).choice(job.batch.count, min(share, job.batch.count), False))
         part = job.batch.select(upload(mi.UInt32, rows))
         few = job.batch.select(upload(mi.UInt32, rows[:16]))
-        sum_all_lights(job.scene, job.traits, job.lights, few)  # compiles the kernel
-        (exact, _), spent = scenes.timed(lambda: sum_all_lights(job.scene, job.traits, job.lights, part))  # noqa: B023
+        sum_all_lights(job.transport, few)  # compiles the kernel
+        (exact, _), spent = scenes.timed(lambda: sum_all_lights(job.transport, part))  # noqa: B023
         exact, direct = download(exact), download(job.direct)[rows]
         scale = job.batch.count / len(rows)
         seconds += spent * scale
@@ -123,7 +123,7 @@ def _seconds_alone(plugin, job) -> float:
         lanes = dr.compress(active)
         rays = dr.gather(mi.Ray3f, ray, lanes)
         dr.eval(rays)
-        scene = job.scene
+        scene = job.transport.scene
         scenes.timed(lambda: scene.ray_test(rays))  # noqa: B023
         _, spent = scenes.timed(lambda: scene.ray_test(rays))  # noqa: B023
         seconds += spent

@@ -16,9 +16,9 @@ from vpl.direct.emitter_sampling import ExtendedEmitters, direct_light
 from vpl.direct.sources import Sources
 from vpl.lights.light_set import LightOptions, LightSet, prepare_lights
 from vpl.points.bsdf_proxies import probe_materials
-from vpl.points.camera_paths import PixelGrid, SceneTraits
+from vpl.points.camera_paths import PixelGrid
 from vpl.points.surfaces import Batch, make_batches
-from vpl.transport.evaluation import mean_radiance
+from vpl.transport.evaluation import Transport, mean_radiance
 
 from . import properties
 from .gathering import CameraPass, GatheringIntegrator, whole_sum
@@ -31,15 +31,14 @@ REGIONS = 300  # of an environment [IAS section 4.3.1]
 class ShadeJob:
     """Job of one ``shade`` call: a batch of gather points, and what is known of them.
 
-    ``direct``: radiance per point that is known already (direct light of extended emitters); ``mean``: an estimate of
-    the mean radiance over all gather points of the render and over channels; ``share``: the fraction of them that is in
-    this batch; ``ray``: UInt32, the camera ray of each point; ``weight``: what its radiance counts in that ray;
-    ``grid``: how camera rays lie in the image; ``stopped``: whether to give up early.
+    ``transport``: the scene and its lights; ``batch``: the points; ``direct``: radiance per point that is known
+    already (direct light of extended emitters); ``mean``: an estimate of the mean radiance over all gather points of
+    the render and over channels; ``share``: the fraction of them that is in this batch; ``ray``: UInt32, the camera ray
+    of each point; ``weight``: what its radiance counts in that ray; ``grid``: how camera rays lie in the image;
+    ``stopped``: whether to give up early.
     """
 
-    scene: object
-    traits: SceneTraits
-    lights: LightSet
+    transport: Transport
     batch: Batch
     direct: object
     mean: float
@@ -49,6 +48,10 @@ class ShadeJob:
     weight: object
     grid: PixelGrid
     stopped: Callable[[], bool]
+
+    @property
+    def lights(self) -> LightSet:
+        return self.transport.lights
 
 
 @dataclass
@@ -133,7 +136,7 @@ class ManyLightIntegrator(GatheringIntegrator):
             "dropped": lights.dropped + emitters.dropped,
         }
         if lights.groups:
-            prepared.jobs = self._jobs(scene, camera.traits, lights, prepared, camera.seed, grid)
+            prepared.jobs = self._jobs(Transport(scene, camera.traits, lights), prepared, camera.seed, grid)
         return prepared
 
     def _nee(self, scene, camera: CameraPass, grid):
@@ -172,10 +175,10 @@ class ManyLightIntegrator(GatheringIntegrator):
         found = {label: whole_sum(totals.get(name)) for name, label in names.items()}
         return radiance, totals, found | {"lights": {}, "light_paths": 0, "emitter_rays": 0} | prepared.counts
 
-    def _jobs(self, scene, traits, lights: LightSet, prepared: Prepared, seed: int, grid: PixelGrid) -> list[ShadeJob]:
+    def _jobs(self, transport: Transport, prepared: Prepared, seed: int, grid: PixelGrid) -> list[ShadeJob]:
         """One job per batch of gather points, each knowing the mean radiance over all of them."""
         points, jobs, mean = prepared.paths.points, [], 0.0
-        batches = make_batches(points, probe_materials(points, traits))
+        batches = make_batches(points, probe_materials(points, transport.traits))
         prepared.clock.lap(Stage.PROBE)
         for number, batch in enumerate(batches):
             direct = dr.gather(type(prepared.direct), prepared.direct, batch.index)
@@ -183,11 +186,9 @@ class ManyLightIntegrator(GatheringIntegrator):
             ray = dr.gather(mi.UInt32, points.ray, batch.index)
             weight = dr.gather(type(points.weight), points.weight, batch.index)
             share = batch.count / points.count
-            jobs.append(
-                ShadeJob(scene, traits, lights, batch, direct, 0.0, share, stream, ray, weight, grid, self.should_stop)
-            )
+            jobs.append(ShadeJob(transport, batch, direct, 0.0, share, stream, ray, weight, grid, self.should_stop))
             if self.needs_trees:
-                level = mean_radiance(scene, traits, lights, batch, derived_seed(seed, 32, number))
+                level = mean_radiance(transport, batch, derived_seed(seed, 32, number))
                 mean += (level + float(download(direct).mean(dtype="float64"))) * share
         for job in jobs:
             job.mean = mean

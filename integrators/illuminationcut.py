@@ -159,9 +159,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         """Phase I: approximate radiance at every leaf, (m,) float64, and the shadow rays it took, per point."""
         negligible = self.phase_one_error * job.mean
         generator = np.random.default_rng(job.seed)
-        reflected, rays = approximate_radiance(
-            job.scene, job.traits, job.lights, clusters, negligible, generator, counter
-        )
+        reflected, rays = approximate_radiance(job.transport, clusters, negligible, generator, counter)
         tree = clusters.tree
         direct = tree.reduce(download(job.direct).mean(1, dtype=np.float64), np.minimum)
         return reflected + direct, rays
@@ -200,14 +198,12 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         """Add the light of some pairs to ``shaded``."""
         seen, traced = [], [pairs]
         if self.visibility == "adaptive":
-            seen, traced = decide_visibility(
-                job.scene, job.traits, job.lights, group, clusters, pairs, shaded.shadow_rays
-            )
+            seen, traced = decide_visibility(job.transport, group, clusters, pairs, shaded.shadow_rays)
             clock.lap(Stage.VISIBILITY)
         if not seen and not traced:
             return
         lists = list_pairs(group, clusters, traced, seen)
-        radiance, rays = evaluate_lists(job.scene, job.traits, job.lights, group, shown.batch, lists, shown.rows)
+        radiance, rays = evaluate_lists(job.transport, group, shown.batch, lists, shown.rows)
         shaded.radiance += dr.gather(type(radiance), radiance, shown.of)
         add_at(shaded.shadow_rays, rays, shown.rows)
         add_at(shaded.cut_size, dr.gather(mi.UInt32, lists.length, shown.rows), shown.rows)

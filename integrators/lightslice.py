@@ -134,11 +134,9 @@ class LightSliceIntegrator(ManyLightIntegrator):
         # A row of the light matrix is sampled at one random point of each slice
         points = first + (np.random.default_rng(seeds[1]).random(len(size)) * size).astype(np.int64)
         clock.lap(Stage.SLICES)
-        forest, rays, bounds = shared_columns(
-            job.scene, job.traits, job.lights, clusters, points, self.shared_columns, seeds[2]
-        )
+        forest, rays, bounds = shared_columns(job.transport, clusters, points, self.shared_columns, seeds[2])
         clock.lap(Stage.SHARED_COLUMNS)
-        rows = SampledRows(job.scene, job.traits, clusters.batch, DeviceForest(forest, job.lights), points)
+        rows = SampledRows(job.transport, clusters.batch, DeviceForest(forest, job.lights), points)
         clock.lap(Stage.ROWS)
         near = NearRows.nearest(slice_places(clusters), self.neighbours)
         chosen = slice_lights(rows, near, clusters, self.columns, self.unseen, self.sets, seeds[3])
@@ -176,9 +174,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
                 if job.stopped():
                     break
                 end = dr.minimum(first + _COLUMNS_PER_KERNEL, last)
-                value, rays = sum_lights(
-                    job.scene, job.traits, job.lights, lights.group, clusters.batch.surfaces, first, end, pick
-                )
+                value, rays = sum_lights(job.transport, lights.group, clusters.batch.surfaces, first, end, pick)
                 radiance, traced, first = radiance + value, traced + rays, end
                 dr.eval(radiance, traced, first)
         return radiance, traced, columns

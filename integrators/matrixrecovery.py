@@ -158,7 +158,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
 
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Slices, their columns, what is traced of their matrices, and what these send to the points of one batch."""
-        if job.traits.null:
+        if job.transport.traits.null:
             mi.Log(mi.LogLevel.Warn, "Light that passes through coloured glass or masks loses its colour there.")
         work = self.start(job)
         clusters = work.entries.rows.clusters
@@ -179,7 +179,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
         clusters = PointClusters(job.batch, partial(build_row_slices, pixel, self.slice_rows))
         rows = MatrixRows(clusters, pixel, job.seed)
         clock.lap(Stage.SLICES)
-        return Work(MatrixEntries(job.scene, job.traits, job.lights, rows), clock)
+        return Work(MatrixEntries(job.transport, rows), clock)
 
     def recovered(self, job: ShadeJob, work: Work):
         """Yield the matrices of all slices, recovered: (block, what was found), block by block."""

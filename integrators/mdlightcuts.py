@@ -108,7 +108,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
         pixel = download(job.ray).astype(np.int64) // job.grid.samples
         per_pixel = job.batch.count / np.count_nonzero(np.bincount(pixel))
         estimate = estimate_radiance(
-            job.scene, job.traits, job.lights, job.batch, job.direct, job.mean, self.max_cut,
+            job.transport, job.batch, job.direct, job.mean, self.max_cut,
             round(_ESTIMATE_PIXELS * per_pixel),
         )  # fmt: skip
         clock.lap(Stage.ESTIMATE)
@@ -127,7 +127,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
             clock.lap(Stage.PAIRS)
             if job.stopped():
                 break
-            cuts.evaluate(job.scene, job.traits, job.lights, group, pairs)
+            cuts.evaluate(job.transport, group, pairs)
             clock.lap(Stage.EVALUATE)
         radiance, pairs = cuts.per_point()
         radiance, rays, bounds, pairs = clusters.in_batch_order([radiance, cuts.rays, counter.per_point(), pairs])

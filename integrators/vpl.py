@@ -48,7 +48,7 @@ class VPLIntegrator(ManyLightIntegrator):
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Sum over all lights; see :func:`vpl.transport.evaluation.sum_all_lights`."""
         count = job.batch.count
-        radiance, rays = sum_all_lights(job.scene, job.traits, job.lights, job.batch, job.stopped)
+        radiance, rays = sum_all_lights(job.transport, job.batch, job.stopped)
         return ShadeResult(radiance, rays, dr.zeros(mi.UInt32, count), dr.full(mi.UInt32, job.lights.count, count))
 
 

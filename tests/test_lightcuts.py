@@ -1,5 +1,7 @@
 """Cuts against the sum of all lights, and against a walk in plain Python."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -111,7 +113,7 @@ def test_cuts_are_unbiased_for_coloured_lights():
     records = download(group.lights._records).reshape(-1, 16)
     depth = records[:, 3].copy().view(np.uint32)
     lights = VirtualLights.of("oriented", records[:, 0:3], records[:, 4:7], records[:, 8:11], depth)
-    exact = download(sum_all_lights(job.scene, job.traits, job.lights, job.batch)[0]).mean(0)
+    exact = download(sum_all_lights(job.transport, job.batch)[0]).mean(0)
     means = []
     for seed in range(48):
         trees = LightSet(
@@ -119,7 +121,7 @@ def test_cuts_are_unbiased_for_coloured_lights():
         )
         threshold = dr.full(mi.Float, 0.1 * job.mean, job.batch.count)
         sizes = cut_sizes(trees, job.batch, threshold)
-        radiance, _, _ = evaluate_cuts(job.scene, job.traits, trees, job.batch, threshold, sizes)
+        radiance, _, _ = evaluate_cuts(replace(job.transport, lights=trees), job.batch, threshold, sizes)
         means.append(download(radiance).mean(0))
     means = np.array(means)
     deviation = np.abs(means.mean(0) - exact) / (means.std(0, ddof=1) / np.sqrt(len(means)))
@@ -205,7 +207,7 @@ def test_thresholds_do_not_bias_the_image():
     for seed in range(24):
         plugin, jobs = prepared(scene, seed, 16, vpl_count=300, error=0.3, dark_floor=0.0)
         job = jobs[0]
-        exact = download(sum_all_lights(job.scene, job.traits, job.lights, job.batch)[0]).sum()
+        exact = download(sum_all_lights(job.transport, job.batch)[0]).sum()
         ratios.append(download(plugin.shade(job).radiance).sum() / exact)
     assert abs(np.mean(ratios) - 1) < 3.5 * np.std(ratios, ddof=1) / np.sqrt(len(ratios)) + 1e-3
 

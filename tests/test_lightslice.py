@@ -176,7 +176,7 @@ def sampled(job, slices, shared=10**9):
     clusters = PointClusters(job.batch, lambda position, normal: build_slices(position, normal, slices))
     forest = DeviceForest(fine_forest(job.lights, shared), job.lights)
     points = clusters.tree.first[clusters.tree.leaves].astype(np.int64)
-    return clusters, SampledRows(job.scene, job.traits, clusters.batch, forest, points), points
+    return clusters, SampledRows(job.transport, clusters.batch, forest, points), points
 
 
 def column_of_each_light(forest, every):
@@ -249,7 +249,7 @@ def test_no_column_that_can_arrive_has_a_weight_of_zero(batch, shared, clamping)
     leaves = upload(mi.UInt32, clusters.tree.leaves)
     points = np.arange(0, clusters.count, clusters.count // 40)
     light = [
-        download(SampledRows(job.scene, job.traits, clusters.batch, every, points[k : k + 1]).values)
+        download(SampledRows(job.transport, clusters.batch, every, points[k : k + 1]).values)
         for k in range(len(points))
     ]
     column = column_of_each_light(rows.forest.forest, every.forest)

@@ -13,7 +13,7 @@ from vpl.cuts.product_cuts import Pairs
 from vpl.lights.virtual_lights import VirtualLights
 from vpl.points.camera_paths import scene_traits
 from vpl.points.point_clusters import PointClusters
-from vpl.transport.evaluation import sum_all_lights
+from vpl.transport.evaluation import Transport, sum_all_lights
 
 from .conftest import sensor, wall
 from .test_pairs import batch_of, lit_by
@@ -47,7 +47,7 @@ class Tiles:
         for name in turned:
             normal[tile == name] = [0, 0, -1]
         self.scene = mi.load_dict(scene)
-        self.traits = scene_traits(self.scene)
+        traits = scene_traits(self.scene)
         self.clusters = PointClusters(batch_of(position, normal))
         tree = self.clusters.tree
         tile, x = tile[tree.order], position[tree.order, 0]
@@ -61,6 +61,7 @@ class Tiles:
             VirtualLights.of(kind, None if kind == "environment" else place, down, np.full((lamps, 3), 1e8))
         )
         self.group = self.lights.groups[0]
+        self.transport = Transport(self.scene, traits, self.lights)
 
     def pairs_with_all_lights(self, nodes):
         """Pairs of some point nodes and the root of the lights."""
@@ -69,7 +70,7 @@ class Tiles:
     def decide(self, pairs):
         """Open and traced pairs as lists of (point node, light node), and rays per point."""
         rays = dr.zeros(mi.UInt32, self.clusters.count)
-        found = decide_visibility(self.scene, self.traits, self.lights, self.group, self.clusters, pairs, rays)
+        found = decide_visibility(self.transport, self.group, self.clusters, pairs, rays)
         return *found, download(rays)
 
     def points_of(self, pairs: Pairs):
@@ -101,9 +102,7 @@ def test_probes_tell_open_closed_and_mixed_pairs_apart(variant, kind):
     assert len(nodes) == 4
     rays = dr.zeros(mi.UInt32, place.clusters.count)
     union = pair_visibility._probe(
-        place.scene,
-        place.traits,
-        place.lights,
+        place.transport,
         place.group,
         place.clusters,
         place.pairs_with_all_lights(nodes),
@@ -128,8 +127,8 @@ def test_points_are_open_traced_or_dark_and_their_light_is_that_of_all_rays(kind
     assert 0 < rays.sum() < 0.5 * clusters.count
     row = dr.arange(mi.UInt32, clusters.count)
     lists = list_pairs(place.group, clusters, traced, opened)
-    ours, more = evaluate_lists(place.scene, place.traits, place.lights, place.group, clusters.batch, lists, row)
-    exact = sum_all_lights(place.scene, place.traits, place.lights, clusters.batch)[0]
+    ours, more = evaluate_lists(place.transport, place.group, clusters.batch, lists, row)
+    exact = sum_all_lights(place.transport, clusters.batch)[0]
     assert np.allclose(download(ours), download(exact), rtol=1e-4, atol=0)
     assert np.array_equal(download(more), asked), "one ray for each point of a pair that is traced, none for open ones"
     # Open and closed tiles are left to their probes but for leftovers; the veiled one never is, if it passes light
@@ -187,6 +186,7 @@ def test_coincident_points_are_divided_until_their_rays_are_traced():
     lights = lit_by(VirtualLights.of("oriented", [0, 0, 1] + rng.uniform(-0.1, 0.1, (8, 3)), down, np.ones((8, 3))))
     rays = dr.zeros(mi.UInt32, 500)
     pair = Pairs(dr.opaque(mi.UInt32, 0, 1), dr.opaque(mi.UInt32, 0, 1))
-    opened, traced = decide_visibility(scene, scene_traits(scene), lights, lights.groups[0], clusters, pair, rays)
+    transport = Transport(scene, scene_traits(scene), lights)
+    opened, traced = decide_visibility(transport, lights.groups[0], clusters, pair, rays)
     nodes = np.concatenate([download(part.points) for part in traced])
     assert opened == [] and clusters.tree.count[nodes].sum() == 500 and clusters.tree.count[nodes].max() < 32

@@ -275,14 +275,12 @@ def test_lists_are_evaluated_as_their_pairs_one_by_one(jobs, number):
             points, nodes = expanded(clusters, part)
             light, scale = group.representatives(upload(mi.UInt32, nodes))
             surface = clusters.batch.surfaces_at(upload(mi.UInt32, points))
-            value, asked = evaluate_pairs(
-                job.scene, job.traits, job.lights, group, surface, light, scale, mi.Bool(is_seen)
-            )
+            value, asked = evaluate_pairs(job.transport, group, surface, light, scale, mi.Bool(is_seen))
             np.add.at(expected, points, download(value).astype(np.float64))
             np.add.at(rays, points, download(dr.select(asked, mi.UInt32(1), 0)))
         for chosen, part in ((rows, clusters.batch.select(index)), (np.arange(clusters.count), clusters.batch)):
             lists = list_pairs(group, clusters, [traced], [seen])
-            found = evaluate_lists(job.scene, job.traits, job.lights, group, part, lists, upload(mi.UInt32, chosen))
+            found = evaluate_lists(job.transport, group, part, lists, upload(mi.UInt32, chosen))
             assert np.allclose(download(found[0]), expected[chosen], rtol=1e-4, atol=1e-5 * expected.mean())
             assert np.array_equal(download(found[1]), rays[chosen])
 
@@ -301,8 +299,8 @@ def test_lists_of_all_single_pairs_are_the_sum_of_all_lights(jobs, number, monke
         if found:
             lists = list_pairs(group, clusters, found, [])
             row = dr.arange(mi.UInt32, clusters.count)
-            total += download(evaluate_lists(job.scene, job.traits, job.lights, group, clusters.batch, lists, row)[0])
-    exact_sum = download(sum_all_lights(job.scene, job.traits, job.lights, clusters.batch)[0])
+            total += download(evaluate_lists(job.transport, group, clusters.batch, lists, row)[0])
+    exact_sum = download(sum_all_lights(job.transport, clusters.batch)[0])
     assert np.allclose(total, exact_sum, rtol=1e-4, atol=1e-6 * exact_sum.mean())
 
 

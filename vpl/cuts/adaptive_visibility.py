@@ -21,10 +21,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import add_at, even_chunks
-from ..lights.light_set import LightGroup, LightSet
-from ..points.camera_paths import SceneTraits
+from ..lights.light_set import LightGroup
 from ..points.point_clusters import PointClusters
-from ..transport.evaluation import probe_visibility
+from ..transport.evaluation import Transport, probe_visibility
 from .product_cuts import Pairs
 
 # Rays of pairs with fewer points are all traced; probes of larger ones, and of those above the limit
@@ -34,9 +33,7 @@ _PROBES_PER_KERNEL = 1 << 22
 _OPEN, _CLOSED = 1, 2
 
 
-def _probe(
-    scene, traits, lights: LightSet, group: LightGroup, clusters: PointClusters, pairs: Pairs, probes: int, rays
-):
+def _probe(transport: Transport, group: LightGroup, clusters: PointClusters, pairs: Pairs, probes: int, rays):
     """Trace ``probes`` rays for each pair, spread over its points: the union of _OPEN and _CLOSED per pair.
 
     ``rays``: array of counts per point, to which the traced ones are added.
@@ -48,7 +45,7 @@ def _probe(
     point = points.first + (2 * (lane % probes) + 1) * points.count // (2 * probes)
     surface = clusters.batch.surfaces_at(point)
     light, _ = group.representatives(dr.gather(mi.UInt32, pairs.lights, pair))
-    passed, votes = probe_visibility(scene, traits, lights, group, surface, light)
+    passed, votes = probe_visibility(transport, group, surface, light)
     found = dr.select(dr.all(passed == 1), mi.UInt32(_OPEN), dr.select(dr.any(passed > 0), _OPEN | _CLOSED, _CLOSED))
     union = dr.block_reduce(dr.ReduceOp.Or, dr.select(votes, found, 0), probes)
     add_at(rays, dr.select(votes, mi.UInt32(1), 0), point)
@@ -56,7 +53,7 @@ def _probe(
     return union
 
 
-def decide_visibility(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, clusters, pairs: Pairs, rays):
+def decide_visibility(transport: Transport, group: LightGroup, clusters, pairs: Pairs, rays):
     """Divide pairs into those whose light arrives at all points and those whose rays must be traced; drop the others.
 
     ``rays``: (n,) UInt32 counts per point along the tree; the probes are added.  Returns (open, traced) lists of
@@ -75,7 +72,7 @@ def decide_visibility(scene, traits: SceneTraits, lights: LightSet, group: Light
             chosen_pairs = pairs.select(dr.compress(chosen))
             for first, last in even_chunks(chosen_pairs.count, probes, _PROBES_PER_KERNEL):
                 part = chosen_pairs.slice(first, last - first)
-                union = _probe(scene, traits, lights, group, clusters, part, probes, rays)
+                union = _probe(transport, group, clusters, part, probes, rays)
                 opened.append(part.select(dr.compress(union == _OPEN)))
                 traced.append(part.select(dr.compress(union == 0)))
                 mixed = part.select(dr.compress(union == (_OPEN | _CLOSED)))

@@ -19,10 +19,9 @@ import numpy as np
 
 from ..core.arrays import NO_LIMIT, chunks, download, upload, upload_limit
 from ..lights.light_set import LightGroup, LightSet
-from ..points.camera_paths import SceneTraits
 from ..points.surfaces import Batch
 from ..transport.bounds import contribution_bound
-from ..transport.evaluation import evaluate_representatives
+from ..transport.evaluation import Transport, evaluate_representatives
 
 # Pairs that are shaded and traced at a time: bounds the memory whatever the size of image and cuts
 _PAIRS_PER_CHUNK = 1 << 22
@@ -204,7 +203,7 @@ def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
             yield CutChunk(group, part, points, offset, written, rows, nodes, visits)
 
 
-def evaluate_cuts(scene, traits: SceneTraits, lights: LightSet, batch: Batch, threshold, sizes: CutSizes, second=False):
+def evaluate_cuts(transport: Transport, batch: Batch, threshold, sizes: CutSizes, second=False):
     """Radiance of every point from its cut: representatives, scaled to the intensity of their clusters.
 
     ``second``: use the second representative of every cluster, for an estimate that another cut may depend on.
@@ -212,12 +211,10 @@ def evaluate_cuts(scene, traits: SceneTraits, lights: LightSet, batch: Batch, th
     """
     radiance = dr.zeros(mi.UnpolarizedSpectrum, batch.count)
     rays, visits = dr.zeros(mi.UInt32, batch.count), dr.zeros(mi.UInt32, batch.count)
-    for chunk in collect_cuts(lights, batch, threshold, sizes):
+    for chunk in collect_cuts(transport.lights, batch, threshold, sizes):
         tree = chunk.group.tree
         light, intensity = tree.representative(chunk.nodes, second=second), tree.summed_intensity(chunk.nodes)
-        value, traced = evaluate_representatives(
-            scene, traits, lights, chunk.group, chunk.batch, chunk.rows, light, intensity
-        )
+        value, traced = evaluate_representatives(transport, chunk.group, chunk.batch, chunk.rows, light, intensity)
         traced = dr.select(traced, mi.UInt32(1), mi.UInt32(0))
         dr.scatter_add(radiance, _sum_segments(value, chunk.offset, chunk.length), chunk.points)
         dr.scatter_add(rays, _sum_segments(traced, chunk.offset, chunk.length), chunk.points)
@@ -236,9 +233,7 @@ class Estimate:
     upper_bounds: object
 
 
-def estimate_radiance(
-    scene, traits: SceneTraits, lights: LightSet, batch: Batch, direct, mean: float, max_cut: int, stride: int
-) -> Estimate:
+def estimate_radiance(transport: Transport, batch: Batch, direct, mean: float, max_cut: int, stride: int) -> Estimate:
     """Coarse cuts at every ``stride``-th point, averaged, with the direct light of all, over the blocks of 2 strides.
 
     Points should lie along a curve, so that those of a block are neighbours.  ``direct``: radiance per point that is
@@ -249,9 +244,9 @@ def estimate_radiance(
     index = upload(mi.UInt32, rows)
     part = batch.select(index)
     threshold = dr.opaque(mi.Float, _ESTIMATE_ERROR * mean, len(rows))
-    threshold, sizes, searched = limited_cuts(lights, part, threshold, max_cut)
+    threshold, sizes, searched = limited_cuts(transport.lights, part, threshold, max_cut)
     # Second representatives: the thresholds must not depend on the lights that the final cuts are made of
-    radiance, rays, collected = evaluate_cuts(scene, traits, lights, part, threshold, sizes, second=True)
+    radiance, rays, collected = evaluate_cuts(transport, part, threshold, sizes, second=True)
     reflected = np.repeat(download(radiance).mean(1, dtype=np.float64), stride)[:count]
     level = block_mean(reflected + download(direct).mean(1, dtype=np.float64), 2 * stride)
     estimate = Estimate(level, *(dr.zeros(mi.UInt32, count) for _ in range(2)))

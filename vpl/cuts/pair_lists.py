@@ -15,12 +15,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import download, upload
-from ..lights.light_set import LightGroup, LightSet
-from ..points.camera_paths import SceneTraits
+from ..lights.light_set import LightGroup
 from ..points.point_clusters import PointClusters
 from ..points.point_tree import PointTree
 from ..points.surfaces import Batch
-from ..transport.evaluation import evaluate_pairs
+from ..transport.evaluation import Transport, evaluate_pairs
 from .product_cuts import Pairs
 
 # The bit of a light node's index that marks it as seen by all points of the pair
@@ -92,7 +91,7 @@ def _paths(tree: PointTree, filled: np.ndarray):
 
 
 @dr.syntax
-def evaluate_lists(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, batch: Batch, lists, rows):
+def evaluate_lists(transport: Transport, group: LightGroup, batch: Batch, lists, rows):
     """Light of a group at the points of a batch, and shadow rays traced for each: (radiance, rays).
 
     ``rows``: where each point of the batch lies along the tree that ``lists`` (:class:`PairLists`) belong to.
@@ -103,11 +102,11 @@ def evaluate_lists(scene, traits: SceneTraits, lights: LightSet, group: LightGro
     j, last = dr.gather(mi.UInt32, lists.path_start, rows), dr.gather(mi.UInt32, lists.path_end, rows)
     node = dr.gather(mi.UInt32, lists.path, j, j < last)
     k, end = dr.gather(mi.UInt32, lists.start, node, j < last), dr.gather(mi.UInt32, lists.end, node, j < last)
-    while dr.hint(k < end, exclude=[traits, lights, group, surface, lists]):
+    while dr.hint(k < end, exclude=[transport, group, surface, lists]):
         entry, scale = dr.gather(mi.UInt32, lists.lights, k), dr.gather(mi.Float, lists.scales, k)
         seen = (entry & _SEEN) != 0 if lists.any_seen else None
         light = group.lights.gather(entry & ~mi.UInt32(_SEEN))
-        value, traced = evaluate_pairs(scene, traits, lights, group, surface, light, scale, seen)
+        value, traced = evaluate_pairs(transport, group, surface, light, scale, seen)
         radiance += value
         rays += dr.select(traced, 1, 0)
         k += 1

@@ -17,11 +17,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import add_at, channel_mean, download, upload
-from ..lights.light_set import LightGroup, LightSet
+from ..lights.light_set import LightGroup
 from ..lights.virtual_lights import AT_INFINITY
-from ..points.camera_paths import SceneTraits
 from ..points.point_clusters import PointClusters
-from ..transport.evaluation import evaluate_pairs
+from ..transport.evaluation import Transport, evaluate_pairs
 from .product_cuts import find_pairs, in_batches
 
 # Pairs that are shaded and traced at a time
@@ -54,9 +53,7 @@ def _coarse_enough(clusters: PointClusters, group: LightGroup, negligible: float
     return accept
 
 
-def approximate_radiance(
-    scene, traits: SceneTraits, lights: LightSet, clusters: PointClusters, negligible: float, generator, counter
-):
+def approximate_radiance(transport: Transport, clusters: PointClusters, negligible: float, generator, counter):
     """Light at every node of the point tree, as the mean over channels: its own pairs' and its ancestors'.
 
     One point and one light stand for each pair: the light is the second representative of its cluster, so that what
@@ -70,14 +67,14 @@ def approximate_radiance(
     stand_in = upload(mi.UInt32, tree.first + np.minimum(drawn, tree.count - 1))
     radiance, rays = dr.zeros(mi.Float, tree.size), dr.zeros(mi.UInt32, clusters.count)
     dr.eval(radiance, rays)
-    for group in lights.groups:
+    for group in transport.lights.groups:
         criterion = _coarse_enough(clusters, group, negligible)
         # Many steps of the search at a time: a kernel for each would cost more than its rays
-        for part in in_batches(find_pairs(clusters, lights, group, criterion, counter), _PAIRS_PER_KERNEL):
+        for part in in_batches(find_pairs(clusters, transport.lights, group, criterion, counter), _PAIRS_PER_KERNEL):
             point = dr.gather(mi.UInt32, stand_in, part.points)
             surface = clusters.batch.surfaces_at(point)
             light, scale = group.representatives(part.lights, second=True)
-            value, traced = evaluate_pairs(scene, traits, lights, group, surface, light, scale)
+            value, traced = evaluate_pairs(transport, group, surface, light, scale)
             add_at(radiance, channel_mean(value), part.points)
             add_at(rays, dr.select(traced, mi.UInt32(1), 0), point)
             dr.eval(radiance, rays)

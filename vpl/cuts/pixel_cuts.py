@@ -20,10 +20,9 @@ import numpy as np
 
 from ..core.arrays import add_at, channel_mean, download, upload
 from ..core.sampling import derived_seed, find_interval, independent_sampler, running_sums
-from ..lights.light_set import LightGroup, LightSet
-from ..points.camera_paths import SceneTraits
+from ..lights.light_set import LightGroup
 from ..points.point_clusters import PointClusters
-from ..transport.evaluation import evaluate_pairs
+from ..transport.evaluation import Transport, evaluate_pairs
 from .light_cuts import upload_thresholds
 from .product_cuts import Pairs
 
@@ -76,13 +75,13 @@ class PixelCuts:
 
         return accept, points_first
 
-    def evaluate(self, scene, traits: SceneTraits, lights: LightSet, group: LightGroup, pairs: Pairs) -> None:
+    def evaluate(self, transport: Transport, group: LightGroup, pairs: Pairs) -> None:
         """Add the light of accepted pairs: one point and one light stand for each."""
         self._kernels += 1
         point, factor = self._representative(pairs)
         light, scale = group.representatives(pairs.lights)
         surface = self.clusters.batch.surfaces_at(point)
-        value, traced = evaluate_pairs(scene, traits, lights, group, surface, light, scale)
+        value, traced = evaluate_pairs(transport, group, surface, light, scale)
         value = mi.UnpolarizedSpectrum(value * factor)
         bad = ~dr.all(dr.isfinite(value))
         add_at(self._light, dr.select(bad, 0, value), pairs.points)

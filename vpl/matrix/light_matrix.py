@@ -17,11 +17,10 @@ import numpy as np
 from ..core.arrays import channel_mean, even_chunks, finite_or_zero, upload
 from ..core.sampling import running_sums
 from ..lights.light_set import LightSet
-from ..points.camera_paths import SceneTraits
 from ..points.point_clusters import PointClusters
 from ..points.surfaces import Batch
 from ..transport.bounds import contribution_bound
-from ..transport.evaluation import evaluate_pairs
+from ..transport.evaluation import Transport, evaluate_pairs
 from .column_forest import ColumnForest
 
 # What a bound counts for at most, relative to the light that was seen; and what float32 still squares or adds up
@@ -80,7 +79,7 @@ class SampledRows:
     ``sums``: Float, of the columns of every node, row by row; ``rays``: shadow rays that were traced for them.
     """
 
-    def __init__(self, scene, traits: SceneTraits, batch: Batch, forest: DeviceForest, points: np.ndarray):
+    def __init__(self, transport: Transport, batch: Batch, forest: DeviceForest, points: np.ndarray):
         self.forest, self.count, self.rays = forest, len(points), 0
         index = upload(mi.UInt32, points)
 
@@ -88,7 +87,7 @@ class SampledRows:
             """Mean over channels, with visibility."""
             surface = batch.surfaces_at(dr.gather(mi.UInt32, index, row))
             light, scale = group.representatives(node)
-            value, traced = evaluate_pairs(scene, traits, forest.lights, group, surface, light, scale)
+            value, traced = evaluate_pairs(transport, group, surface, light, scale)
             # One value that is not finite would spoil the sums of all that follow
             value, traced = channel_mean(finite_or_zero(value)), dr.select(traced, mi.UInt32(1), 0)
             dr.eval(value, traced)

@@ -14,11 +14,10 @@ import numpy as np
 
 from ..core.arrays import channel_mean, download, upload
 from ..core.sampling import HASH_ROUNDS
-from ..lights.light_set import LightGroup, LightSet
-from ..points.camera_paths import SceneTraits
+from ..lights.light_set import LightGroup
 from ..points.point_clusters import PointClusters, unit_or_up
 from ..points.slice_rows import golden_steps, rows_of, tangent_places
-from ..transport.evaluation import probe_visibility, unoccluded
+from ..transport.evaluation import Transport, probe_visibility, unoccluded
 
 
 class MatrixRows:
@@ -131,10 +130,10 @@ class Columns:
 class MatrixEntries:
     """Evaluates entries: E without rays, V with them; ``rays``: how many were traced."""
 
-    def __init__(self, scene, traits: SceneTraits, lights: LightSet, rows: MatrixRows):
-        self._scene, self._traits, self.lights, self.rows, self.rays = scene, traits, lights, rows, 0
+    def __init__(self, transport: Transport, rows: MatrixRows):
+        self._transport, self.lights, self.rows, self.rays = transport, transport.lights, rows, 0
         # Of the light trees, of NumPy
-        self.records = [group.tree.records() for group in lights.groups]
+        self.records = [group.tree.records() for group in self.lights.groups]
 
     def columns_of(self, piece, group: int, node) -> Columns:
         """Columns with the representatives of some nodes."""
@@ -186,7 +185,7 @@ class MatrixEntries:
         """
         surface = self.rows.random_surface(row, number, active)
         light = group.lights.gather(light, active)
-        passed, asked = probe_visibility(self._scene, self._traits, self.lights, group, surface, light, active)
+        passed, asked = probe_visibility(self._transport, group, surface, light, active)
         passed = channel_mean(passed)
         dr.eval(passed, asked)
         self.rays += int(dr.count(asked)[0])

@@ -22,9 +22,9 @@ from ..core.arrays import channel_mean, download, even_chunks, upload
 from ..core.sampling import derived_seed, find_interval, independent_sampler
 from ..lights.light_set import LightGroup, LightSet
 from ..lights.light_tree import ESCAPE, DeviceTree, cluster_sizes
-from ..points.camera_paths import SceneTraits
 from ..points.point_clusters import PointClusters
 from ..points.slices import six_dimensional
+from ..transport.evaluation import Transport
 from .column_forest import ColumnForest, split_threshold
 from .light_matrix import ColumnWeights, DeviceForest, NearRows, SampledRows
 
@@ -82,18 +82,18 @@ def fine_forest(lights: LightSet, most: int) -> ColumnForest:
 
 
 def shared_columns(
-    scene, traits: SceneTraits, lights: LightSet, clusters: PointClusters, points: np.ndarray, most: int, seed: int
+    transport: Transport, clusters: PointClusters, points: np.ndarray, most: int, seed: int
 ) -> tuple[ColumnForest, int, int]:
     """At most ``most`` clusters of lights that all slices share [LS: global clustering], rays and bounds spent on them.
 
     ``points``: one of each slice, along the slices; at some of them, drawn at random, rows are sampled.
     """
-    fine = fine_forest(lights, _FINE * most)
+    fine = fine_forest(transport.lights, _FINE * most)
     if len(fine.columns) <= most:
         return fine, 0, 0
-    forest = DeviceForest(fine, lights)
+    forest = DeviceForest(fine, transport.lights)
     points = np.random.default_rng(seed).permutation(points)[: max(round(_DECIDING * len(points)), 1)]
-    rows = SampledRows(scene, traits, clusters.batch, forest, points)
+    rows = SampledRows(transport, clusters.batch, forest, points)
     rows.balance()
     weights = ColumnWeights(rows, NearRows.all_of(rows.count), clusters, dr.zeros(mi.UInt32, 1), _SHARED_UNSEEN)
     return fine.pruned(download(weights.cost), most), rows.rays, forest.columns

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
@@ -16,39 +18,47 @@ from .contribution import contribution, shadow_ray, transmittance
 _LIGHTS_PER_KERNEL = 4096
 
 
-def evaluate_pairs(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface, light, scale, seen=None):
+@dataclass(frozen=True)
+class Transport:
+    """Context of all that is evaluated: the ``scene``, the ``traits`` of its surfaces, and the ``lights`` of a render.
+
+    Functions that work on the lights of one kind take their ``group`` besides.
+    """
+
+    scene: object
+    traits: SceneTraits
+    lights: LightSet
+
+
+def evaluate_pairs(transport: Transport, group: LightGroup, surface, light, scale, seen=None):
     """Shade one (surface, light) pair per lane and trace its shadow ray, unless nothing would arrive.
 
     ``light``: lights gathered from ``group``; ``scale``: factor on their intensity; ``seen``: lanes whose light is
     taken to arrive without a ray (None: none).  Returns (radiance with visibility, mask of the lanes whose ray was
     traced).
     """
-    value = unoccluded(lights, group, surface, light) * scale
+    value = unoccluded(transport.lights, group, surface, light) * scale
     arrives = dr.any(value > 0)
     traced = arrives if seen is None else arrives & ~seen
-    passed = _visibility(scene, traits, group, surface, light, traced)
+    passed = _visibility(transport, group, surface, light, traced)
     if seen is not None:
         passed = dr.select(seen, 1, passed)
     return dr.select(arrives, value * passed, 0), traced
 
 
-def evaluate_representatives(
-    scene, traits: SceneTraits, lights: LightSet, group: LightGroup, batch: Batch, rows, light, intensity
-):
+def evaluate_representatives(transport: Transport, group: LightGroup, batch: Batch, rows, light, intensity):
     """Shade and trace pairs of ``rows`` of a batch and lights of a group, each of which stands for a cluster.
 
     ``light``: their indices; ``intensity``: of the clusters, the mean over channels.  However the pairs were chosen,
     this is the same kernel, compiled once.  Returns as :func:`evaluate_pairs`, evaluated.
     """
     dr.eval(rows, light, intensity)
-    value, traced = evaluate_pairs(
-        scene, traits, lights, group, batch.surfaces_at(rows), *group.standing_for(light, intensity)
-    )
+    value, traced = evaluate_pairs(transport, group, batch.surfaces_at(rows), *group.standing_for(light, intensity))
     dr.eval(value, traced)
     return value, traced
 
 
-def evaluate_one_of(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface, candidates: list, number):
+def evaluate_one_of(transport: Transport, group: LightGroup, surface, candidates: list, number):
     """Shade several lights that stand for the same cluster, and trace the ray of one, drawn by what they would send.
 
     ``candidates``: (light, factor on its intensity) pairs, any of which alone would do; ``number``: UInt32 that differs
@@ -57,34 +67,32 @@ def evaluate_one_of(scene, traits: SceneTraits, lights: LightSet, group: LightGr
     """
     (light, scale), *others = candidates
     if not others:
-        return evaluate_pairs(scene, traits, lights, group, surface, light, scale)
-    value = unoccluded(lights, group, surface, light) * scale
+        return evaluate_pairs(transport, group, surface, light, scale)
+    value = unoccluded(transport.lights, group, surface, light) * scale
     strength = channel_mean(value)
     total = mi.Float(strength)
     for k, (other, scale) in enumerate(others):
-        new = unoccluded(lights, group, surface, other) * scale
+        new = unoccluded(transport.lights, group, surface, other) * scale
         new_strength = channel_mean(new)
         total += new_strength
         taken = mi.sample_tea_float32(number, mi.UInt32(k)) * total < new_strength
         value, strength = dr.select(taken, new, value), dr.select(taken, new_strength, strength)
         light = select_record(taken, other, light)
     arrives = strength > 0
-    passed = _visibility(scene, traits, group, surface, light, arrives)
+    passed = _visibility(transport, group, surface, light, arrives)
     # The strength of the light that was drawn cancels, but for its colour
     share = total / (strength * len(candidates))
     return dr.select(arrives, value * passed * share, 0), arrives
 
 
-def probe_visibility(
-    scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface: Surface, light, active=True
-):
+def probe_visibility(transport: Transport, group: LightGroup, surface: Surface, light, active=True):
     """The fraction of light that arrives, (surface, light) pair by pair, where any would if nothing was between.
 
     Returns (fraction, mask of the lanes for which it was asked).
     """
-    traced = dr.any(unoccluded(lights, group, surface, light) > 0) & active
+    traced = dr.any(unoccluded(transport.lights, group, surface, light) > 0) & active
     # Always of several channels: all() and any() over those of one would run over the lanes
-    return mi.UnpolarizedSpectrum(_visibility(scene, traits, group, surface, light, traced)), traced
+    return mi.UnpolarizedSpectrum(_visibility(transport, group, surface, light, traced)), traced
 
 
 def unoccluded(lights: LightSet, group: LightGroup, surface: Surface, light):
@@ -93,13 +101,13 @@ def unoccluded(lights: LightSet, group: LightGroup, surface: Surface, light):
     return contribution(group.kind, surface, light, lights.smallest_distance, allowed)
 
 
-def _visibility(scene, traits: SceneTraits, group: LightGroup, surface: Surface, light, active):
+def _visibility(transport: Transport, group: LightGroup, surface: Surface, light, active):
     ray = shadow_ray(group.kind, surface.interaction, light)
-    return transmittance(scene, traits, group.kind, ray, active)
+    return transmittance(transport.scene, transport.traits, group.kind, ray, active)
 
 
 @dr.syntax
-def sum_lights(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface: Surface, first, last, pick):
+def sum_lights(transport: Transport, group: LightGroup, surface: Surface, first, last, pick):
     """Sum over the numbers first .. last - 1 of every surface, in step: (radiance, shadow rays per surface).
 
     ``surface``: evaluated; ``pick``: function of a number to the candidates of :func:`evaluate_one_of`.
@@ -108,9 +116,9 @@ def sum_lights(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, 
     lane = dr.arange(mi.UInt32, count)
     j, end = mi.UInt32(first), mi.UInt32(last)
     radiance, rays = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UInt32, count)
-    while dr.hint(j < end, exclude=[traits, lights, group, surface, pick]):
+    while dr.hint(j < end, exclude=[transport, group, surface, pick]):
         number, _ = mi.sample_tea_32(lane, j)
-        value, traced = evaluate_one_of(scene, traits, lights, group, surface, pick(j), number)
+        value, traced = evaluate_one_of(transport, group, surface, pick(j), number)
         radiance += value
         rays += dr.select(traced, 1, 0)
         j += 1
@@ -118,32 +126,32 @@ def sum_lights(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, 
     return radiance, rays
 
 
-def sum_all_lights(scene, traits: SceneTraits, lights: LightSet, batch: Batch, stopped=lambda: False):
+def sum_all_lights(transport: Transport, batch: Batch, stopped=lambda: False):
     """Every light at every point of a batch: the oracle of all methods.
 
     ``stopped``: asked between kernels; once true the sum ends early.  Returns (radiance, shadow rays per point).
     """
     precise = dr.float64_array_t(mi.UnpolarizedSpectrum)
     total, rays = dr.zeros(precise, batch.count), dr.zeros(mi.UInt32, batch.count)
-    for group in lights.groups:
+    for group in transport.lights.groups:
         for first, last in even_chunks(group.count, most=_LIGHTS_PER_KERNEL):
             if stopped():
                 break
             begin, end = dr.opaque(mi.UInt32, first, batch.count), dr.opaque(mi.UInt32, last)
-            radiance, traced = sum_lights(scene, traits, lights, group, batch.surfaces, begin, end, group.pick)
+            radiance, traced = sum_lights(transport, group, batch.surfaces, begin, end, group.pick)
             total += precise(radiance)
             rays += traced
             dr.eval(total, rays)
     return mi.UnpolarizedSpectrum(total), rays
 
 
-def mean_radiance(scene, traits: SceneTraits, lights: LightSet, batch: Batch, seed: int, count: int = 1 << 15) -> float:
-    """Mean over points and channels of the light of ``lights``, from ``count`` random pairs per group.
+def mean_radiance(transport: Transport, batch: Batch, seed: int, count: int = 1 << 15) -> float:
+    """Mean over points and channels of the light of all lights, from ``count`` random pairs per group.
 
     Points are drawn uniformly, lights by intensity; the result only sets the scale of thresholds.
     """
     total = 0.0
-    for group in lights.groups:
+    for group in transport.lights.groups:
         choice = Choice(group.lights.scalar_intensity)
         sampler = independent_sampler(seed, count)
         points = dr.opaque(mi.UInt32, batch.count)
@@ -151,6 +159,6 @@ def mean_radiance(scene, traits: SceneTraits, lights: LightSet, batch: Batch, se
         index = choice.row(sampler.next_1d())
         # Drawn by intensity, each of them stands for all
         everything = dr.opaque(mi.Float, float(group.lights.scalar_intensity.sum()), count)
-        value, _ = evaluate_representatives(scene, traits, lights, group, batch, row, mi.UInt32(index), everything)
+        value, _ = evaluate_representatives(transport, group, batch, row, mi.UInt32(index), everything)
         total += float(download(value).mean(dtype="float64"))
     return total
