@@ -207,7 +207,7 @@ class _BatchLight:
             yield groups[first:last]
 
     def _light(self, groups, summed: bool, level, seed, halted):
-        """Light some groups: (their sites, what :meth:`SitePasses.result` says of them)."""
+        """Light some groups: (their sites, what :meth:`SiteEstimates.result` says of them)."""
         single = summed or self._single
         part, cuts = self.sites.select(groups), self._cut(groups, 0.0) if single else self._cuts.select(groups)
         scenery, share, bsdf = self._task(part, cuts, groups)

@@ -22,7 +22,7 @@ _LEAST_ROUNDS = 2  # of each half, before their difference is believed
 class SourceRounds:
     """Rounds of summing over all sources for the sites of a table whose clusters are single sources.
 
-    Other arguments as in :class:`vpl.direct.passes.SitePasses`, and so is :meth:`result`.
+    Other arguments as in :class:`vpl.direct.passes.SiteEstimates`, and so is :meth:`result`.
     """
 
     def __init__(self, scenery: Scenery, sites: Sites, share, bsdf_share, level: float, options):

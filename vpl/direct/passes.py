@@ -31,52 +31,26 @@ _LEAST_VARIANCE = 0.01  # of a pass, relative to the mean over sites, where pass
 _UNIFORM_SHARE, _BLOCK_DECAY = 0.1, 0.7
 
 
-class SitePasses:
-    """The passes over the sites of ``table``.
+class SiteEstimates:
+    """Estimates of both halves of each site, what they took, and what they need to converge.
 
-    ``share`` (s,): of its pixel's camera rays, those that belong to a site; ``bsdf_share`` (s,): BSDF samples for each
-    emitter sample; ``level``: mean radiance of the image, which ``options.dark_floor`` is relative to.
+    ``scenery``: with a table of s sites; ``share`` (s,): of its pixel's camera rays, those that belong to a site;
+    ``bsdf_share`` (s,): BSDF samples for each emitter sample; ``level``: mean radiance of the image, which
+    ``options.dark_floor`` is relative to.
     """
 
     def __init__(self, scenery: Scenery, share, bsdf_share, level: float, options):
         self.scenery, self.share, self.bsdf_share = scenery, share, bsdf_share
-        self.level, self.options, self.max_passes = level, options, options.max_passes
+        self.level, self.options = level, options
         table = scenery.table
-        self.size, self.cut = (download(column).astype(np.int64) for column in (table.size, table.cut))
+        self.size = download(table.size).astype(np.int64)
         count = table.count
         # Per half and site: sums of weighted estimates, of weights, and of squared weights times variances
         self.total, self.weight, self.spread = np.zeros((2, count, 3)), np.zeros((2, count)), np.zeros((2, count))
         self.samples, self.seen = np.zeros((2, count), np.int64), np.zeros((2, count), np.int64)
         self.tried, self.rays, self.passes = np.zeros(count), np.zeros(count), np.zeros(count, np.int64)
 
-    def run(self, two_sided, seed: int, halted: Callable[[int], bool]) -> None:
-        """Sample until all sites are done.
-
-        ``two_sided``: Bool per point of the batch, lit from both sides; ``halted``: asked before every pass.
-        """
-        scenery, table = self.scenery, self.scenery.table
-        if table.entries == 0:
-            return
-        scenery.importance = dr.ones(mi.Float, table.entries)
-        dr.eval(scenery.importance)
-        if self.options.evaluated:
-            update_importance(scenery, two_sided, dr.arange(mi.UInt32, table.count))
-        scenery.statistics = Statistics.empty(table.entries)
-        scenery.probability = dr.empty(mi.Float, table.entries)
-        of_groups = tuple(dr.zeros(mi.Float, dr.width(table.node)) for _ in range(3))
-        wanted = self._full_pass()
-        for number in range(self.max_passes):
-            active = np.flatnonzero(wanted.any(0))
-            if len(active) == 0 or halted(number):
-                break
-            sum_over_groups(table, scenery.statistics, of_groups, upload(mi.UInt32, self._places(active)))
-            update_probabilities(scenery, of_groups, self._mixture(number), upload(mi.UInt32, active))
-            # That later passes are better, but not by how much, is all that the square root assumes [Owen and
-            # Zhou 2020, "The square root rule for adaptive importance sampling"]
-            self._draw(wanted, number, np.sqrt(number + 1.0), derived_seed(seed, number))
-            wanted = self._wanted(number)
-
-    def _draw(self, wanted: np.ndarray, number: int, weight: float, seed: int) -> None:
+    def draw(self, wanted: np.ndarray, number: int, weight: float, seed: int) -> None:
         """Take ``wanted`` samples of each half and site, (2, s), and add what they find.
 
         Estimates are weighted by their samples times ``weight``.  Weights that do not depend on what was found leave
@@ -104,20 +78,7 @@ class SitePasses:
         self.passes[site] = number + 1
         np.add.at(self.rays, site, download(drawn.rays))
 
-    def _places(self, active: np.ndarray) -> np.ndarray:
-        """Where the nodes of the cuts of some sites' groups are."""
-        first, at = np.unique(self.cut[active], return_index=True)
-        return ranges(first, self.size[active[at]])
-
-    def _mixture(self, number: int) -> Mixture:
-        """Shares of the three functions in a pass [IAS fig. 2]: first uniform, then mostly the block's, more and more
-        the pixel's."""
-        uniform = 1.0 if number == 0 else _UNIFORM_SHARE
-        pixel = (1 - uniform) * (1 - _BLOCK_DECAY**number)
-        shares = (uniform, 1 - uniform - pixel, pixel, self.options.prior)
-        return Mixture(*(dr.opaque(mi.Float, share) for share in shares))
-
-    def _full_pass(self) -> np.ndarray:
+    def full_pass(self) -> np.ndarray:
         """Samples of each half in a whole pass [IAS section 5.8], (2, s); 0 for sites that no cluster lights."""
         options = self.options
         of_pixel = np.clip(options.samples_per_cluster * self.size, options.least_samples, options.most_samples)
@@ -125,19 +86,19 @@ class SitePasses:
         half = np.maximum(np.ceil(of_pixel * self.share / 2).astype(np.int64), _LEAST_HALF)
         return np.where(self.size > 0, half, 0) * np.ones((2, 1), np.int64)
 
-    def _estimates(self):
+    def halves(self):
         """(Radiance (2, s, 3), variance of its mean over channels (2, s)) of both halves."""
         weight = np.where(self.weight > 0, self.weight, 1)
         return self.total / weight[..., None], self.spread / np.square(weight)
 
-    def _wanted(self, number: int) -> np.ndarray:
-        """Samples that each half takes in the next pass, (2, s), as the other half has it.
+    def wanted(self, number: int, radiance: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        """Samples that each half takes in the next pass, (2, s), as the other half has it; ``radiance``, ``variance``:
+        as of :meth:`halves`.
 
         [IAS section 4.2] compares s² / L² with a threshold; here the squared radiance gets a floor, and a site that is
         only a part of its pixel may be noisier accordingly.
         """
-        options, full = self.options, self._full_pass()
-        radiance, variance = self._estimates()
+        options, full = self.options, self.full_pass()
         level = radiance.mean(2)
         allowed = options.error**2 * (np.square(level) + (options.dark_floor * self.level) ** 2) / self.share
         # What the variance of the other half would be if it was as good as this one, and of the mean of both
@@ -155,9 +116,9 @@ class SitePasses:
         left = np.floor(options.max_samples * self.share / 2 - self.samples).astype(np.int64)
         return np.where(left >= _LEAST_HALF, np.minimum(wanted, left), 0)
 
-    def result(self):
-        """Per site: radiance (s, 3), its estimated variance, passes, rays, and the share of samples that saw light."""
-        radiance, variance = self._estimates()
+    def result(self, radiance: np.ndarray, variance: np.ndarray):
+        """Per site: radiance (s, 3), its estimated variance, passes, rays, and the share of samples that saw light;
+        ``radiance``, ``variance``: as of :meth:`halves`."""
         # A half that was stopped before its first sample leaves the other
         counted = self.weight > 0
         halves = np.maximum(counted.sum(0), 1)
@@ -166,3 +127,56 @@ class SitePasses:
             mean, np.where(counted, variance, 0).sum(0) / np.square(halves), self.passes, self.rays,
             self.seen.sum(0) / np.maximum(self.tried, 1),
         )  # fmt: skip
+
+
+class SitePasses:
+    """The passes over the sites of a table, which learn from one another.  Arguments as in :class:`SiteEstimates`."""
+
+    def __init__(self, scenery: Scenery, share, bsdf_share, level: float, options):
+        self.estimates = SiteEstimates(scenery, share, bsdf_share, level, options)
+        self.scenery, self.options, self.max_passes = scenery, options, options.max_passes
+        self._cut = download(scenery.table.cut).astype(np.int64)
+
+    def run(self, two_sided, seed: int, halted: Callable[[int], bool]) -> None:
+        """Sample until all sites are done.
+
+        ``two_sided``: Bool per point of the batch, lit from both sides; ``halted``: asked before every pass.
+        """
+        scenery, table, estimates = self.scenery, self.scenery.table, self.estimates
+        if table.entries == 0:
+            return
+        scenery.importance = dr.ones(mi.Float, table.entries)
+        dr.eval(scenery.importance)
+        if self.options.evaluated:
+            update_importance(scenery, two_sided, dr.arange(mi.UInt32, table.count))
+        scenery.statistics = Statistics.empty(table.entries)
+        scenery.probability = dr.empty(mi.Float, table.entries)
+        of_groups = tuple(dr.zeros(mi.Float, dr.width(table.node)) for _ in range(3))
+        wanted = estimates.full_pass()
+        for number in range(self.max_passes):
+            active = np.flatnonzero(wanted.any(0))
+            if len(active) == 0 or halted(number):
+                break
+            sum_over_groups(table, scenery.statistics, of_groups, upload(mi.UInt32, self._places(active)))
+            update_probabilities(scenery, of_groups, self._mixture(number), upload(mi.UInt32, active))
+            # That later passes are better, but not by how much, is all that the square root assumes [Owen and
+            # Zhou 2020, "The square root rule for adaptive importance sampling"]
+            estimates.draw(wanted, number, np.sqrt(number + 1.0), derived_seed(seed, number))
+            wanted = estimates.wanted(number, *estimates.halves())
+
+    def _places(self, active: np.ndarray) -> np.ndarray:
+        """Where the nodes of the cuts of some sites' groups are."""
+        first, at = np.unique(self._cut[active], return_index=True)
+        return ranges(first, self.estimates.size[active[at]])
+
+    def _mixture(self, number: int) -> Mixture:
+        """Shares of the three functions in a pass [IAS fig. 2]: first uniform, then mostly the block's, more and more
+        the pixel's."""
+        uniform = 1.0 if number == 0 else _UNIFORM_SHARE
+        pixel = (1 - uniform) * (1 - _BLOCK_DECAY**number)
+        shares = (uniform, 1 - uniform - pixel, pixel, self.options.prior)
+        return Mixture(*(dr.opaque(mi.Float, share) for share in shares))
+
+    def result(self):
+        """See :meth:`SiteEstimates.result`."""
+        return self.estimates.result(*self.estimates.halves())

@@ -15,24 +15,25 @@ import numpy as np
 from ..core.arrays import download, upload
 from ..core.sampling import derived_seed
 from .cluster_probabilities import Mixture, update_importance, update_probabilities
-from .passes import SitePasses
+from .passes import SiteEstimates
 from .site_table import Statistics
 
 _LEAST_PASSES = 4  # of each half: fewer say nothing about the variance between points
 
 
-class UnoccludedPasses(SitePasses):
+class UnoccludedPasses:
     """Passes over one point of every site after another.  ``options.least_samples`` and ``most_samples``:
-    emitter samples at each."""
+    emitter samples at each.  Other arguments as in :class:`vpl.direct.passes.SiteEstimates`."""
 
     def __init__(self, scenery, share, bsdf_share, level, options):
-        super().__init__(scenery, share, bsdf_share, level, options)
+        self.estimates = SiteEstimates(scenery, share, bsdf_share, level, options)
+        self.scenery, self.options = scenery, options
         self.several = download(scenery.table.members) > 1
         # Sums over the passes of each half and site: their means, squares of these, and how many there were
         self.levels, self.squares, self.done = (np.zeros((2, len(share))) for _ in range(3))
 
     def run(self, two_sided, seed: int, halted) -> None:
-        """Sample until all sites are done.  Arguments as in :class:`SitePasses`."""
+        """Sample until all sites are done.  Arguments as in :meth:`vpl.direct.passes.SitePasses.run`."""
         whole = self.scenery.table
         if whole.entries == 0:
             return
@@ -42,8 +43,8 @@ class UnoccludedPasses(SitePasses):
         self.scenery.statistics = Statistics.empty(whole.entries)
         nothing = tuple(dr.zeros(mi.Float, dr.width(whole.node)) for _ in range(3))
         mixture = Mixture(*(dr.opaque(mi.Float, share) for share in (1.0, 0.0, 0.0, 1.0)))
-        wanted = self._full_pass()
-        for number in range(self.max_passes):
+        wanted = self.estimates.full_pass()
+        for number in range(self.options.max_passes):
             active = np.flatnonzero(wanted.any(0))
             if len(active) == 0 or halted(number):
                 break
@@ -55,7 +56,7 @@ class UnoccludedPasses(SitePasses):
                     changed = changed[members[changed] > 1]
                 self._stand_on(whole, first + member, changed, two_sided, nothing, mixture)
                 self._draw_half(wanted, half, number, derived_seed(seed, number, half))
-            wanted = self._wanted(number)
+            wanted = self.estimates.wanted(number, *self._halves())
 
     def _stand_on(self, whole, place, changed, two_sided, nothing, mixture) -> None:
         """Take one point of every site, and make the densities of the sites ``changed``; others keep theirs."""
@@ -71,18 +72,22 @@ class UnoccludedPasses(SitePasses):
         taken = wanted[half]
         if not taken.any():
             return
-        before = self.total[half].mean(1)
-        self._draw(np.where(np.arange(2)[:, None] == half, wanted, 0), number, 1.0, seed)
-        found = np.where(taken > 0, (self.total[half].mean(1) - before) / np.maximum(taken, 1), 0)
+        before = self.estimates.total[half].mean(1)
+        self.estimates.draw(np.where(np.arange(2)[:, None] == half, wanted, 0), number, 1.0, seed)
+        found = np.where(taken > 0, (self.estimates.total[half].mean(1) - before) / np.maximum(taken, 1), 0)
         self.levels[half] += found
         self.squares[half] += np.square(found)
         self.done[half] += taken > 0
 
-    def _estimates(self):
+    def _halves(self):
         """Radiance and variance of both halves; between the passes where these stand on different points."""
-        radiance, variance = super()._estimates()
+        radiance, variance = self.estimates.halves()
         passes = np.maximum(self.done, 2)
         between = np.maximum(self.squares / passes - np.square(self.levels / passes), 0) / (passes - 1)
         several = self.several & (self.done >= _LEAST_PASSES)
         unknown = self.several & (self.done < _LEAST_PASSES) & (self.done > 0)
         return radiance, np.where(several, between, np.where(unknown, np.inf, variance))
+
+    def result(self):
+        """See :meth:`vpl.direct.passes.SiteEstimates.result`."""
+        return self.estimates.result(*self._halves())

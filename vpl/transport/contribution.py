@@ -4,7 +4,9 @@ Opaque surfaces block.  Surfaces that let light pass unscattered (masks, thin gl
 only for lights that a camera path could also reach by passing through them; towards point lights, spots and directional
 emitters they block, because no path that Mitsuba's ``path`` counts passes there.
 
-Emitters that are no virtual lights are sampled, and their shadow rays traced, in :mod:`vpl.direct`.
+Points on emitters that are no virtual lights are sampled in :mod:`vpl.direct`, by ``emitter_sampling`` and
+``cluster_sampling``, which trace their own shadow rays: as in ``path`` every surface blocks these, and what shines
+through masks and glass is found by BSDF samples.
 """
 
 from __future__ import annotations
