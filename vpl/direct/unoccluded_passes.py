@@ -22,11 +22,11 @@ _LEAST_PASSES = 4  # of each half: fewer say nothing about the variance between 
 
 
 class UnoccludedPasses(SitePasses):
-    """Passes over one point of every site after another.  ``options.least_samples`` and ``most_samples``:
-    emitter samples at each."""
+    """Passes over one point of every site after another, with ``options.samples_per_ray`` emitter samples at each."""
 
     def __init__(self, scenery, share, bsdf_share, level, options):
         super().__init__(scenery, share, bsdf_share, level, options)
+        self.least_samples = self.most_samples = options.samples_per_ray
         self.several = download(scenery.table.members) > 1
         # Sums over the passes of each half and site: their means, squares of these, and how many there were
         self.levels, self.squares, self.done = (np.zeros((2, len(share))) for _ in range(3))
