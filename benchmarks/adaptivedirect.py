@@ -68,9 +68,10 @@ class Problem:
 
     def _make_reference(self, file: Path) -> None:
         """The mean of independent renders, and its standard error."""
-        batches, fine = references.Batches(RAYS), plugin("adaptivedirect", error=REFERENCE_ERROR, max_passes=30)
+        batches, fine = references.Batches(), plugin("adaptivedirect", error=REFERENCE_ERROR, max_passes=30)
         for seed in range(1000, 1000 + REFERENCE_RENDERS):
-            batches.add(np.array(mi.render(self.scene, integrator=fine, spp=RAYS, seed=seed), np.float64)[..., :3])
+            image = np.array(mi.render(self.scene, integrator=fine, spp=RAYS, seed=seed), np.float64)
+            batches = batches.with_batch(image[..., :3], RAYS)
         file.parent.mkdir(parents=True, exist_ok=True)
         batches.write(file, {"integrator": "adaptivedirect", "error": REFERENCE_ERROR})
 

@@ -33,7 +33,6 @@ class Band:
 class DirectLightIntegrator(GatheringIntegrator):
     """Base class: lights gather points by :func:`vpl.direct.adaptive.light_directly`, large images in bands."""
 
-    offered_aovs = FIELDS
     along_curve = False  # the pixels' points stay together
     knobs = (
         Number(
@@ -68,7 +67,7 @@ class DirectLightIntegrator(GatheringIntegrator):
             "aovs", "",
             "Comma-separated channels to return, per camera ray: {allowed}. ``noise`` is the estimated standard error "
             "relative to the radiance, ``visible`` the share of samples that found light.",
-            words=offered_aovs,
+            words=FIELDS,
         ),
     )  # fmt: skip
 

@@ -81,7 +81,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
     wrappers such as ``moment`` and ``aov``, which only call ``sample``, work like ``mi.render``.
     """
 
-    offered_aovs = ()
+    aovs: tuple[str, ...] = ()  # channels that are asked for, where derived classes have a knob of that name
     along_curve = True  # whether gather points are sorted by their place
     knobs = PATH_KNOBS
 

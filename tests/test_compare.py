@@ -37,7 +37,7 @@ def test_what_a_replaced_integrator_does_not_know_is_dropped_and_of_the_same_one
     file = cornell()
     file.set_integrator("lightcuts", {"error": 0.02, "vpl_count": 100})
     file.set_integrator("vpl", {"clamping": 0.0}, keep=None)
-    assert file.integrator == ("vpl", {"vpl_count": 100, "clamping": 0.0})
+    assert file.integrator == ("vpl", {"max_depth": 6, "vpl_count": 100, "clamping": 0.0})
     with pytest.raises(ValueError, match='vpl: unknown property "vpl_cuont"; did you mean "vpl_count"'):
         file.set_integrator("vpl", {"vpl_cuont": 3}, keep=None)
 
