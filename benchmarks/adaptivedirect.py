@@ -5,8 +5,7 @@
 table   direct light (``max_depth`` 2) of each scene at the same convergence rule: seconds, shadow rays per pixel and
         relMSE of ``adaptivedirect`` and ``unoccludeddirect``; and how long that one, ``lights="all"``, ``direct`` and
         ``path`` would take for the same relMSE.
-paper   the same with the method as the paper prints it: ``guide="sampled"``, ``combine="inverse_variance"``,
-        ``faint_share=0``.
+paper   the same with the method as the paper prints it (benchmarks/printed_passes.py).
 lights  the hall with 100 to 100 000 lights: seconds to the same error.
 cold    first render in a fresh process with an empty kernel cache.
 
@@ -24,6 +23,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 
 import mitsuba as mi
@@ -34,6 +34,7 @@ mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
 from benchmarks import scenes  # noqa: E402
+from benchmarks.printed_passes import as_printed  # noqa: E402
 from comparison import references  # noqa: E402
 from comparison.metrics import compare  # noqa: E402
 from comparison.scene_files import SceneFile  # noqa: E402
@@ -44,7 +45,7 @@ NAMES = (
 )  # fmt: skip
 AGAINST = ("unoccluded", "all", "direct", "path")
 RAYS, REFERENCE_ERROR, REFERENCE_RENDERS = 64, 0.015, 4
-PAPER = {"guide": "sampled", "combine": "inverse_variance", "pass_limit": 20_000, "faint_share": 0.0}
+PRINTED = "adaptivedirect, printed"
 
 
 class Problem:
@@ -67,9 +68,10 @@ class Problem:
 
     def _make_reference(self, file: Path) -> None:
         """The mean of independent renders, and its standard error."""
-        batches, fine = references.Batches(RAYS), plugin("adaptivedirect", error=REFERENCE_ERROR, max_passes=30)
+        batches, fine = references.Batches(), plugin("adaptivedirect", error=REFERENCE_ERROR, max_passes=30)
         for seed in range(1000, 1000 + REFERENCE_RENDERS):
-            batches.add(np.array(mi.render(self.scene, integrator=fine, spp=RAYS, seed=seed), np.float64)[..., :3])
+            image = np.array(mi.render(self.scene, integrator=fine, spp=RAYS, seed=seed), np.float64)
+            batches = batches.with_batch(image[..., :3], RAYS)
         file.parent.mkdir(parents=True, exist_ok=True)
         batches.write(file, {"integrator": "adaptivedirect", "error": REFERENCE_ERROR})
 
@@ -87,16 +89,19 @@ class Problem:
         for kind, more, samples in methods.values():
             # The kernels of Mitsuba's integrators contain the number of samples
             few = samples if kind in ("direct", "path") else 2
-            mi.render(self.scene, integrator=plugin(kind, **{k: v for k, v in more.items() if k != "error"}), spp=few)
+            usual = plugin(kind, **{k: v for k, v in more.items() if k != "error"})
+            with method(kind):
+                mi.render(self.scene, integrator=usual, spp=few)
         found = {label: [] for label in methods}
         others = [label for label in methods if label != ours]
         turns = [x for k, other in enumerate(others) for x in ((ours, other) if k % 2 == 0 else (other,))]
         for number, label in enumerate([*turns, ours]):
             kind, more, samples = methods[label]
             integrator = plugin(kind, **more)
-            image, seconds = scenes.timed(
-                lambda: mi.render(self.scene, integrator=integrator, spp=samples, seed=number)  # noqa: B023
-            )
+            with method(kind):
+                image, seconds = scenes.timed(
+                    lambda: mi.render(self.scene, integrator=integrator, spp=samples, seed=number)  # noqa: B023
+                )
             rays = getattr(integrator, "statistics", {}).get("shadow_rays", 0) / self.pixels
             found[label].append((seconds, self.error(image), rays))
         return {
@@ -107,7 +112,12 @@ class Problem:
 
 def plugin(name: str, **more):
     """An integrator for direct light."""
-    return mi.load_dict({"type": name, **more})
+    return mi.load_dict({"type": name.split(",")[0], **more})
+
+
+def method(name: str):
+    """Context in which the plugin of that name renders by the method that is meant."""
+    return as_printed() if name == PRINTED else nullcontext()
 
 
 def table(names, options) -> None:
@@ -144,7 +154,7 @@ def table(names, options) -> None:
     print("geometric means:", ", ".join(f"{label} {value}" for label, value in means.items()))
 
 
-def as_printed(names, options) -> None:
+def departures(names, options) -> None:
     """Part "paper": what the departures from the paper bring."""
     print("\n## the method as printed, and with what was changed, at the same rule")
     print("scene | ours: s, rays/px, relMSE, bias | as printed: s, rays/px, relMSE, bias | ours at equal relMSE: times")
@@ -153,12 +163,13 @@ def as_printed(names, options) -> None:
         rule = {"error": options.error, "lights": "clusters"}
         methods = {
             "ours": ("adaptivedirect", rule, RAYS),
-            "printed": ("adaptivedirect", rule | PAPER, RAYS),
+            "printed": (PRINTED, rule, RAYS),
         }
         found = problem.race("ours", methods)
         bias = {}
         for label, (kind, more, samples) in methods.items():
-            image = np.array(mi.render(problem.scene, integrator=plugin(kind, **more), spp=samples, seed=7))
+            with method(kind):
+                image = np.array(mi.render(problem.scene, integrator=plugin(kind, **more), spp=samples, seed=7))
             bias[label] = 100 * (image.mean() / problem.reference.image.mean() - 1)
         columns = [
             ", ".join([f"{found[label][0]:.2f}", f"{found[label][2]:.0f}", f"{found[label][1]:.5f}",
@@ -252,7 +263,7 @@ def main() -> None:
     if "table" in options.parts:
         table(names, options)
     if "paper" in options.parts:
-        as_printed(names, options)
+        departures(names, options)
     if "lights" in options.parts:
         number_of_lights(options)
     if "cold" in options.parts:

@@ -25,6 +25,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from unittest.mock import patch
 
 import mitsuba as mi
 
@@ -33,7 +34,9 @@ mi.set_variant("llvm_ad_rgb")
 
 from benchmarks import scenes  # noqa: E402
 from benchmarks.baselines import QUALITY, VPLS, Found, Problem  # noqa: E402
+from benchmarks.separated_light import light_of_entries  # noqa: E402
 from vpl.core.stages import Stage  # noqa: E402
+from vpl.matrix import recovery  # noqa: E402
 
 METHOD = "matrixrecovery"
 # With other properties that suit images of this size; of several, those that take the fewest rays for the same error
@@ -48,14 +51,14 @@ NAMES = ("cornell", "kitchen", "sponza_crytek", "dining_room", "bistro_interior"
 VEILS, VEILS_DEPTH = (0, 8, 16, 32), 80
 STEPS = {
     "all": {},
-    "no prediction": {"prediction": False},
-    "no separation": {"separation": False},
-    "no correction": {"correction": False},
+    "no prediction": {"steps": "separation,correction"},
+    "no separation": {"steps": "nearest,linear,bayes"},
+    "no correction": {"steps": "nearest,linear,bayes,separation"},
     "no columns split": {"alpha": 1.0},
-    "light separated": {"recover": "light"},
-    "nearest only": {"predictors": "nearest"},
-    "linear only": {"predictors": "linear"},
-    "bayes only": {"predictors": "bayes"},
+    "light separated": {},
+    "nearest only": {"steps": "nearest,separation,correction"},
+    "linear only": {"steps": "linear,separation,correction"},
+    "bayes only": {"steps": "bayes,separation,correction"},
 }
 
 
@@ -146,7 +149,9 @@ def steps(names, options) -> None:
     for name in names:
         problem = Problem(name, SAMPLES, options.width, options.points)
         for label, settings in STEPS.items():
-            found = problem.shade(problem.plugin(METHOD, **settings))
+            weight = light_of_entries if label == "light separated" else recovery.whole_entries
+            with patch.object(recovery, "whole_entries", weight):
+                found = problem.shade(problem.plugin(METHOD, **settings))
             rate = 100 * _rate(found, problem.pixels)
             print(
                 f"{name} | {label} | {found.rays:.1f} | {rate:.1f}% | {100 * found.absolute:.2f}% | {found.rmse:.4f}",

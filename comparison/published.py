@@ -2,7 +2,7 @@
 
 Only tables that runs of a comparison can fill are here; `paper_tables` fills them. Figures are those of the paper's
 scenes, in its order. Left out are pictures ([IC] Table 2), how many emitters a pixel sees ([IAS] Table 5), which no
-integrator counts, regions of pixels ([IAS] Table 4), which `adaptivedirect` does without unless asked, and
+integrator counts, regions of pixels ([IAS] Table 4), which `adaptivedirect` does without, and
 numbers of triangles and emitters, which say nothing about a method.
 """
 

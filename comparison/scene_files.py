@@ -6,6 +6,7 @@ before any object is created, so a scene may name an integrator that is replaced
 
 import hashlib
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import drjit as dr
@@ -55,13 +56,19 @@ class SceneFile:
 
     def set_integrator(self, name, parameters=None, keep=KEPT_PARAMETERS):
         """Replace the scene's integrator. Of the old one's parameters it keeps those named by `keep` (None: all),
-        unless given anew, or unknown to the new one. Raises RuntimeError if the new one cannot be created."""
-        given, old = dict(parameters or {}), self.integrator[1]
+        unless given anew, or unknown to a new one of another name. Raises RuntimeError or ValueError if the new one
+        cannot be created."""
+        given, (old_name, old) = dict(parameters or {}), self.integrator
         kept = {key: old[key] for key in old if key not in given and (keep is None or key in keep)}
-        # Nothing lists the parameters of a plugin, but one that was created tells which it asked for.
-        tried = _properties(name, kept | given)
-        mi.PluginManager.instance().create_object(tried)
-        properties = _properties(name, {key: kept[key] for key in kept if tried.was_queried(key)} | given)
+        if name != old_name:
+            # Nothing lists the parameters of a plugin, but one that was created, or refused those that it does not
+            # know, tells which it asked for
+            tried = _properties(name, kept | given)
+            with suppress(RuntimeError, ValueError):
+                mi.PluginManager.instance().create_object(tried)
+            kept = {key: kept[key] for key in kept if tried.was_queried(key)}
+        properties = _properties(name, kept | given)
+        mi.PluginManager.instance().create_object(_properties(name, kept | given))
         nodes = self._nodes(mi.ObjectType.Integrator)
         if nodes:
             nodes[0].props = properties

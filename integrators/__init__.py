@@ -53,7 +53,7 @@ def _register(_old: str | None, variant: str) -> None:
             mi.register_integrator(name, _refuse(name, variant))
         return
     check_backend(variant)
-    for name in ("gathering", "bands", "common", *PLUGINS):
+    for name in ("gathering", "bands", "common", "direct", *PLUGINS):
         full_name = f"{__name__}.{name}"
         if full_name in sys.modules:
             importlib.reload(sys.modules[full_name])

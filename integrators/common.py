@@ -20,11 +20,18 @@ from vpl.points.camera_paths import PixelGrid
 from vpl.points.surfaces import Batch, make_batches
 from vpl.transport.evaluation import Transport, mean_radiance
 
-from . import properties
 from .gathering import CameraPass, GatheringIntegrator, whole_sum
+from .knobs import Choice, Integer, Number, Words
 
 AOVS = ("shadow_rays", "upper_bounds", "cut_size")
-REGIONS = 300  # of an environment [IAS section 4.3.1]
+AOVS_TEXT = "Comma-separated channels to return, per camera ray and from the same pass: {allowed}."
+# Of the methods that compare bounds with the radiance around them
+DARK_FLOOR = Number(
+    "dark_floor", 0.5,
+    "What is darker than this fraction of the image's mean is refined as if it had it; 0 holds the bound everywhere, "
+    "at several times the cost in dark corners.",
+    minimum=0,
+)  # fmt: skip
 
 
 @dataclass
@@ -86,20 +93,52 @@ class Prepared(CameraPass):
 
 
 class ManyLightIntegrator(GatheringIntegrator):
-    """Base class: reads the common properties, makes lights and gather points, and asks ``shade`` for the rest."""
+    """Base class: makes lights and gather points, and asks ``shade`` for the rest."""
 
     needs_trees = True
     offered_aovs = AOVS
-
-    def __init__(self, props):
-        super().__init__(props, -1)
-        self.vpl_count = properties.integer(props, "vpl_count", 200_000, 1)
-        self.direct_count = properties.integer(props, "direct_count", 4096, 1)
-        self.clamping = properties.number(props, "clamping", 0.01, 0)
-        self.direct = properties.choice(props, "direct", "nee", ("nee", "adaptive", "vpl", "none"))
-        self.emitter_samples = properties.integer(props, "emitter_samples", 16, 1)
-        self.direct_error = properties.number(props, "direct_error", 0.05, 1e-4)
-        self.lobe_limit = properties.number(props, "lobe_limit", 1.0, 0)
+    knobs = (
+        Integer("vpl_count", 200_000, "How many virtual point lights to aim for.", minimum=1),
+        Choice(
+            "direct", "nee",
+            "Light that comes straight from emitters. ``nee``: area emitters and environments by emitter and BSDF "
+            "sampling with multiple importance sampling. ``vpl``: they become virtual lights, as in the papers. "
+            "``none``: left out. ``adaptive``: area emitters and environments by iterative adaptive sampling, as in "
+            "``adaptivedirect``. Point, spot and directional emitters are virtual lights already, exact and never "
+            "clamped, in all of these but ``none``.",
+            words=("nee", "adaptive", "vpl", "none"),
+        ),
+        Integer(
+            "emitter_samples", 16,
+            "Pairs of an emitter and a BSDF sample per gather point with ``direct=\"nee\"``. More of them cost little "
+            "beside virtual lights, and their noise is often most of what is left.",
+            minimum=1,
+        ),
+        Number(
+            "direct_error", 0.05,
+            "Standard error of the direct light, relative to it, with ``direct=\"adaptive\"``.",
+            minimum=1e-4,
+        ),
+        Integer(
+            "direct_count", 4096,
+            "Virtual lights on area emitters, and as many for the environment, with ``direct=\"vpl\"``.",
+            minimum=1,
+        ),
+        Number(
+            "clamping", 0.01,
+            "Smallest distance to a virtual light that stands for a surface, as a fraction of the radius of the "
+            "scene's bounding sphere; light from nearer is dimmed instead of becoming a bright spot. 0 turns it off; "
+            "papers that use fewer lights clamp at 0.05.",
+            minimum=0,
+        ),
+        Number(
+            "lobe_limit", 1.0,
+            "A glossy lobe stores virtual lights where its density is at most this, per steradian, as though it were "
+            "diffuse (which has at most 1/pi); 0 stores the light of diffuse lobes only.",
+            minimum=0,
+        ),
+        Words("aovs", "", AOVS_TEXT, words=offered_aovs),
+    )  # fmt: skip
 
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Light of ``job.lights`` at the points of ``job.batch``: the one thing that a method defines."""
@@ -149,7 +188,7 @@ class ManyLightIntegrator(GatheringIntegrator):
     def _adaptive(self, scene, camera: CameraPass, grid):
         """Direct light of extended emitters by adaptive sampling: (radiance, rays)."""
         # Points, spots and directional emitters are virtual lights already
-        sources = Sources(scene, camera.emitters.extended_only(), REGIONS)
+        sources = Sources(scene, camera.emitters.extended_only())
         options = DirectOptions(error=self.direct_error)
         found = light_directly(
             scene, camera.traits, sources, camera.paths.points, grid, self.max_depth, options,
@@ -194,8 +233,3 @@ class ManyLightIntegrator(GatheringIntegrator):
             job.mean = mean
         prepared.clock.lap(Stage.PILOT)
         return jobs
-
-    def describe(self) -> dict:
-        """Properties and their values, for ``to_string`` and file metadata."""
-        names = ["vpl_count", "direct_count", "clamping", "direct", "emitter_samples", "direct_error", "lobe_limit"]
-        return super().describe() | {name: getattr(self, name) for name in names}

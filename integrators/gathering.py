@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -15,7 +14,10 @@ from vpl.core.stages import Stage
 from vpl.lights.emitters import Emitters, read_emitters
 from vpl.points.camera_paths import CameraPaths, PixelGrid, SceneTraits, follow_camera_rays, refuse_media, scene_traits
 
-from . import properties
+from .knobs import PATH_KNOBS, Integer, read_knobs, show_knobs
+
+# Of Mitsuba, whose own constructor does not show what it has read
+_SAMPLES_PER_PASS = Integer("samples_per_pass", 2**32 - 1, "Most samples of a pixel in a pass.", minimum=1)
 
 
 class Clock:
@@ -82,16 +84,14 @@ class GatheringIntegrator(mi.SamplingIntegrator):
     wrappers such as ``moment`` and ``aov``, which only call ``sample``, work like ``mi.render``.
     """
 
-    offered_aovs = ()
+    aovs: tuple[str, ...] = ()  # channels that are asked for, where derived classes have a knob of that name
     along_curve = True  # whether gather points are sorted by their place
+    knobs = PATH_KNOBS
 
-    def __init__(self, props, default_depth: int):
+    def __init__(self, props):
         super().__init__(props)
-        self.max_depth = properties.depth(props, default_depth)
-        self.rr_depth = properties.integer(props, "rr_depth", 5, 1)
-        self.aovs = properties.words(props, "aovs", self.offered_aovs)
-        # Read by the base class too, which does not show it
-        self.samples_per_pass = properties.integer(props, "samples_per_pass", 2**32 - 1, 1)
+        read_knobs(self, props)
+        self.samples_per_pass = _SAMPLES_PER_PASS.read(self, props)
         self.statistics: dict = {}
 
     def light(self, scene, sampler, camera: CameraPass):
@@ -170,15 +170,9 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         self.statistics["dropped"] = self.statistics.get("dropped", camera.emitters.dropped) + bad_samples
         return image, counters
 
-    def describe(self) -> dict:
-        """Properties and their values, for ``to_string`` and file metadata."""
-        depth = -1 if math.isinf(self.max_depth) else self.max_depth
-        return {"max_depth": depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
-
     def to_string(self):
-        """One line a property, as Mitsuba's plugins print themselves."""
-        lines = ",\n".join(f"  {name} = {value}" for name, value in self.describe().items())
-        return f"{type(self).__name__}[\n{lines}\n]"
+        """All properties and their values."""
+        return show_knobs(self)
 
     def render_forward(self, *args, **kwargs):
         """Not supported: what is sampled is chosen by what was seen, which is not continuous."""

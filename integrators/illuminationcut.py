@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from vpl.core.arrays import add_at, download, upload
+from vpl.core.arrays import download, upload
 from vpl.core.stages import Stage
 from vpl.cuts.adaptive_visibility import decide_visibility
 from vpl.cuts.light_cuts import upload_thresholds
 from vpl.cuts.pair_lists import evaluate_lists, list_pairs
 from vpl.cuts.phase_one import approximate_radiance
 from vpl.cuts.product_cuts import BoundCounter, Pairs, find_pairs, in_batches, raise_thresholds
-from vpl.direct.shared_samples import share_samples
 from vpl.points.point_clusters import PointClusters
-from vpl.points.surfaces import Batch
 
-from . import properties
-from .common import AOVS, ManyLightIntegrator, ShadeJob, ShadeResult
+from .common import AOVS, AOVS_TEXT, DARK_FLOOR, ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
+from .knobs import Choice, Integer, Number, Words
 from .manual import manual_page
 
 # Pairs held before they are evaluated: bounds the memory whatever the image and the error
@@ -29,16 +27,6 @@ _PAIRS_HELD = 1 << 23
 # One point in so many tells how large the cuts around it are
 _TRIED_STRIDE = 32
 _DEFAULT_ERROR = {"all": 0.015, "adaptive": 0.01}
-
-
-@dataclass
-class Shown:
-    """The points that are shaded: ``rows`` along the tree, as a batch; ``of``: for every point, which of them it
-    shows."""
-
-    batch: Batch
-    rows: object
-    of: object
 
 
 @manual_page
@@ -51,37 +39,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
 
     .. pluginparameters::
 
-     * - error
-       - |float|
-       - Largest bound of what a pair of clusters contributes to one of its points, as a fraction of the least radiance
-         among them: 0.01 is 1%. 0 refines to single lights. (Default: 0.015, with ``visibility="adaptive"`` 0.01)
-
-     * - visibility
-       - |string|
-       - ``all``: one shadow ray for every point of a pair. ``adaptive``: a few of them are traced, and where they agree
-         the others are taken to see the same; fewer rays, and a bias (see below). (Default: ``all``)
-
-     * - dark_floor
-       - |float|
-       - Points darker than this fraction of the image's mean are refined as if they had it; 0 holds the bound
-         everywhere, at several times the cost in dark corners. (Default: 0.5)
-
-     * - max_cut
-       - |int|
-       - About how many clusters a point may be lit by; where the bound asks for more, it is raised. 0 is no limit.
-         (Default: 1000)
-
-     * - phase_one_error
-       - |float|
-       - Bound, as a fraction of the image's mean, up to which pairs of the first, approximate image are not refined. 0
-         leaves it to the paper's criterion alone. (Default: 0.5)
-
-     * - share_samples
-       - |bool|
-       - Shade only one of the samples of a pixel that lie close to each other, and let the others take over its light.
-         Pays with many samples a pixel; noisier on fine textures. (Default: no)
-
-     {common parameters}
+     {knobs}
 
     Bus, Mustafa and Biri 2015, "IlluminationCut" [IC]. Like :ref:`lightcuts <integrator-lightcuts>`, but points are
     clustered too: a tree over all gather points and the trees over the lights are descended together, until every pair
@@ -118,15 +76,34 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
     """
 
     offered_aovs = (*AOVS, "phase_one")
-
-    def __init__(self, props):
-        super().__init__(props)
-        self.visibility = properties.choice(props, "visibility", "all", tuple(_DEFAULT_ERROR))
-        self.error = properties.number(props, "error", _DEFAULT_ERROR[self.visibility], 0)
-        self.dark_floor = properties.number(props, "dark_floor", 0.5, 0)
-        self.max_cut = properties.integer(props, "max_cut", 1000, 0)
-        self.share_samples = properties.boolean(props, "share_samples", False)
-        self.phase_one_error = properties.number(props, "phase_one_error", 0.5, 0)
+    knobs = (
+        Choice(
+            "visibility", "all",
+            "``all``: one shadow ray for every point of a pair. ``adaptive``: a few of them are traced, and where they "
+            "agree the others are taken to see the same; fewer rays, and a bias (see below).",
+            words=tuple(_DEFAULT_ERROR),
+        ),
+        Number(
+            "error", lambda plugin: _DEFAULT_ERROR[plugin.visibility],
+            "Largest bound of what a pair of clusters contributes to one of its points, as a fraction of the least "
+            "radiance among them: 0.01 is 1%. 0 refines to single lights.",
+            minimum=0, stated_default='0.015, with ``visibility="adaptive"`` 0.01',
+        ),
+        DARK_FLOOR,
+        Integer(
+            "max_cut", 1000,
+            "About how many clusters a point may be lit by; where the bound asks for more, it is raised. 0 is no "
+            "limit.",
+            minimum=0,
+        ),
+        Number(
+            "phase_one_error", 0.5,
+            "Bound, as a fraction of the image's mean, up to which pairs of the first, approximate image are not "
+            "refined. 0 leaves it to the paper's criterion alone.",
+            minimum=0,
+        ),
+        Words("aovs", "", AOVS_TEXT, words=offered_aovs),
+    )  # fmt: skip
 
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Phase I, Phase II and the evaluation of the pairs, for one batch ([IC] section 3)."""
@@ -141,12 +118,11 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         shaded = ShadeResult(
             dr.zeros(mi.UnpolarizedSpectrum, clusters.count), rays, None, dr.zeros(mi.UInt32, clusters.count)
         )
-        shown = self._choose_shown(job, clusters)
         for group, pairs in self._pairs(job, clusters, threshold, counter):
             clock.lap(Stage.PHASE_TWO)
             if job.stopped():
                 break
-            self._evaluate(job, group, clusters, shown, pairs, shaded, clock)
+            self._evaluate(job, group, clusters, pairs, shaded, clock)
         clock.lap(Stage.PHASE_TWO)
         shaded.upper_bounds = counter.per_point()
         shaded.phase_one = upload(mi.Float, bright[clusters.tree.leaf])
@@ -183,18 +159,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
             for pairs in in_batches(find_pairs(clusters, job.lights, group, illumination_aware, counter), _PAIRS_HELD):
                 yield group, pairs
 
-    def _choose_shown(self, job: ShadeJob, clusters: PointClusters) -> Shown:
-        """All points, or with ``share_samples`` those that stand for others of their pixel."""
-        rows = of = dr.arange(mi.UInt32, clusters.count)
-        if not self.share_samples or job.grid.samples == 1:
-            dr.eval(rows)
-            return Shown(clusters.batch, rows, of)
-        pixel = download(job.ray)[clusters.tree.order] // job.grid.samples
-        chosen, stands_for = share_samples(clusters.tree, pixel, job.grid.samples, np.random.default_rng(job.seed + 1))
-        rows = upload(mi.UInt32, chosen)
-        return Shown(clusters.batch.select(rows), rows, upload(mi.UInt32, stands_for))
-
-    def _evaluate(self, job: ShadeJob, group, clusters, shown: Shown, pairs: Pairs, shaded: ShadeResult, clock: Clock):
+    def _evaluate(self, job: ShadeJob, group, clusters, pairs: Pairs, shaded: ShadeResult, clock: Clock):
         """Add the light of some pairs to ``shaded``."""
         seen, traced = [], [pairs]
         if self.visibility == "adaptive":
@@ -203,17 +168,13 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         if not seen and not traced:
             return
         lists = list_pairs(group, clusters, traced, seen)
-        radiance, rays = evaluate_lists(job.transport, group, shown.batch, lists, shown.rows)
-        shaded.radiance += dr.gather(type(radiance), radiance, shown.of)
-        add_at(shaded.shadow_rays, rays, shown.rows)
-        add_at(shaded.cut_size, dr.gather(mi.UInt32, lists.length, shown.rows), shown.rows)
+        rows = dr.arange(mi.UInt32, clusters.count)
+        radiance, rays = evaluate_lists(job.transport, group, clusters.batch, lists, rows)
+        shaded.radiance += radiance
+        shaded.shadow_rays += rays
+        shaded.cut_size += lists.length
         dr.eval(shaded.radiance, shaded.shadow_rays, shaded.cut_size)
         clock.lap(Stage.EVALUATE)
-
-    def describe(self):
-        """All properties and their values."""
-        names = ("visibility", "error", "dark_floor", "max_cut", "phase_one_error", "share_samples")
-        return super().describe() | {name: getattr(self, name) for name in names}
 
 
 mi.register_integrator("illuminationcut", IlluminationCutIntegrator)

@@ -9,9 +9,9 @@ from vpl.core.arrays import upload
 from vpl.core.stages import Stage
 from vpl.cuts.light_cuts import estimate_radiance, evaluate_cuts, limited_cuts
 
-from . import properties
-from .common import ManyLightIntegrator, ShadeJob, ShadeResult
+from .common import DARK_FLOOR, ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
+from .knobs import Integer, Number
 from .manual import manual_page
 
 # A point's radiance is estimated from coarse cuts at every eighth point, averaged over sixteen neighbours on the curve
@@ -28,21 +28,7 @@ class LightcutsIntegrator(ManyLightIntegrator):
 
     .. pluginparameters::
 
-     * - error
-       - |float|
-       - Largest bound of the error of one cluster, as a fraction of the radiance around the point: 0.01 is 1%.
-         0 refines to single lights. (Default: 0.01)
-
-     * - dark_floor
-       - |float|
-       - Points darker than this fraction of the image's mean are refined as if they had it; 0 holds the bound
-         everywhere, at several times the cost in dark corners. (Default: 0.5)
-
-     * - max_cut
-       - |int|
-       - Most clusters in the cut of a point, at least one per kind of light; 0 is no limit. (Default: 1000)
-
-     {common parameters}
+     {knobs}
 
     Walter et al. 2005, "Lightcuts: a scalable approach to illumination" [LC]. All virtual lights are clustered into
     one tree per kind (point, spot, oriented, directional, environment); every gather point is lit by a *cut*: clusters
@@ -73,11 +59,20 @@ class LightcutsIntegrator(ManyLightIntegrator):
             "integrator": {"type": "lightcuts", "max_depth": 8, "error": 0.01}
     """
 
-    def __init__(self, props):
-        super().__init__(props)
-        self.error = properties.number(props, "error", 0.01, 0)
-        self.dark_floor = properties.number(props, "dark_floor", 0.5, 0)
-        self.max_cut = properties.integer(props, "max_cut", 1000, 0)
+    knobs = (
+        Number(
+            "error", 0.01,
+            "Largest bound of the error of one cluster, as a fraction of the radiance around the point: 0.01 is 1%. 0 "
+            "refines to single lights.",
+            minimum=0,
+        ),
+        DARK_FLOOR,
+        Integer(
+            "max_cut", 1000,
+            "Most clusters in the cut of a point, at least one per kind of light; 0 is no limit.",
+            minimum=0,
+        ),
+    )  # fmt: skip
 
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Choose a cut for every point of a batch and evaluate it."""
@@ -91,10 +86,6 @@ class LightcutsIntegrator(ManyLightIntegrator):
         clock.lap(Stage.EVALUATE)
         bounds = searched + collected + spent.upper_bounds
         return ShadeResult(radiance, rays + spent.shadow_rays, bounds, sum(sizes.count), clock.seconds)
-
-    def describe(self):
-        """All properties and their values."""
-        return super().describe() | {"error": self.error, "dark_floor": self.dark_floor, "max_cut": self.max_cut}
 
 
 mi.register_integrator("lightcuts", LightcutsIntegrator)

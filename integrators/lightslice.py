@@ -18,9 +18,9 @@ from vpl.points.point_clusters import PointClusters
 from vpl.points.slices import build_slices
 from vpl.transport.evaluation import sum_lights
 
-from . import properties
 from .common import ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
+from .knobs import Integer, Number
 from .manual import manual_page
 
 # Lights of every point that one kernel adds up; between kernels the render may be stopped
@@ -37,42 +37,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
 
     .. pluginparameters::
 
-     * - slices
-       - |int|
-       - Groups of neighbouring gather points that are lit by the same clusters. Fewer make larger ones, which take less
-         time to prepare and more columns to light well. (Default: 1500)
-
-     * - columns
-       - |int|
-       - Most clusters of lights that a slice is lit by, at least one per kind of light. The error falls and the time
-         grows with it. (Default: 200)
-
-     * - shared_columns
-       - |int|
-       - Most clusters of lights that all slices together tell apart; what is sampled at one point of each slice are
-         these, in 12 bytes for each. As many as there are lights is what the paper does. (Default: 8192)
-
-     * - neighbours
-       - |int|
-       - The sampled points of so many slices, its own among them, tell how lights are clustered for a slice.
-         (Default: 6)
-
-     * - unseen
-       - |float|
-       - How much of the choice of lights goes by upper bounds, relative to what goes by the sampled points: the lights
-         that none of these saw are chosen with it. (Default: 1)
-
-     * - sets
-       - |int|
-       - Lights that are drawn for each cluster; the samples of a pixel take turns with them, and the pixels of blocks
-         of 4 × 4. With 1 all points of a slice share one error, and slices show as blotches. (Default: 16)
-
-     * - candidates
-       - |int|
-       - Lights of a cluster, from as many sets, that are shaded at glossy points; one is drawn by what it would send,
-         and traced. So fewer pixels are far too bright. At most ``sets`` are used. (Default: 4)
-
-     {common parameters}
+     {knobs}
 
     Ou and Pellacini 2011, "LightSlice: matrix slice sampling for the many-lights problem" [LS]. What every light sends
     to every gather point is a large matrix; slices of its rows, for points that are near to each other and face alike,
@@ -114,15 +79,49 @@ class LightSliceIntegrator(ManyLightIntegrator):
             "integrator": {"type": "lightslice", "max_depth": 8, "columns": 200}
     """
 
-    def __init__(self, props):
-        super().__init__(props)
-        self.slices = properties.integer(props, "slices", 1500, 1)
-        self.columns = properties.integer(props, "columns", 200, 1)
-        self.shared_columns = properties.integer(props, "shared_columns", 8192, 1)
-        self.neighbours = properties.integer(props, "neighbours", 6, 1)
-        self.unseen = properties.number(props, "unseen", 1.0, 1e-6)
-        self.sets = properties.integer(props, "sets", 16, 1)
-        self.candidates = properties.integer(props, "candidates", 4, 1)
+    knobs = (
+        Integer(
+            "slices", 1500,
+            "Groups of neighbouring gather points that are lit by the same clusters. Fewer make larger ones, which "
+            "take less time to prepare and more columns to light well.",
+            minimum=1,
+        ),
+        Integer(
+            "columns", 200,
+            "Most clusters of lights that a slice is lit by, at least one per kind of light. The error falls and the "
+            "time grows with it.",
+            minimum=1,
+        ),
+        Integer(
+            "shared_columns", 8192,
+            "Most clusters of lights that all slices together tell apart; what is sampled at one point of each slice "
+            "are these, in 12 bytes for each. As many as there are lights is what the paper does.",
+            minimum=1,
+        ),
+        Integer(
+            "neighbours", 6,
+            "The sampled points of so many slices, its own among them, tell how lights are clustered for a slice.",
+            minimum=1,
+        ),
+        Number(
+            "unseen", 1.0,
+            "How much of the choice of lights goes by upper bounds, relative to what goes by the sampled points: the "
+            "lights that none of these saw are chosen with it.",
+            minimum=1e-6,
+        ),
+        Integer(
+            "sets", 16,
+            "Lights that are drawn for each cluster; the samples of a pixel take turns with them, and the pixels of "
+            "blocks of 4 × 4. With 1 all points of a slice share one error, and slices show as blotches.",
+            minimum=1,
+        ),
+        Integer(
+            "candidates", 4,
+            "Lights of a cluster, from as many sets, that are shaded at glossy points; one is drawn by what it would "
+            "send, and traced. So fewer pixels are far too bright. At most ``sets`` are used.",
+            minimum=1,
+        ),
+    )  # fmt: skip
 
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Slices, the lights of each, and what these send to its points, for one batch."""
@@ -178,11 +177,6 @@ class LightSliceIntegrator(ManyLightIntegrator):
                 radiance, traced, first = radiance + value, traced + rays, end
                 dr.eval(radiance, traced, first)
         return radiance, traced, columns
-
-    def describe(self):
-        """All properties and their values."""
-        names = ("slices", "columns", "shared_columns", "neighbours", "unseen", "sets", "candidates")
-        return super().describe() | {name: getattr(self, name) for name in names}
 
 
 mi.register_integrator("lightslice", LightSliceIntegrator)

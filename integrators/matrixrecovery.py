@@ -13,18 +13,17 @@ from vpl.core.arrays import ENTRIES, download
 from vpl.core.sampling import derived_seed
 from vpl.core.stages import Stage
 from vpl.matrix.matrix_block import MatrixBlock
-from vpl.matrix.recovery import RecoveryOptions, recover
+from vpl.matrix.recovery import STEPS, recover
 from vpl.matrix.reduced_columns import initial_columns, split_columns
 from vpl.matrix.reduced_matrix import MatrixEntries, MatrixRows
-from vpl.matrix.separation import SeparationLimits
 from vpl.matrix.visibility_prediction import PREDICTORS, predict_columns
 from vpl.matrix.visibility_samples import VisibilitySamples
 from vpl.points.point_clusters import PointClusters
 from vpl.points.slice_rows import build_row_slices
 
-from . import properties
 from .common import ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
+from .knobs import Integer, Number, Words
 from .manual import manual_page
 
 # Slices that are sampled together: bounds the memory of their samples
@@ -41,61 +40,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
 
     .. pluginparameters::
 
-     * - slice_rows
-       - |int|
-       - Most rows of a slice: pixels whose gather points are lit by the same clusters; at most 65536. (Default: 1024)
-
-     * - initial_columns
-       - |int|
-       - Clusters of lights that a slice begins with, at most, chosen by upper bounds. (Default: 200)
-
-     * - max_columns
-       - |int|
-       - Most clusters that a slice ends with, but one for each kind of light at least. (Default: 2000)
-
-     * - alpha
-       - |float|
-       - Clusters are split that may send more than this fraction of what all of them may send. The error falls and the
-         time grows as it falls. (Default: 0.002)
-
-     * - sampling
-       - |float|
-       - How many rows are traced for each column in every round, of those where light would arrive: this fraction of
-         the rows that slices have on average. (Default: 0.01)
-
-     * - prediction_error
-       - |float|
-       - A column is sampled until its visibility is predicted with fewer errors than this fraction of the new samples.
-         (Default: 0.1)
-
-     * - rounds
-       - |int|
-       - How often a column is sampled at most after the first time. (Default: 20)
-
-     * - predictors
-       - |string|
-       - Comma-separated: :monosp:`nearest` (the nearest rows that were traced), :monosp:`linear` (a line between light
-         and shadow), :monosp:`bayes` (the same row in nearby columns). (Default: all three)
-
-     * - prediction, separation, correction
-       - |bool|
-       - Which steps are taken: visibility predicted (else taken to be 1); errors of the prediction found by separating
-         the matrix into a part of low rank and sparse errors; entries traced where these lie dense, which needs the
-         separation. (Default: true)
-
-     * - density
-       - |float|
-       - Share of errors around an entry, weighted by a Gaussian, from which on it is traced. (Default: 0.65)
-
-     * - recover
-       - |string|
-       - What is separated: :monosp:`visibility`, or :monosp:`light` as in the paper. (Default: :monosp:`visibility`)
-
-     * - iterations, rank
-       - |int|
-       - Most iterations of the separation and largest rank. (Default: 20, 32)
-
-     {common parameters}
+     {knobs}
 
     Huo et al. 2015, "A matrix sampling-and-recovery approach for many-lights rendering" [MSR]. What the clusters of
     lights of a slice send to its pixels is a matrix, most entries of which differ from those beside them only by smooth
@@ -117,12 +62,12 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
     channels, and every gather point is shaded exactly. Slices are halved at medians by the number of points
     (:mod:`vpl.points.slice_rows`). Clusters are split in rounds, and lend their samples to those beside them along the
     light tree (:mod:`vpl.matrix.reduced_columns`); ``alpha`` is a tenth of the paper's, with which slices have 200
-    columns here rather than its 700; ``density`` is 0.65 instead of 0.2, for errors lie denser here. Rows that are
-    traced follow each other by golden sections instead of being drawn at random (:mod:`vpl.matrix.visibility_samples`).
-    Nearest rows are found by looking at all samples of a column, and the line of the linear predictor lies in the
-    slice's plane (:mod:`vpl.matrix.visibility_prediction`). Where the separation of a slice fails, all entries of the
-    columns in question are traced, and the slice is counted. Lambertian points and all others are in slices of their
-    own.
+    columns here rather than its 700; entries are traced where 65% of those around them are wrong instead of 20%, for
+    errors lie denser here. Rows that are traced follow each other by golden sections instead of being drawn at random
+    (:mod:`vpl.matrix.visibility_samples`). Nearest rows are found by looking at all samples of a column, and the line
+    of the linear predictor lies in the slice's plane (:mod:`vpl.matrix.visibility_prediction`). Where the separation of
+    a slice fails, all entries of the columns in question are traced, and the slice is counted. Lambertian points and
+    all others are in slices of their own.
 
     .. tabs::
         .. code-tab:: xml
@@ -138,23 +83,51 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
             "integrator": {"type": "matrixrecovery", "max_depth": 8, "alpha": 0.002}
     """
 
-    def __init__(self, props):
-        super().__init__(props)
-        self.slice_rows = properties.integer(props, "slice_rows", 1024, 1, 65536)
-        self.initial_columns = properties.integer(props, "initial_columns", 200, 1)
-        self.max_columns = properties.integer(props, "max_columns", 2000, 1)
-        self.alpha = properties.number(props, "alpha", 0.002, 0)
-        self.sampling = properties.number(props, "sampling", 0.01, 1e-6)
-        self.prediction_error = properties.number(props, "prediction_error", 0.1, 0)
-        self.rounds = properties.integer(props, "rounds", 20, 1)
-        self.predictors = properties.words(props, "predictors", tuple(PREDICTORS), ",".join(PREDICTORS))
-        self.prediction = properties.boolean(props, "prediction", True)
-        self.separation = properties.boolean(props, "separation", True)
-        self.correction = properties.boolean(props, "correction", True)
-        self.density = properties.number(props, "density", 0.65, 0)
-        self.recover = properties.choice(props, "recover", "visibility", ("visibility", "light"))
-        self.iterations = properties.integer(props, "iterations", 20, 1)
-        self.rank = properties.integer(props, "rank", 32, 1)
+    knobs = (
+        Integer(
+            "slice_rows", 1024,
+            "Most rows of a slice: pixels whose gather points are lit by the same clusters.",
+            minimum=1, maximum=65536,
+        ),
+        Integer(
+            "initial_columns", 200,
+            "Clusters of lights that a slice begins with, at most, chosen by upper bounds.",
+            minimum=1,
+        ),
+        Integer(
+            "max_columns", 2000,
+            "Most clusters that a slice ends with, but one for each kind of light at least.",
+            minimum=1,
+        ),
+        Number(
+            "alpha", 0.002,
+            "Clusters are split that may send more than this fraction of what all of them may send. The error falls "
+            "and the time grows as it falls.",
+            minimum=0,
+        ),
+        Number(
+            "sampling", 0.01,
+            "How many rows are traced for each column in every round, of those where light would arrive: this fraction "
+            "of the rows that slices have on average.",
+            minimum=1e-6,
+        ),
+        Number(
+            "prediction_error", 0.1,
+            "A column is sampled until its visibility is predicted with fewer errors than this fraction of the new "
+            "samples.",
+            minimum=0,
+        ),
+        Integer("rounds", 20, "How often a column is sampled at most after the first time.", minimum=1),
+        Words(
+            "steps", ",".join(STEPS),
+            "What is done, out of {allowed}. The first three predict visibility: by the nearest rows that were traced, "
+            "by a line between light and shadow, by the same row in nearby columns, each column by the best of those "
+            "named; where none is, all that was not traced is taken to arrive. ``separation``: errors of the "
+            "prediction are found by separating the matrix into a part of low rank and sparse errors. ``correction``: "
+            "entries are traced where these lie dense.",
+            words=STEPS,
+        ),
+    )  # fmt: skip
 
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Slices, their columns, what is traced of their matrices, and what these send to the points of one batch."""
@@ -205,11 +178,12 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
     ):
         """Predict the columns of some slices, and recover their matrices as many at a time as memory allows."""
         entries, columns = work.entries, samples.columns
-        kinds, rounds = tuple(PREDICTORS[name] for name in self.predictors), self.rounds if self.prediction else 0
+        named = tuple(kind for name, kind in PREDICTORS.items() if name in self.steps)
+        kinds, rounds = (named, self.rounds) if named else (tuple(PREDICTORS.values()), 0)
         predictors, best = predict_columns(samples, kinds, count, self.prediction_error, rounds, seed)
         work.lap(Stage.PREDICTION)
         for name, kind in PREDICTORS.items():
-            work.add(f"{name}_columns", int(self.prediction and (best == kind).sum()))
+            work.add(f"{name}_columns", int((best == kind).sum()) if named else 0)
         for begin, end in _chunks(entries, columns, slices):
             low, high = np.searchsorted(columns.piece, (begin, end))
             if job.stopped():
@@ -217,24 +191,11 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
             if low < high:
                 block = MatrixBlock(entries, columns.select(np.arange(low, high)), begin, end)
                 seed_of_block = derived_seed(seed, 1, begin)
-                found = recover(block, predictors, best, int(low), self.options(), seed_of_block, work.lap)
+                found = recover(block, predictors, best, int(low), self.steps, seed_of_block, work.lap)
                 work.add("failed_slices", found.failed)
                 work.add("entries", int(block.counts.prod(1).sum()))
                 yield block, found
                 work.lap(Stage.EVALUATE)
-
-    def options(self) -> RecoveryOptions:
-        """How matrices are recovered."""
-        limits = SeparationLimits(self.iterations, rank=self.rank)
-        return RecoveryOptions(self.prediction, self.separation, self.correction, self.density, self.recover, limits)
-
-    def describe(self):
-        """All properties and their values."""
-        names = (
-            "slice_rows", "initial_columns", "max_columns", "alpha", "sampling", "prediction_error", "rounds",
-            "prediction", "separation", "correction", "density", "recover", "iterations", "rank",
-        )  # fmt: skip
-        return super().describe() | {"predictors": ",".join(self.predictors)} | {n: getattr(self, n) for n in names}
 
 
 class Work:

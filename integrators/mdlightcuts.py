@@ -16,9 +16,9 @@ from vpl.cuts.product_cuts import BoundCounter, find_pairs, in_batches, raise_th
 from vpl.points.gather_tree import build_gather_tree
 from vpl.points.point_clusters import PointClusters
 
-from . import properties
-from .common import ManyLightIntegrator, ShadeJob, ShadeResult
+from .common import DARK_FLOOR, ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
+from .knobs import Integer, Number
 from .manual import manual_page
 
 # Pairs that are shaded and traced at a time, at least
@@ -39,27 +39,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
 
     .. pluginparameters::
 
-     * - error
-       - |float|
-       - Largest bound of what a pair of clusters contributes to its pixel, as a fraction of the pixel's radiance: 0.01
-         is 1%. 0, with ``max_cut`` 0 and ``leaf_points`` 1, takes every light at every point. (Default: 0.01)
-
-     * - dark_floor
-       - |float|
-       - Pixels darker than this fraction of the image's mean are refined as if they had it; 0 holds the bound
-         everywhere, at several times the cost in dark corners. (Default: 0.5)
-
-     * - max_cut
-       - |int|
-       - About how many pairs a pixel may be lit by; where the bound asks for more, it is raised. 0 is no limit.
-         (Default: 1000)
-
-     * - leaf_points
-       - |int|
-       - Neighbouring samples of a pixel, on surfaces without gloss, that are never told apart: for every cluster of
-         lights one of them, drawn at random, stands for all, whatever ``error`` says. 1: there are none. (Default: 4)
-
-     {common parameters}
+     {knobs}
 
     Walter et al. 2006, "Multidimensional lightcuts" [MDLC]. Like :ref:`lightcuts <integrator-lightcuts>`, but what is
     cut is the product of two trees: the gather points of all samples of a pixel (over its area, the lens and the
@@ -93,12 +73,26 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
             "integrator": {"type": "mdlightcuts", "max_depth": 8, "error": 0.01}
     """
 
-    def __init__(self, props):
-        super().__init__(props)
-        self.error = properties.number(props, "error", 0.01, 0)
-        self.dark_floor = properties.number(props, "dark_floor", 0.5, 0)
-        self.max_cut = properties.integer(props, "max_cut", 1000, 0)
-        self.leaf_points = properties.integer(props, "leaf_points", 4, 1)
+    knobs = (
+        Number(
+            "error", 0.01,
+            "Largest bound of what a pair of clusters contributes to its pixel, as a fraction of the pixel's radiance: "
+            "0.01 is 1%. 0, with ``max_cut`` 0 and ``leaf_points`` 1, takes every light at every point.",
+            minimum=0,
+        ),
+        DARK_FLOOR,
+        Integer(
+            "max_cut", 1000,
+            "About how many pairs a pixel may be lit by; where the bound asks for more, it is raised. 0 is no limit.",
+            minimum=0,
+        ),
+        Integer(
+            "leaf_points", 4,
+            "Neighbouring samples of a pixel, on surfaces without gloss, that are never told apart: for every cluster "
+            "of lights one of them, drawn at random, stands for all, whatever ``error`` says. 1: there are none.",
+            minimum=1,
+        ),
+    )  # fmt: skip
 
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Gather trees, thresholds, and the cut of every pixel, for one batch."""
@@ -148,11 +142,6 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
         weighted = estimate.radiance * download(job.weight).mean(1, dtype=np.float64)
         radiance = np.bincount(pixel, weighted)[pixel] / job.grid.samples
         return self.error * np.maximum(radiance, self.dark_floor * job.mean)
-
-    def describe(self):
-        """All properties and their values."""
-        names = ("error", "dark_floor", "max_cut", "leaf_points")
-        return super().describe() | {name: getattr(self, name) for name in names}
 
 
 mi.register_integrator("mdlightcuts", MultidimensionalLightcutsIntegrator)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mitsuba as mi
 
 from vpl.direct.adaptive import DirectOptions
 
-from . import properties
-from .adaptivedirect import AdaptiveDirectIntegrator
-from .manual import direct_manual_page
+from .direct import DirectLightIntegrator
+from .knobs import Integer
+from .manual import manual_page
 
 
-@direct_manual_page
-class UnoccludedDirectIntegrator(AdaptiveDirectIntegrator):
+@manual_page
+class UnoccludedDirectIntegrator(DirectLightIntegrator):
     r"""
     .. _integrator-unoccludeddirect:
 
@@ -21,18 +23,14 @@ class UnoccludedDirectIntegrator(AdaptiveDirectIntegrator):
 
     .. pluginparameters::
 
-     * - samples_per_ray
-       - |int|
-       - Emitter samples for each camera ray of a pixel, before the next ray is taken. (Default: 100)
-
-     {common parameters}
+     {knobs}
 
     The reference solution of Donikian et al. 2006 [IAS section 5.1], with which ``adaptivedirect`` is compared: at
     every point emitters are drawn in proportion to what each would send if nothing was between, one camera ray of the
     pixel after another, until its error is below ``error`` by the same rule. Needs a sampler with several samples a
     pixel to antialias; it goes round them as often as it has to.
 
-    {what is estimated}
+    {what direct light is estimated}
 
     **Departures from the paper.** Samples are stratified by jitter along the emitters and by an additive recurrence on
     them, instead of a Sobol sequence; a tenth of the samples is spread evenly over the emitters, because unoccluded
@@ -51,19 +49,17 @@ class UnoccludedDirectIntegrator(AdaptiveDirectIntegrator):
             "integrator": {"type": "unoccludeddirect", "error": 0.02}
     """
 
-    own_properties = ("samples_per_ray",)
-
-    def _read_method(self, props) -> None:
-        self.samples_per_ray = properties.integer(props, "samples_per_ray", 100, 2)
+    knobs = (
+        Integer(
+            "samples_per_ray", DirectOptions.samples_per_ray,
+            "Emitter samples for each camera ray of a pixel, before the next ray is taken.",
+            minimum=2,
+        ),
+    )  # fmt: skip
 
     def options(self) -> DirectOptions:
-        """The properties as the renderer's core takes them."""
-        # As many passes as the limit of samples allows
-        return DirectOptions(
-            error=self.error, dark_floor=self.dark_floor, lights="unoccluded", max_samples=self.max_samples,
-            max_passes=1 << 20, least_samples=self.samples_per_ray, most_samples=self.samples_per_ray,
-            bsdf_share=self.bsdf_share, time=self.time,
-        )  # fmt: skip
+        """As many passes as the limit of samples allows."""
+        return replace(super().options(), lights="unoccluded", max_passes=1 << 20)
 
 
 mi.register_integrator("unoccludeddirect", UnoccludedDirectIntegrator)

@@ -21,7 +21,7 @@ class VPLIntegrator(ManyLightIntegrator):
 
     .. pluginparameters::
 
-     {common parameters}
+     {knobs}
 
     Instant radiosity without any approximation but the virtual lights themselves: every light, one shadow ray each, at
     every gather point. It is what ``lightcuts`` and its relatives converge to, and slow: the time grows as pixels times

@@ -17,8 +17,8 @@ PLUGINS = {
     "matrixrecovery": {"vpl_count": 200, "slice_rows": 100},
     "illuminationcut": {"vpl_count": 200},
     "illuminationcut-adaptive": {"vpl_count": 200, "visibility": "adaptive"},
-    "adaptivedirect": {"max_samples": 300, "regions": 50},
-    "unoccludeddirect": {"max_samples": 300, "regions": 50},
+    "adaptivedirect": {"max_samples": 300},
+    "unoccludeddirect": {"max_samples": 300},
 }
 
 

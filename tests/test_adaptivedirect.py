@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from benchmarks.printed_passes import PrintedEstimates, PrintedPasses, as_printed
+from vpl.direct import adaptive
+from vpl.direct.passes import SiteEstimates
+
 from .conftest import area_light, closed_box, render, sensor, wall
 
 PLUGINS = ("adaptivedirect", "unoccludeddirect")
-AOVS = ("noise", "passes", "shadow_rays", "regions", "visible")
+AOVS = ("noise", "passes", "shadow_rays", "visible")
 TILE = 8  # pixels
 
 
@@ -130,23 +134,19 @@ def assert_same_expectation(ours, reference, alpha=0.002):
 BOTH_BAD = [
     ("error", 0.0), ("error", -0.1), ("error", "x"), ("error", math.nan), ("error", True), ("dark_floor", -1.0),
     ("dark_floor", math.inf), ("max_samples", 0), ("max_samples", 1.5), ("bsdf_share", -0.1), ("bsdf_share", "no"),
-    ("regions", 0), ("regions", 2.5), ("time", -1.0), ("time", math.nan), ("aovs", "noise,colour"),
+    ("time", -1.0), ("time", math.nan), ("aovs", "noise,colour"),
     ("aovs", "noise,noise"), ("max_depth", -2), ("rr_depth", 0), ("samples_per_pass", 0),
 ]  # fmt: skip
 ADAPTIVE_BAD = [
     ("lights", "some"), ("lights", 3), ("lights", "unoccluded"), ("cluster_angle", -0.1), ("cluster_angle", "x"),
-    ("faint_share", -0.1), ("faint_share", "some"),
-    ("max_passes", 0), ("max_passes", 2.0), ("samples_per_cluster", -1.0), ("samples_per_cluster", True),
-    ("min_samples", 0), ("min_samples", 0.5), ("guide", "evaluate"), ("guide", True), ("combine", "variance"),
-    ("shade_regions", 1), ("shade_regions", "yes"),
+    ("max_passes", 0), ("max_passes", 2.0),
 ]  # fmt: skip
 BAD = [(plugin, *bad) for plugin in PLUGINS for bad in BOTH_BAD] + [
     *(("adaptivedirect", *bad) for bad in ADAPTIVE_BAD),
     *(("unoccludeddirect", "samples_per_ray", value) for value in (1, 0, 2.5, "many")),
 ]
 ALLOWED = {
-    "lights": '"auto", "clusters", "all"', "guide": '"evaluated", "sampled"', "combine": '"fixed", "inverse_variance"',
-    "shade_regions": "true or false", "error": "a number of at least 0.0001", "samples_per_ray": "at least 2",
+    "lights": '"auto", "clusters", "all"', "error": "a number of at least 0.0001", "samples_per_ray": "at least 2",
     "max_samples": "an integer from 1 to 100000", "aovs": ", ".join(f'"{name}"' for name in AOVS),
 }  # fmt: skip
 
@@ -164,7 +164,7 @@ def test_bad_properties_are_named_with_their_value(plugin, name, value):
     ("plugin", "name", "value"),
     [
         ("adaptivedirect", "samples_per_ray", 10), ("unoccludeddirect", "lights", "all"),
-        ("unoccludeddirect", "min_samples", 10), ("adaptivedirect", "vpl_count", 10),
+        ("unoccludeddirect", "max_passes", 10), ("adaptivedirect", "vpl_count", 10),
     ],
 )  # fmt: skip
 def test_properties_of_other_plugins_are_refused(plugin, name, value):
@@ -174,19 +174,12 @@ def test_properties_of_other_plugins_are_refused(plugin, name, value):
 
 def test_properties_reach_the_sampler_under_their_own_names():
     given = {
-        "error": 0.25, "dark_floor": 0.5, "lights": "clusters", "cluster_angle": 0.125, "faint_share": 0.25,
-        "max_passes": 7, "max_samples": 1234, "samples_per_cluster": 2.5, "min_samples": 77, "bsdf_share": 0.75,
-        "guide": "sampled", "combine": "inverse_variance", "shade_regions": False, "time": 9.0,
+        "error": 0.25, "dark_floor": 0.5, "lights": "clusters", "cluster_angle": 0.125, "max_passes": 7,
+        "max_samples": 1234, "bsdf_share": 0.75, "time": 9.0,
     }  # fmt: skip
     plugin = mi.load_dict({"type": "adaptivedirect", **given})
     options, text = vars(plugin.options()), str(plugin)
-    names = {
-        "cluster_angle": "solid_angle", "min_samples": "least_samples", "guide": "evaluated",
-        "combine": "inverse_variance",
-    }  # fmt: skip
-    meant = given | {"guide": False, "combine": True}
-    assert {name: options[names.get(name, name)] for name in given} == meant
-    assert options["prior"] == 0
+    assert {name: options[name] for name in given} == given
     assert all(f"{name} = {value}" in text for name, value in given.items())
 
 
@@ -195,8 +188,6 @@ def test_properties_reach_the_sampler_under_their_own_names():
 METHODS = {
     "clusters": ("adaptivedirect", {"lights": "clusters"}),
     "all": ("adaptivedirect", {"lights": "all"}),
-    "sampled": ("adaptivedirect", {"lights": "clusters", "guide": "sampled"}),
-    "regions": ("adaptivedirect", {"lights": "clusters", "shade_regions": True}),
     "unoccluded": ("unoccludeddirect", {"samples_per_ray": 30}),
 }
 
@@ -229,13 +220,26 @@ def test_smaller_error_gives_less_noise_for_more_rays(mixed):
     assert fine < 0.7 * coarse and many > 3 * few
 
 
-def test_combining_by_variance_is_another_estimate_of_the_same(mixed, reference):
-    fixed, weighted = (
-        repeat(mixed, "adaptivedirect", 2, 4, lights="clusters", error=0.05, combine=combine)
-        for combine in ("fixed", "inverse_variance")
-    )
-    assert not np.allclose(fixed, weighted, rtol=1e-3)
-    assert abs(weighted.mean() / reference.mean() - 1) < 0.1
+class UniformPasses(PrintedPasses):
+    """Learnt from samples alone as printed, but weighted without bias."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.estimates = SiteEstimates(*arguments)
+        self.estimates.most_samples = PrintedEstimates.most_samples
+
+
+def test_probabilities_learnt_from_samples_alone_leave_the_expectation(mixed, reference, monkeypatch):
+    monkeypatch.setattr(adaptive, "SitePasses", UniformPasses)
+    assert_same_expectation(repeat(mixed, "adaptivedirect", 32, 4, error=0.2, lights="clusters"), reference)
+
+
+def test_the_method_as_printed_is_another_estimate_of_the_same(mixed, reference):
+    usual = repeat(mixed, "adaptivedirect", 2, 4, lights="clusters", error=0.05)
+    with as_printed():
+        printed = repeat(mixed, "adaptivedirect", 2, 4, lights="clusters", error=0.05)
+    assert not np.allclose(usual, printed, rtol=1e-3)
+    assert abs(printed.mean() / reference.mean() - 1) < 0.1
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
@@ -248,7 +252,7 @@ def test_emitters_seen_by_the_camera_equal_path(mixed, plugin):
 
 def test_hidden_emitters_equal_path(mixed, reference):
     more = {"hide_emitters": True}
-    ours = repeat(mixed, "adaptivedirect", 16, 4, error=0.2, shade_regions=False, **more)
+    ours = repeat(mixed, "adaptivedirect", 16, 4, error=0.2, **more)
     hidden = repeat(mixed, "path", 16, 256, 1000, max_depth=2, **more)
     assert_same_expectation(ours, hidden)
     assert hidden.mean() < 0.95 * reference.mean()
@@ -350,14 +354,14 @@ def test_aovs_have_their_names_and_ranges(mixed):
         assert tuple(integrator.aov_names()) == AOVS
         image = render(mixed, integrator, 4)
         assert np.isfinite(image).all() and image.min() >= 0
-        noise, passes, rays, regions, visible = np.moveaxis(image[..., 3:], 2, 0)
+        noise, passes, rays, visible = np.moveaxis(image[..., 3:], 2, 0)
         lit = passes > 0
         assert 0.05 < lit.mean() < 1
         assert 0 < np.median(noise[lit]) < 0.3 and noise.max() < 2
         assert rays.sum() * 4 == pytest.approx(integrator.statistics["shadow_rays"], rel=1e-5)
         assert 0 < integrator.statistics["shadow_rays"] and rays[~lit].max() == 0
         # BSDF samples that found light are counted among those that the emitter samples are
-        assert 0 < regions.max() <= 4 and visible.max() <= 1 and visible.mean() > 0.05
+        assert visible.max() <= 1 and visible.mean() > 0.05
         assert passes.sum() * 4 == pytest.approx(integrator.statistics["passes"], rel=1e-5)
         if plugin == "adaptivedirect" and more["lights"] == "clusters":
             assert passes.max() <= 15
@@ -365,7 +369,7 @@ def test_aovs_have_their_names_and_ranges(mixed):
 
 def test_aovs_come_in_the_order_that_is_asked_for(mixed):
     some, rest = (render(mixed, "adaptivedirect", 4, 1, aovs=names) for names in ("visible,noise", ",".join(AOVS)))
-    assert np.allclose(some[..., 3:], rest[..., [7, 3]], rtol=1e-4, atol=1e-6)
+    assert np.allclose(some[..., 3:], rest[..., [6, 3]], rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("method", ["clusters", "unoccluded"])
@@ -383,22 +387,13 @@ def test_noise_is_calibrated(mixed, method):
     assert actual < 0.2
 
 
-def test_shade_regions_shades_fewer_points(mixed):
-    together, alone = (
-        render(mixed, "adaptivedirect", 16, lights="clusters", error=0.1, shade_regions=on, aovs="regions")[..., 3]
-        for on in (True, False)
-    )
-    assert together.max() <= 16 and alone.max() == 16
-    assert 0 < together.mean() < 0.5 * alone.mean()
-
-
 @pytest.mark.parametrize(("plugin", "more"), [METHODS["clusters"], METHODS["unoccluded"]], ids=PLUGINS)
 def test_max_samples_holds_and_matters(mixed, plugin, more):
     most = 200
 
     def rays(limit):
         integrator = mi.load_dict(
-            {"type": plugin, "error": 1e-3, "regions": 20, "bsdf_share": 0.0, "aovs": "shadow_rays",
+            {"type": plugin, "error": 1e-3, "bsdf_share": 0.0, "aovs": "shadow_rays",
              "max_samples": limit, **more}
         )  # fmt: skip
         return render(mixed, integrator, 1)[..., 3], integrator.statistics["sources"]

@@ -33,6 +33,25 @@ def test_replacing_an_integrator_keeps_what_it_shows():
     assert "max_depth = 4" in str(file.load().integrator())
 
 
+def test_what_a_replaced_integrator_does_not_know_is_dropped_and_of_the_same_one_refused():
+    file = cornell()
+    file.set_integrator("lightcuts", {"error": 0.02, "vpl_count": 100})
+    file.set_integrator("vpl", {"clamping": 0.0}, keep=None)
+    assert file.integrator == ("vpl", {"max_depth": 6, "vpl_count": 100, "clamping": 0.0})
+    with pytest.raises(ValueError, match='vpl: unknown property "vpl_cuont"; did you mean "vpl_count"'):
+        file.set_integrator("vpl", {"vpl_cuont": 3}, keep=None)
+
+
+def test_a_misspelt_parameter_in_a_scene_is_refused_when_its_integrator_is_kept(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><integrator type="lightcuts"><float name="eror" value="1"/></integrator>'
+        '<sensor type="perspective"/><emitter type="constant"/></scene>'
+    )
+    with pytest.raises(ValueError, match='unknown property "eror"; did you mean "error"'):
+        SceneFile(path).set_integrator("lightcuts", {"max_cut": 10}, keep=None)
+
+
 def test_unknown_parameters_are_refused_even_if_looked_at():
     file = cornell()
     file.set_integrator("path", {"bogus": 1})
@@ -323,7 +342,7 @@ def test_aovs_that_not_all_know_are_asked_of_those_that_do(monkeypatch):
         ([CORNELL, "-i", ""], "'' is no name of its own"),
         ([CORNELL, "-i", "path,reference=vpl"], "'reference=vpl' is no name of its own"),
         ([CORNELL, HALL, "-r", HALL_REFERENCE], "is of one scene; for several give a folder"),
-        ([CORNELL, "-p", "lightcuts.bogus=1"], "lightcuts: the integrator 'lightcuts' has no parameter 'bogus'"),
+        ([CORNELL, "-p", "lightcuts.bogus=1"], 'lightcuts: unknown property "bogus"; there are "error", "dark_floor"'),
         ([CORNELL, "-p", "lightcuts.error=-1"], 'property "error" must be a number of at least 0, got -1'),
         ([CORNELL, "-r", "path:many"], "not of the form path:SPP"),
         ([CORNELL, "-r", "path:auto:2"], "'2' is not a fraction"),

@@ -205,8 +205,6 @@ def test_small_things_are_lit_as_by_all_lights(name):
         expected = render(scene, "vpl", spp, **settings)
         ours, _ = rendered(scene, spp, visibility="adaptive", error=1e-3, **settings)
         assert np.abs(ours - expected).mean() < 0.03 * expected.mean() and expected.mean() > 0
-    shared, _ = rendered(scene, 16, share_samples=True, **settings)
-    assert np.isfinite(shared).all() and shared.max() > 0
 
 
 @pytest.mark.parametrize("integrator", ["vpl", NAME])
@@ -247,7 +245,7 @@ def test_points_without_a_normal_are_black_as_in_the_other_methods():
 @pytest.mark.parametrize("visibility", ["all", "adaptive"])
 def test_same_seed_same_image_and_other_seed_other_image(visibility):
     scene = glossy_room()
-    settings = {"vpl_count": 1000, "max_depth": 4, "visibility": visibility, "share_samples": True}
+    settings = {"vpl_count": 1000, "max_depth": 4, "visibility": visibility}
     first, again, other = (rendered(scene, 4, seed, **settings) for seed in (3, 3, 4))
     assert_same(first, again)
     assert not np.allclose(first[0], other[0], rtol=1e-2)
@@ -287,7 +285,7 @@ def test_a_render_that_is_cancelled_ends_before_the_second_phase_is_evaluated():
 
 BAD = [
     ("error", -1.0), ("error", math.nan), ("error", "x"), ("visibility", "some"), ("max_cut", 1.5), ("max_cut", -1),
-    ("share_samples", 3), ("dark_floor", -1.0), ("phase_one_error", -0.1), ("phase_one_error", math.inf),
+    ("dark_floor", -1.0), ("phase_one_error", -0.1), ("phase_one_error", math.inf),
     ("aovs", "phase_two"),
 ]  # fmt: skip
 
@@ -300,7 +298,7 @@ def test_bad_properties_are_named_with_their_value(name, value):
 
 def test_properties_are_shown_with_their_defaults():
     text = str(mi.load_dict({"type": NAME, "visibility": "adaptive"}))
-    for line in ("visibility = adaptive", "error = 0.01", "max_cut = 1000", "share_samples = False"):
+    for line in ("visibility = adaptive", "error = 0.01", "max_cut = 1000"):
         assert line in text
     assert "error = 0.015" in str(mi.load_dict({"type": NAME}))
 
@@ -313,7 +311,7 @@ def test_no_kernel_reads_or_writes_outside_of_an_array(capfd):
     ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, sampler.next_2d(), mi.Point2f(0.5))
     plugin = mi.load_dict(
         {"type": NAME, "vpl_count": 300, "max_depth": 5, "max_cut": 50, "visibility": "adaptive"}
-        | {"share_samples": True, "aovs": "upper_bounds,phase_one"}
+        | {"aovs": "upper_bounds,phase_one"}
     )
     with dr.scoped_set_flag(dr.JitFlag.Debug, True):
         radiance, _, aovs = plugin.sample(scene, sampler, mi.Ray3f(ray))

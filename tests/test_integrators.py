@@ -228,7 +228,7 @@ def test_bad_properties_are_named_with_their_value(name, value):
 
 
 def test_unknown_properties_are_refused():
-    with pytest.raises(RuntimeError, match="vpl_cuont"):
+    with pytest.raises(RuntimeError, match='unknown property "vpl_cuont"; did you mean "vpl_count"'):
         mi.load_dict({"type": "lightcuts", "vpl_cuont": 5})
 
 

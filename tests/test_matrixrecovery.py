@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.separated_light import light_of_entries
 from vpl.core.arrays import download, upload
 from vpl.matrix import recovery as matrix_recovery
 from vpl.matrix.reduced_columns import _nearby_largest
@@ -34,6 +35,7 @@ from .test_lightcuts import many_kinds
 from .test_pairs import batch_of, glossy_room
 
 NAME = "matrixrecovery"
+PREDICTED = "nearest,linear,bayes"
 SMALL = {"max_depth": 4, "vpl_count": 3000, "direct": "vpl"}
 # Every light a column of its own, every row traced
 EXACT = {"alpha": 0.0, "max_columns": 100_000, "sampling": 9.0}
@@ -218,7 +220,7 @@ def test_with_a_column_for_every_light_and_every_row_traced_it_is_the_sum_of_all
     scene = scenes()[name]
     settings = SMALL | {"vpl_count": 200, "direct_count": 60}
     expected = render(scene, "vpl", 1, **settings)
-    image, found = rendered(scene, **settings, **EXACT, separation=False)
+    image, found = rendered(scene, **settings, **EXACT, steps=PREDICTED)
     assert relative_error(image, expected) < 1e-5
     assert found["failed_slices"] == 0
 
@@ -261,18 +263,19 @@ def test_the_bias_of_prediction_is_small_and_falls_with_sampling(shadows):
         return mean[dark].sum() / expected[dark].sum() - 1
 
     assert abs(bias()) < 0.05
-    assert abs(bias(sampling=9.0, separation=False)) < 0.01
+    assert abs(bias(sampling=9.0, steps=PREDICTED)) < 0.01
 
 
-def test_each_step_does_its_part(shadows):
+def test_each_step_does_its_part(shadows, monkeypatch):
+    monkeypatch.setattr(matrix_recovery, "DENSITY", 0.1)
     expected = render(shadows, "vpl", 1, **SMALL)
-    everything, all_found = rendered(shadows, 1, **SMALL, density=0.1)
-    without_correction, found = rendered(shadows, 1, **SMALL, correction=False)
+    everything, all_found = rendered(shadows, 1, **SMALL)
+    without_correction, found = rendered(shadows, 1, **SMALL, steps=f"{PREDICTED},separation")
     assert found["correction_rays"] == 0 < all_found["correction_rays"]
     assert dark_error(everything, expected) < 0.8 * dark_error(without_correction, expected)
-    plain, found = rendered(shadows, 1, **SMALL, separation=False)
+    plain, found = rendered(shadows, 1, **SMALL, steps=PREDICTED)
     assert found["correction_rays"] == 0 and not np.array_equal(plain, without_correction)
-    blind, found = rendered(shadows, 1, **SMALL, prediction=False, separation=False)
+    blind, found = rendered(shadows, 1, **SMALL, steps="")
     # What is not predicted is taken to arrive
     assert found["prediction_rays"] == found["nearest_columns"] == 0 and dark_error(blind, expected) > 1
 
@@ -280,16 +283,17 @@ def test_each_step_does_its_part(shadows):
 @pytest.mark.parametrize("kind", ["nearest", "linear", "bayes"])
 def test_every_predictor_alone_sees_most_shadows(shadows, kind):
     expected = render(shadows, "vpl", 1, **SMALL)
-    image, found = rendered(shadows, 1, **SMALL, predictors=kind, separation=False)
-    blind, _ = rendered(shadows, 1, **SMALL, prediction=False, separation=False)
+    image, found = rendered(shadows, 1, **SMALL, steps=kind)
+    blind, _ = rendered(shadows, 1, **SMALL, steps="")
     assert dark_error(image, expected) < 0.3 * dark_error(blind, expected)
     others = {"nearest", "linear", "bayes"} - {kind}
     assert found[f"{kind}_columns"] > 0 and all(found[f"{other}_columns"] == 0 for other in others)
 
 
-def test_light_can_be_separated_as_in_the_paper(shadows):
-    image, found = rendered(shadows, 1, **SMALL, recover="light")
+def test_light_can_be_separated_as_in_the_paper(shadows, monkeypatch):
     _, usual_found = rendered(shadows, 1, **SMALL)
+    monkeypatch.setattr(matrix_recovery, "whole_entries", light_of_entries)
+    image, found = rendered(shadows, 1, **SMALL)
     assert found["correction_rays"] != usual_found["correction_rays"]
     assert (image >= 0).all() and dark_error(image, render(shadows, "vpl", 1, **SMALL)) < 1
 
@@ -300,12 +304,12 @@ def test_a_slice_that_fails_is_traced_whole_and_counted(shadows, monkeypatch):
         return Separation(dr.full(mi.Float, np.nan, int(np.prod(shape))), ones, ones, none, [])
 
     monkeypatch.setattr(matrix_recovery, "separate", fails)
-    settings = SMALL | {"correction": False}
+    settings = SMALL | {"steps": f"{PREDICTED},separation"}
     image, found = rendered(shadows, 1, **settings)
     assert found["failed_slices"] > 0 and found["correction_rays"] > 0
     monkeypatch.undo()
     # All rows of all columns that are not alike
-    traced, _ = rendered(shadows, 1, **SMALL, sampling=9.0, separation=False)
+    traced, _ = rendered(shadows, 1, **SMALL, sampling=9.0, steps=PREDICTED)
     assert relative_error(image, traced) < 0.01
 
 
@@ -337,7 +341,7 @@ def test_the_same_seed_gives_the_same_image(shadows):
 def test_blocks_of_slices_and_chunks_of_entries_change_nothing(shadows, monkeypatch):
     from integrators import matrixrecovery
 
-    settings = SMALL | EXACT | {"slice_rows": 100, "separation": False, "vpl_count": 300}
+    settings = SMALL | EXACT | {"slice_rows": 100, "steps": PREDICTED, "vpl_count": 300}
     expected, _ = rendered(shadows, 1, **settings)
     monkeypatch.setattr(matrixrecovery, "ENTRIES", 50_000)
     assert np.array_equal(rendered(shadows, 1, **settings)[0], expected)
@@ -375,7 +379,7 @@ def test_masks_are_predicted_on_average():
     scene = mi.load_dict(closed_box({"lamp": area_light()}, size=24, veil=veil))
     expected = render(scene, "vpl", 1, **SMALL)
     for kind in ("nearest", "linear", "bayes"):
-        image, _ = rendered(scene, 1, **SMALL, predictors=kind, separation=False)
+        image, _ = rendered(scene, 1, **SMALL, steps=kind)
         assert image.sum() == pytest.approx(expected.sum(), rel=0.03)
 
 
@@ -383,9 +387,8 @@ def test_masks_are_predicted_on_average():
     ("name", "value"),
     [
         ("slice_rows", 0), ("slice_rows", 65537), ("initial_columns", 0), ("max_columns", 0), ("alpha", -0.1),
-        ("sampling", 0.0), ("prediction_error", -1.0), ("rounds", 0), ("predictors", "nearest,wrong"),
-        ("predictors", ""), ("prediction", 1), ("density", -0.5), ("recover", "both"), ("iterations", 0), ("rank", 0),
-        ("rank", 2.5),
+        ("sampling", 0.0), ("prediction_error", -1.0), ("rounds", 0), ("steps", "nearest,wrong"),
+        ("steps", "nearest,nearest"), ("steps", True),
     ],
 )  # fmt: skip
 def test_bad_properties_are_refused(name, value):
@@ -393,4 +396,4 @@ def test_bad_properties_are_refused(name, value):
 
 
 def test_properties_are_shown():
-    assert_properties_are_shown(NAME, {"slice_rows": 512, "alpha": 0.01, "recover": "light", "predictors": "linear"})
+    assert_properties_are_shown(NAME, {"slice_rows": 512, "alpha": 0.01, "steps": "linear,separation"})

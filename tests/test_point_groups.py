@@ -1,4 +1,4 @@
-"""Sites, groups, regions of pixels, and the cuts of groups through the clusters, these against brute force."""
+"""Sites, groups, and the cuts of groups through the clusters, these against brute force."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from vpl.direct.cluster_cuts import GroupCuts, PointGroups, cut_clusters, has_wide_source
 from vpl.direct.emitter_clusters import build_cluster_forest
-from vpl.direct.pixel_regions import representatives
 from vpl.direct.sites import BLOCK, bound_groups, find_groups, find_sites, normal_class
 from vpl.direct.sources import Nodes
 
@@ -483,82 +482,3 @@ def test_one_two_sided_point_opens_the_cone_of_its_group_alone():
     found = bounds(group, np.zeros((6, 3)), np.tile(UP, (6, 1)), [False, False, True, False, False, False])
     assert found.cone_cos[1] == -1
     assert (found.cone_cos[[0, 2]] > 0.99).all()
-
-
-# ---- Regions of pixels
-
-
-def standing_of(*columns):
-    return representatives(*columns, np.random.default_rng(0))
-
-
-def check_representatives(standing, pixel, shape, normal):
-    """Assert what holds for all points; returns the number of regions."""
-    assert np.array_equal(standing[standing], standing)
-    assert np.array_equal(pixel[standing], pixel)
-    assert np.array_equal(shape[standing], shape)
-    kind = normal_class(normal)
-    assert np.array_equal(kind[standing], kind)
-    regions = np.unique(standing)
-    surfaces = np.stack([pixel[regions], shape[regions], kind[regions]], 1)
-    assert np.unique(surfaces, axis=0, return_counts=True)[1].max() <= 8
-    return len(regions)
-
-
-@given(seed=SEEDS, count=st.integers(1, 300), kinds=st.integers(1, 4), scale=st.sampled_from([1e-6, 1.0, 1e6]))
-@settings(max_examples=examples(60), deadline=None)
-def test_points_stand_only_for_their_like(seed, count, kinds, scale):
-    rng = np.random.default_rng(seed)
-    pixel = rng.integers(0, 10, count) + 40_000_000
-    shape = rng.integers(0, kinds, count).astype(np.uint32) * np.uint32(1000)
-    normal = random_unit(rng, count).astype(np.float32)
-    position = (scale * rng.normal(size=(count, 3))).astype(np.float32)
-    regions = check_representatives(standing_of(pixel, shape, position, normal), pixel, shape, normal)
-    assert regions >= len(np.unique(np.stack([pixel, shape, normal_class(normal)], 1), axis=0))
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_a_plane_has_four_regions_in_each_pixel(seed):
-    rng = np.random.default_rng(seed)
-    side, samples = 12, 32
-    pixel = np.repeat(np.arange(side * side), samples)
-    along, across = random_unit(rng, 2)
-    plane = rng.random((len(pixel), 2)) + np.stack([pixel % side, pixel // side], 1)
-    position = (plane[:, :1] * along + plane[:, 1:] * across).astype(np.float32)
-    normal = np.cross(along, across)
-    normal = np.tile(normal / np.linalg.norm(normal), (len(pixel), 1)).astype(np.float32)
-    shape = np.zeros(len(pixel), np.uint32)
-    standing = standing_of(pixel, shape, position, normal)
-    regions = check_representatives(standing, pixel, shape, normal)
-    assert 3.5 * side**2 <= regions <= 4.1 * side**2
-    # Nobody stands for points farther away than across half the pixel
-    offset = position - position[standing]
-    extent = np.linalg.norm(along) + np.linalg.norm(across)
-    assert np.linalg.norm(offset, axis=1).max() < 0.75 * extent
-
-
-def test_points_off_the_plane_have_regions_of_their_own():
-    rng = np.random.default_rng(1)
-    count = 64
-    plane = rng.random((count, 2))
-    step = rng.random(count) < 0.5
-    normal = np.tile(UP, (count, 1))
-    zero = np.zeros(count, int)
-    flat = standing_of(zero, zero, np.column_stack([plane, 1e-3 * step]), normal)
-    deep = standing_of(zero, zero, np.column_stack([plane, 0.5 * step]), normal)
-    assert check_representatives(flat, zero, zero, normal) == 4
-    assert check_representatives(deep, zero, zero, normal) == 8
-    assert np.array_equal(step[deep], step)
-
-
-def test_shapes_classes_and_pixels_never_merge():
-    normal = np.array([UP, UP, UP, UP, DOWN, UP])
-    pixel = np.array([0, 0, 1, 1, 1, 0])
-    shape = np.array([7, 3, 3, 7, 3, 7], np.uint32)
-    standing = standing_of(pixel, shape, np.zeros((6, 3)), normal)
-    assert standing[1:5].tolist() == [1, 2, 3, 4]
-    assert standing[0] == standing[5] and standing[0] in (0, 5)
-
-
-def test_a_single_point_stands_for_itself():
-    assert standing_of(np.array([5]), np.array([2], np.uint32), np.ones((1, 3)), np.array([UP])).tolist() == [0]

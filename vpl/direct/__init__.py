@@ -18,12 +18,10 @@ How data flows, which is also the order to read in::
   group of points, by solid angle [IAS section 4.3]
 - ``sites``: blocks of 8 × 8 pixels, classes of normals [IAS section 4.1]; ``site_table``: sites, clusters and
   statistics as kernels read them
-- ``pixel_regions``: camera rays of a pixel that are shaded as one [IAS section 4.4]
 - ``cluster_probabilities``: the learned probability of each cluster, from the uniform, the block's and the pixel's
   function [IAS equations 4 to 6]
 - ``cluster_sampling``: the kernels: a cluster, a source, a point on it, its shadow ray
 - ``passes``: passes, their combination, and when a pixel is done [IAS sections 4.2, 5.8 and 5.9]
 - ``all_sources``: the plain sum over all sources, where it is cheaper
 - ``unoccluded_passes``: the reference method: a fixed density, proportional to unoccluded light [IAS section 5.1]
-- ``shared_samples``: samples of a pixel that take over each other's light, for ``illuminationcut``
 """

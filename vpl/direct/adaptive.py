@@ -25,8 +25,7 @@ from ..points.camera_paths import GatherPoints, PixelGrid
 from ..points.surfaces import Batch, LambertianSurface, make_batches
 from .all_sources import SourceRounds
 from .cluster_cuts import GroupCuts, cut_clusters, has_wide_source
-from .passes import SitePasses
-from .pixel_regions import representatives
+from .passes import SiteEstimates, SitePasses
 from .site_table import Scenery, SiteTable
 from .sites import Sites, bound_groups, divide_points
 from .sources import Sources
@@ -38,42 +37,39 @@ _ENTRIES = 12_000_000
 _SUM_WORTH = 4
 # Sites of the pilot, which finds the mean radiance of the image
 _PILOT_SITES = 1024
-FIELDS = ("noise", "passes", "shadow_rays", "regions", "visible")
+# Clusters that would send less than this share of the light at a group of points, if nothing was between, may be coarse
+FAINT_SHARE = 0.005
+FIELDS = ("noise", "passes", "shadow_rays", "visible")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DirectOptions:
-    """What users choose; see the plugin ``adaptivedirect``."""
+    """What users choose, under the names of the properties of ``adaptivedirect`` and ``unoccludeddirect``.
 
-    error: float
+    ``lights``: "clusters", "all" or "auto"; or "unoccluded", the reference method.
+    """
+
+    error: float = 0.03
     dark_floor: float = 0.1
     lights: str = "auto"
-    solid_angle: float = 0.02
-    faint_share: float = 0.005
+    cluster_angle: float = 0.02
     max_passes: int = 15
-    max_samples: int = 20000
-    samples_per_cluster: float = 1.5
-    least_samples: int = 50
-    most_samples: int = 400
+    max_samples: int = 20_000
+    samples_per_ray: int = 100
     bsdf_share: float = 0.125
-    evaluated: bool = True
-    prior: float = 1.0
-    inverse_variance: bool = False
-    shade_regions: bool = False
     time: float = 0.0
 
 
 @dataclass
 class DirectLight:
     """Per gather point: ``radiance``; ``noise``: estimated standard error over radiance; ``passes``; ``shadow_rays``,
-    shared out among the points that were shaded as one; ``regions``: points that were shaded in the site; ``visible``:
-    share of the samples that found light. Float but the radiance.  ``clusters``: how many light each point, summed."""
+    shared out among the points of a site; ``visible``: share of the samples that found light. Float but the radiance.
+    ``clusters``: how many light each point, summed."""
 
     radiance: object
     noise: object
     passes: object
     shadow_rays: object
-    regions: object
     visible: object
     clusters: int = 0
 
@@ -119,12 +115,6 @@ class _BatchLight:
         position, normal = download(batch.position), download(batch.normal)
         generator = np.random.default_rng(seed)
         self._single = options.lights == "unoccluded"  # sources instead of clusters
-        self._standing = np.arange(batch.count)
-        if options.shade_regions and grid.samples > 1:
-            # What is seen by way of a mirror is no neighbour of what is seen directly
-            surface = download(dr.reinterpret_array(mi.UInt32, points.si.shape)).astype(np.int64) << 8
-            surface += np.minimum(download(points.depth), 255)
-            self._standing = representatives(pixel, surface[self.rows], position, normal, generator)
         # Only the reference method takes the points of a site in their order
         self.sites = divide_points(pixel, grid.width, position, normal, generator if self._single else None)
         two_sided = np.zeros(batch.count, bool)
@@ -137,14 +127,14 @@ class _BatchLight:
     def _choose(self) -> None:
         """Cuts of all groups, which of them sum over all sources, and their share of BSDF samples."""
         options, count = self.options, self._bounds.count
-        self._cuts = self._cut(np.arange(count), options.solid_angle)
+        self._cuts = self._cut(np.arange(count), options.cluster_angle)
         group = self._cuts.group
         held = (self.nodes.last.astype(np.int64) - self.nodes.first)[self._cuts.node]
         # Sources of each group, and how many of them have an extent
         self._held, extended = (np.bincount(group, x, count) for x in (held, self.nodes.extended[self._cuts.node]))
         self._summed = np.full(count, options.lights == "all")
         if options.lights == "auto" and self._beyond is None:
-            a_pass = np.maximum(options.samples_per_cluster * self._cuts.size, options.least_samples)
+            a_pass = np.maximum(SiteEstimates.samples_per_cluster * self._cuts.size, SiteEstimates.least_samples)
             self._summed = (extended == 0) & (self._held <= _SUM_WORTH * a_pass)
         # Emitter samples alone are enough for small sources and matt surfaces, unless light comes by way of a mirror
         self._bsdf = np.ones(count) * options.bsdf_share
@@ -152,7 +142,7 @@ class _BatchLight:
             self._bsdf *= has_wide_source(self.nodes, self._bounds, self._cuts)
 
     def _cut(self, groups, solid_angle: float) -> GroupCuts:
-        cuts = cut_clusters(self.nodes, self._bounds.select(groups), solid_angle, self.options.faint_share)
+        cuts = cut_clusters(self.nodes, self._bounds.select(groups), solid_angle, FAINT_SHARE)
         # Where light comes by way of mirrors, BSDF samples are taken even if nothing lights a group directly
         return cuts if self._beyond is None or self.nodes.count == 0 else cuts.without_empty()
 
@@ -170,12 +160,15 @@ class _BatchLight:
         part = self.sites.select(chosen)
         passes = SitePasses(*self._task(part, self._cuts.select(chosen), chosen), 0.0, self.options)
         passes.max_passes = 1
+        if self._single:
+            # As many as the method itself takes
+            passes.estimates.least_samples = passes.estimates.most_samples = self.options.samples_per_ray
         passes.run(self._two_sided, seed, lambda number: False)
         return float(np.average(passes.result()[0].mean(1), weights=part.points))
 
     def _task(self, part: Sites, cuts: GroupCuts, groups):
         """(Scenery, share of the pixel's rays, share of BSDF samples) of the sites of some groups."""
-        table = SiteTable.of(part, cuts, self._standing[part.order])
+        table = SiteTable.of(part, cuts)
         return (
             Scenery(*self._common, table, self._beyond),
             part.points / self.grid.samples,
@@ -224,10 +217,7 @@ class _BatchLight:
         radiance, variance, passes, rays, visible = result
         level = radiance.mean(1)
         noise = np.where(level > 0, np.sqrt(variance) / np.where(level > 0, level, 1), 0)
-        regions = np.bincount(
-            np.repeat(np.arange(part.count), part.points), self._standing[part.order] == part.order, part.count
-        )
-        return np.concatenate([radiance, np.stack([noise, passes, rays / part.points, regions, visible], 1)], 1)
+        return np.concatenate([radiance, np.stack([noise, passes, rays / part.points, visible], 1)], 1)
 
 
 def _halted(stopped, until: float, number: int) -> bool:

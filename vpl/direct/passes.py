@@ -26,7 +26,6 @@ _BLACK_PASSES, _BLACK_SAMPLES = 3, 250
 _BLACK_LEAST = 48  # however small a part of its pixel a site is
 _BSDF_LEAST = 2
 _NEIGHBOURS = 256  # sites in a row that are sampled in the order of their samples
-_LEAST_VARIANCE = 0.01  # of a pass, relative to the mean over sites, where passes are weighted by it
 # Shares of the uniform function after the first pass, and how the block's gives way to the pixel's [IAS fig. 2]
 _UNIFORM_SHARE, _BLOCK_DECAY = 0.1, 0.7
 
@@ -38,6 +37,9 @@ class SiteEstimates:
     ``bsdf_share`` (s,): BSDF samples for each emitter sample; ``level``: mean radiance of the image, which
     ``options.dark_floor`` is relative to.
     """
+
+    # Emitter samples of a pixel in a pass: for each of its clusters, at least, at most [IAS section 5.8]
+    samples_per_cluster, least_samples, most_samples = 1.5, 50, 400
 
     def __init__(self, scenery: Scenery, share, bsdf_share, level: float, options):
         self.scenery, self.share, self.bsdf_share = scenery, share, bsdf_share
@@ -53,8 +55,7 @@ class SiteEstimates:
     def draw(self, wanted: np.ndarray, number: int, weight: float, seed: int) -> None:
         """Take ``wanted`` samples of each half and site, (2, s), and add what they find.
 
-        Estimates are weighted by their samples times ``weight``.  Weights that do not depend on what was found leave
-        the combination unbiased; in the paper they are the inverse of the variance that each pass estimates (eq. 7, 8).
+        Estimates are weighted by their samples times ``weight``; see :meth:`_weights`.
         """
         half, site = np.nonzero(wanted)
         # Lanes run in step with the next ones, which should be near and have as many samples
@@ -64,11 +65,7 @@ class SiteEstimates:
         bsdf = np.where(self.bsdf_share > 0, np.maximum(np.ceil(wanted * self.bsdf_share), _BSDF_LEAST), 0)[half, site]
         drawn = draw_samples(self.scenery, Lanes(*(upload(mi.UInt32, x) for x in (site, half, samples, bsdf))), seed)
         variance = download(drawn.variance).astype(np.float64)
-        weight = samples * weight
-        if self.options.inverse_variance:
-            # A pass that saw nothing has no variance: it counts as much as one with little
-            typical = np.mean(variance * samples) / samples
-            weight = 1 / np.maximum(variance, np.maximum(_LEAST_VARIANCE * typical, np.finfo(np.float32).tiny))
+        weight = self._weights(samples, variance, weight)
         self.total[half, site] += weight[:, None] * download(drawn.radiance)
         self.weight[half, site] += weight
         self.spread[half, site] += np.square(weight) * variance
@@ -78,11 +75,18 @@ class SiteEstimates:
         self.passes[site] = number + 1
         np.add.at(self.rays, site, download(drawn.rays))
 
+    def _weights(self, samples: np.ndarray, variance: np.ndarray, weight: float) -> np.ndarray:
+        """What the estimates of a pass count, per half and site that was sampled.
+
+        Weights that do not depend on what was found leave the combination unbiased; in the paper they are the inverse
+        of the variance that each pass estimates (eq. 7, 8).
+        """
+        return samples * weight
+
     def full_pass(self) -> np.ndarray:
         """Samples of each half in a whole pass [IAS section 5.8], (2, s); 0 for sites that no cluster lights."""
-        options = self.options
-        of_pixel = np.clip(options.samples_per_cluster * self.size, options.least_samples, options.most_samples)
-        of_pixel = np.minimum(of_pixel, options.max_samples)
+        of_pixel = np.clip(self.samples_per_cluster * self.size, self.least_samples, self.most_samples)
+        of_pixel = np.minimum(of_pixel, self.options.max_samples)
         half = np.maximum(np.ceil(of_pixel * self.share / 2).astype(np.int64), _LEAST_HALF)
         return np.where(self.size > 0, half, 0) * np.ones((2, 1), np.int64)
 
@@ -132,6 +136,9 @@ class SiteEstimates:
 class SitePasses:
     """The passes over the sites of a table, which learn from one another.  Arguments as in :class:`SiteEstimates`."""
 
+    # Weight of the belief that all is visible, in samples
+    prior = 1.0
+
     def __init__(self, scenery: Scenery, share, bsdf_share, level: float, options):
         self.estimates = SiteEstimates(scenery, share, bsdf_share, level, options)
         self.scenery, self.options, self.max_passes = scenery, options, options.max_passes
@@ -147,8 +154,7 @@ class SitePasses:
             return
         scenery.importance = dr.ones(mi.Float, table.entries)
         dr.eval(scenery.importance)
-        if self.options.evaluated:
-            update_importance(scenery, two_sided, dr.arange(mi.UInt32, table.count))
+        self._evaluate_importance(two_sided)
         scenery.statistics = Statistics.empty(table.entries)
         scenery.probability = dr.empty(mi.Float, table.entries)
         of_groups = tuple(dr.zeros(mi.Float, dr.width(table.node)) for _ in range(3))
@@ -164,6 +170,10 @@ class SitePasses:
             estimates.draw(wanted, number, np.sqrt(number + 1.0), derived_seed(seed, number))
             wanted = estimates.wanted(number, *estimates.halves())
 
+    def _evaluate_importance(self, two_sided) -> None:
+        """What clusters would send if nothing was between."""
+        update_importance(self.scenery, two_sided, dr.arange(mi.UInt32, self.scenery.table.count))
+
     def _places(self, active: np.ndarray) -> np.ndarray:
         """Where the nodes of the cuts of some sites' groups are."""
         first, at = np.unique(self._cut[active], return_index=True)
@@ -174,7 +184,7 @@ class SitePasses:
         the pixel's."""
         uniform = 1.0 if number == 0 else _UNIFORM_SHARE
         pixel = (1 - uniform) * (1 - _BLOCK_DECAY**number)
-        shares = (uniform, 1 - uniform - pixel, pixel, self.options.prior)
+        shares = (uniform, 1 - uniform - pixel, pixel, self.prior)
         return Mixture(*(dr.opaque(mi.Float, share) for share in shares))
 
     def result(self):

@@ -48,14 +48,14 @@ class SiteTable:
         return dr.width(self.size)
 
     @classmethod
-    def of(cls, sites: Sites, cuts: GroupCuts, member_row: np.ndarray) -> SiteTable:
-        """``member_row``: for every point along ``sites.order``, the row in the batch that stands for it."""
+    def of(cls, sites: Sites, cuts: GroupCuts) -> SiteTable:
+        """Table of sites with the cuts of their groups."""
         size = cuts.size[sites.group]
         entry = np.concatenate([[0], np.cumsum(size)])
         group = cuts.group
         local = np.arange(len(cuts.node)) - cuts.first[group]
         columns = (
-            size, cuts.first[sites.group], entry[:-1], sites.first[:-1], sites.points, member_row, cuts.node,
+            size, cuts.first[sites.group], entry[:-1], sites.first[:-1], sites.points, sites.order, cuts.node,
             entry[sites.group_first[group]] + local, cuts.size[group], sites.per_group[group],
         )  # fmt: skip
         return cls(*(upload(mi.UInt32, column) for column in columns), int(entry[-1]))

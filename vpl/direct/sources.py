@@ -90,9 +90,9 @@ class DeviceNode:
 
 
 class Sources:
-    """All sources of a scene.  ``regions``: at most so many clusters for an environment."""
+    """All sources of a scene.  ``regions``: at most so many clusters for an environment [IAS section 4.3.1]."""
 
-    def __init__(self, scene, emitters: Emitters, regions: int):
+    def __init__(self, scene, emitters: Emitters, regions: int = 300):
         self.emitters = emitters
         self._reach = 2 * float(bounding_sphere(scene).radius)
         self._pieces = EmitterPieces(scene, emitters.area)

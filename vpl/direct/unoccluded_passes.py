@@ -22,11 +22,14 @@ _LEAST_PASSES = 4  # of each half: fewer say nothing about the variance between 
 
 
 class UnoccludedPasses:
-    """Passes over one point of every site after another.  ``options.least_samples`` and ``most_samples``:
-    emitter samples at each.  Other arguments as in :class:`vpl.direct.passes.SiteEstimates`."""
+    """Passes over one point of every site after another, with ``options.samples_per_ray`` emitter samples at each.
+
+    Arguments as in :class:`vpl.direct.passes.SiteEstimates`.
+    """
 
     def __init__(self, scenery, share, bsdf_share, level, options):
         self.estimates = SiteEstimates(scenery, share, bsdf_share, level, options)
+        self.estimates.least_samples = self.estimates.most_samples = options.samples_per_ray
         self.scenery, self.options = scenery, options
         self.several = download(scenery.table.members) > 1
         # Sums over the passes of each half and site: their means, squares of these, and how many there were

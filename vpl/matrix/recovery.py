@@ -3,15 +3,15 @@
 First every entry that was not traced is predicted, column by column; then the matrix is separated into a part of low
 rank and sparse errors; and where errors lie dense, entries are traced after all.
 
-Departure from the paper: what is separated is visibility, V, rather than light, E V (``recover`` says which).  E needs
-no recovering, and makes the rank higher: separated light errs more than predictions (benchmarks/matrixrecovery.py).
-And what is recovered is D − Z, not XY, so that entries in which no error was found stay what they are.
+Departure from the paper: what is separated is visibility, V, rather than light, E V.  E needs no recovering, and makes
+the rank higher: separated light errs more than predictions (benchmarks/matrixrecovery.py).  And what is recovered is
+D − Z, not XY, so that entries in which no error was found stay what they are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -22,28 +22,17 @@ from ..core.sampling import HASH_ROUNDS
 from ..core.stages import Stage
 from .matrix_block import MatrixBlock
 from .separation import Separation, SeparationLimits, separate
-from .visibility_prediction import Predictors
+from .visibility_prediction import PREDICTORS, Predictors
 
+# What may be done [MSR 7.1]: the predictors to choose from, and what follows prediction
+STEPS = (*PREDICTORS, "separation", "correction")
+# Share of errors around an entry from which on it is traced; 0.2 in the paper, but errors lie denser here
+DENSITY = 0.65
+LIMITS = SeparationLimits()
 # The Gaussian of the density of errors: 7 × 7 entries [MSR 6.2]
 _TAPS, _SIGMA = 7, 1.5
 # An error counts from this fraction of the whole entry on
 _LEAST_ERROR = 0.01
-
-
-@dataclass(frozen=True)
-class RecoveryOptions:
-    """Which steps are taken, and how [MSR 7.1].
-
-    ``prediction``: else what was not traced is taken to arrive; ``separation``; ``correction``, of errors denser than
-    ``density``; ``recover``: "visibility" or "light".
-    """
-
-    prediction: bool = True
-    separation: bool = True
-    correction: bool = True
-    density: float = 0.65
-    recover: str = "visibility"
-    limits: SeparationLimits = field(default_factory=SeparationLimits)
 
 
 @dataclass
@@ -71,21 +60,23 @@ class Recovered:
 
 
 def recover(
-    block: MatrixBlock, predictors: Predictors, best: np.ndarray, first: int, options: RecoveryOptions, seed: int,
+    block: MatrixBlock, predictors: Predictors, best: np.ndarray, first: int, steps: tuple[str, ...], seed: int,
     lap: Callable[[Stage], None] = lambda stage: None,
 ) -> Recovered:  # fmt: skip
     """Recover a block: see :class:`Recovered`.
 
     ``best``: the predictor of every column that has samples; those of the block are these from number ``first`` on.
-    ``lap``: called with every stage as it ends.
+    ``steps``: those of STEPS that are taken; without a predictor what was not traced is taken to arrive, and correction
+    needs separation.  ``lap``: called with every stage as it ends.
     """
-    predicted, traced = _predicted(block, predictors, best, first, options.prediction, seed)
+    prediction = any(step in PREDICTORS for step in steps)
+    predicted, traced = _predicted(block, predictors, best, first, prediction, seed)
     lap(Stage.PREDICTION)
     found = Recovered(block.unoccluded(), predicted, traced, mi.Float(predicted))
     lap(Stage.SHADING)
-    mixed = _mixed_columns(predictors, first, block.columns.count) if options.separation else []
+    mixed = _mixed_columns(predictors, first, block.columns.count) if "separation" in steps else []
     if len(mixed):
-        wanted = _separate(found, block, mixed, options, seed)
+        wanted = _separate(found, block, mixed, "correction" in steps, seed)
         lap(Stage.SEPARATION)
         if len(wanted):
             block.trace(found.visibility, wanted, dr.opaque(mi.UInt32, seed))
@@ -99,17 +90,18 @@ def _mixed_columns(predictors: Predictors, first: int, count: int) -> np.ndarray
     return np.flatnonzero(np.minimum(*sums) > _LEAST_ERROR)
 
 
-def _separate(found: Recovered, block: MatrixBlock, mixed: np.ndarray, options: RecoveryOptions, seed: int):
-    """Find and take off errors in some columns: the places where they lie dense, and of slices that failed, UInt32."""
+def _separate(found: Recovered, block: MatrixBlock, mixed: np.ndarray, correction: bool, seed: int):
+    """Find and take off errors in some columns: the places to trace, UInt32, which are all of slices that failed and,
+    with ``correction``, those where errors lie dense."""
     part = MatrixBlock(block.entries, block.columns.select(mixed), block.begin, block.begin + block.slices)
     source, present = _places(block, part, mixed)
     predicted = dr.gather(mi.Float, found.predicted, source, present)
     free = present & ~dr.gather(mi.Bool, found.traced, source, present)
     unoccluded = dr.gather(mi.Float, found.unoccluded, source, present)
-    weight = _weight(unoccluded, present, options.recover)
+    weight = whole_entries(unoccluded, present)
     whole = predicted * weight
     dr.eval(whole, weight, free, predicted, unoccluded)
-    found.part, found.separation = part, separate(whole, free, weight, part.shape, options.limits, seed)
+    found.part, found.separation = part, separate(whole, free, weight, part.shape, LIMITS, seed)
     error = dr.select(free & (weight > 0), found.separation.error / weight, 0)
     error = dr.select(dr.isfinite(error), dr.clip(error, -1, 1), 0)
     found.error = error
@@ -118,9 +110,9 @@ def _separate(found: Recovered, block: MatrixBlock, mixed: np.ndarray, options: 
     wanted = failed = _of_slices(part, found.separation.failed)
     dr.scatter(found.visibility, dr.clip(predicted - error, 0, 1), source, present & ~failed)
     dr.eval(found.visibility)
-    if options.correction:
+    if correction:
         found.density = _blurred(part, wrong)
-        wanted |= found.density > options.density
+        wanted |= found.density > DENSITY
     return dr.gather(mi.UInt32, source, dr.compress(wanted & free & (unoccluded > 0)))
 
 
@@ -166,12 +158,9 @@ def _predicted(block: MatrixBlock, predictors: Predictors, best: np.ndarray, fir
     return values, traced
 
 
-def _weight(unoccluded, present, recover: str):
-    """What an entry is where all arrives: E in units of its mean, or 1; 0 where there is no entry."""
-    if recover == "visibility":
-        return dr.select(present, mi.Float(1), 0)
-    total = float(dr.sum(dr.float64_array_t(mi.Float)(unoccluded))[0])
-    return unoccluded * dr.opaque(mi.Float, dr.width(unoccluded) / total if total > 0 else 0.0)
+def whole_entries(unoccluded, present):
+    """What an entry of the separated matrix is where all arrives: of V, 1; 0 where there is no entry."""
+    return dr.select(present, mi.Float(1), 0)
 
 
 def _of_slices(block: MatrixBlock, chosen: np.ndarray):

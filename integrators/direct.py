@@ -1,0 +1,149 @@
+"""The base class of the integrators of direct light alone; they differ in what they choose for its core."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from time import perf_counter
+
+import drjit as dr
+import mitsuba as mi
+
+from vpl.core.arrays import download
+from vpl.core.sampling import derived_seed
+from vpl.core.stages import Stage
+from vpl.direct.adaptive import FIELDS, DirectOptions, light_directly
+from vpl.direct.sources import Sources
+from vpl.points.camera_paths import PixelGrid
+
+from .bands import fits_one_band, random_rays, render_in_bands
+from .gathering import CameraPass, GatheringIntegrator, add_statistics, whole_sum
+from .knobs import Depth, Integer, Number, Words, knobs_of
+
+_LEVEL_RAYS = 4096
+
+
+@dataclass
+class Band:
+    """What a band of rows knows of the image: how its pixels lie, the mean radiance, and its share of the time."""
+
+    grid: PixelGrid
+    level: float
+    time: float
+
+
+class DirectLightIntegrator(GatheringIntegrator):
+    """Base class: lights gather points by :func:`vpl.direct.adaptive.light_directly`, large images in bands."""
+
+    along_curve = False  # the pixels' points stay together
+    knobs = (
+        Number(
+            "error", DirectOptions.error,
+            "Standard error to reach in each pixel, as a fraction of its radiance: 0.03 is 3%.",
+            minimum=1e-4,
+        ),
+        Number(
+            "dark_floor", DirectOptions.dark_floor,
+            "Pixels darker than this fraction of the image's mean are rendered about as precisely as if they had it.",
+            minimum=0,
+        ),
+        Integer(
+            "max_samples", DirectOptions.max_samples,
+            "Most emitter samples of a pixel; at least four are taken for each half of the estimate.",
+            minimum=1, maximum=100_000,
+        ),
+        Number(
+            "bsdf_share", DirectOptions.bsdf_share,
+            "BSDF samples for each emitter sample, where surfaces are glossy or emitters near; 0 leaves them out, "
+            "which is noisy there and loses emitters behind glass.",
+            minimum=0,
+        ),
+        Number("time", DirectOptions.time, "Seconds after which to stop, at whatever error; 0 is no limit.", minimum=0),
+        Depth(
+            "max_depth", 2,
+            "Longest path from camera to emitter, in edges, as Mitsuba's ``path`` counts them: 1 shows emitters only, "
+            "2 adds direct light at the surfaces that the camera sees; more follows mirrors, glass and masks to the "
+            "surface behind them, whose direct light is shown. -1 is no limit.",
+        ),
+        Words(
+            "aovs", "",
+            "Comma-separated channels to return, per camera ray: {allowed}. ``noise`` is the estimated standard error "
+            "relative to the radiance, ``visible`` the share of samples that found light.",
+            words=FIELDS,
+        ),
+    )  # fmt: skip
+
+    def __init__(self, props):
+        super().__init__(props)
+        self._in_base, self._band = False, None
+
+    def options(self) -> DirectOptions:
+        """The knobs that the core takes, under their own names."""
+        taken = {field.name for field in fields(DirectOptions)}
+        names = [knob.name for knob in knobs_of(type(self)) if knob.name in taken]
+        return DirectOptions(**{name: getattr(self, name) for name in names})
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """Render as Mitsuba does, but large images in bands of rows; see :mod:`integrators.bands`."""
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        samples = spp or sensor.sampler().sample_count()
+        # The base class calls this method again
+        if self._in_base or self.samples_per_pass < samples or fits_one_band(sensor.film(), samples):
+            self._in_base = True
+            try:
+                return super().render(scene, sensor, seed, spp, develop, evaluate)
+            finally:
+                self._in_base = False
+        with dr.suspend_grad():
+            self._render_bands(scene, sensor, int(mi.UInt32(seed)[0]), samples)
+        return sensor.film().develop() if develop else mi.TensorXf()
+
+    def _render_bands(self, scene, sensor, seed: int, samples: int) -> None:
+        """One level of brightness and one budget of time for all bands."""
+        level, start, totals = self._find_level(scene, sensor, derived_seed(seed, 1)), perf_counter(), {}
+
+        def trace(sampler, ray, grid, share):
+            left = max(self.time - (perf_counter() - start), 1e-3) * share if self.time > 0 else 0.0
+            self._band = Band(grid, level, left)
+            try:
+                return self.sample(scene, sampler, ray)
+            finally:
+                self._band = None
+                add_statistics(totals, self.statistics)
+
+        render_in_bands(self, scene, sensor, derived_seed(seed, 2), samples, trace)
+        self.statistics = totals
+
+    def _find_level(self, scene, sensor, seed: int) -> float:
+        """Mean radiance of direct light over the film, from one pass at few points."""
+        camera = self.begin(scene, *random_rays(sensor, seed, _LEVEL_RAYS))
+        if camera.dark or self.max_depth < 2:
+            return 0.0
+        quick = replace(self.options(), max_passes=1, lights="clusters")
+        found = light_directly(
+            scene, camera.traits, Sources(scene, camera.emitters), camera.paths.points, PixelGrid(8, 1),
+            self.max_depth, quick, derived_seed(seed, 1), level=0.0,
+        )  # fmt: skip
+        return float(download(found.radiance).sum(dtype="float64")) / (3 * _LEVEL_RAYS)
+
+    def pixel_grid(self, scene, sampler):
+        """How the camera rays of this pass or band lie in the image."""
+        return self._band.grid if self._band else super().pixel_grid(scene, sampler)
+
+    def light(self, scene, sampler, camera: CameraPass):
+        """Direct light of all emitters; see :func:`vpl.direct.adaptive.light_directly`."""
+        points = camera.paths.points
+        if camera.dark or self.max_depth < 2:
+            return mi.UnpolarizedSpectrum(0), {}, {"shadow_rays": 0}
+        sources = Sources(scene, camera.emitters)
+        camera.clock.lap(Stage.SOURCES)
+        options, level = self.options(), None
+        if self._band:
+            options, level = replace(options, time=self._band.time), self._band.level
+        found = light_directly(
+            scene, camera.traits, sources, points, self.pixel_grid(scene, sampler), self.max_depth, options,
+            derived_seed(camera.seed, 30), self.should_stop, level,
+        )  # fmt: skip
+        camera.clock.lap(Stage.DIRECT)
+        counts = {"sources": sources.count, "shadow_rays": whole_sum(found.shadow_rays)}
+        counts |= {"passes": whole_sum(found.passes), "clusters": found.clusters}
+        return found.radiance, vars(found), counts | {"dropped": camera.emitters.dropped}

@@ -1,0 +1,241 @@
+"""Properties of plugins, each declared once: what may be given, what is said of it, and what it is by default.
+
+A plugin class has a tuple ``knobs`` of those that it adds to its base classes' or has otherwise than they.  Its
+constructor calls :func:`read_knobs`, which checks what was given and sets an attribute of the same name for each; its
+``to_string`` prints them by :func:`show_knobs`, and its manual page lists them (:mod:`integrators.manual`).
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import textwrap
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+_PAGE_WIDTH = 118
+# Read by Mitsuba itself
+_OF_MITSUBA = ("timeout", "samples_per_pass", "block_size")
+
+
+@dataclass(frozen=True)
+class Knob:
+    """Property of a plugin.
+
+    ``default``: what it is where nothing is given, or a function of the plugin, which has the knobs declared before;
+    ``text``: what it does, in reStructuredText, where ``{allowed}`` stands for the words that may be given;
+    ``stated_default``: what the page says of the default, if not its value.
+    """
+
+    name: str
+    default: object
+    text: str
+    stated_default: str = field(default="", kw_only=True)
+
+    type: ClassVar[str]  # as Mitsuba's manual has it
+
+    @property
+    def allowed(self) -> str:
+        """What may be given, in words."""
+        raise NotImplementedError
+
+    def parse(self, value):
+        """The attribute that becomes of a given value; None if that is not allowed."""
+        raise NotImplementedError
+
+    def show(self, value):
+        """What is printed of an attribute: that which would have to be given for it."""
+        return value
+
+    def read(self, plugin, props):
+        """The value that was given or the default; raises ValueError, which names property, value, what is allowed."""
+        value = props.get(self.name, self.default(plugin) if callable(self.default) else self.default)
+        parsed = self.parse(value)
+        if parsed is None:
+            raise ValueError(f'{props.plugin_name()}: property "{self.name}" must be {self.allowed}, got {value!r}')
+        return parsed
+
+    def entry(self) -> str:
+        """The property's entry of Mitsuba's directive ``pluginparameters``."""
+        default = self.stated_default or self._stated(self.default)
+        text = f"{self.text.replace('{allowed}', self._stated_words())} (Default: {default}{self._stated_limits()})"
+        wrapped = textwrap.fill(
+            text, _PAGE_WIDTH, initial_indent="  - ", subsequent_indent="    ", break_long_words=False,
+            break_on_hyphens=False,
+        )  # fmt: skip
+        return f"* - {self.name}\n  - |{self.type}|\n{wrapped}\n"
+
+    def _stated(self, default) -> str:
+        return str(default)
+
+    def _stated_words(self) -> str:
+        return ""
+
+    def _stated_limits(self) -> str:
+        return ""
+
+
+@dataclass(frozen=True)
+class _Limited(Knob):
+    """Number between two others, both allowed."""
+
+    minimum: float = field(kw_only=True)
+    maximum: float = field(default=math.inf, kw_only=True)
+
+    def _stated_limits(self) -> str:
+        return f"; at least {self.minimum:g}" + (f", at most {self.maximum:g}" if self.maximum < math.inf else "")
+
+    def _within(self, value) -> bool:
+        return self.minimum <= value <= self.maximum
+
+
+class Integer(_Limited):
+    """Whole number."""
+
+    type = "int"
+
+    @property
+    def allowed(self):
+        if self.maximum == math.inf:
+            return f"an integer of at least {self.minimum}"
+        return f"an integer from {self.minimum} to {self.maximum}"
+
+    def parse(self, value):
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        return value if whole and self._within(value) else None
+
+
+class Number(_Limited):
+    """Finite number."""
+
+    type = "float"
+
+    @property
+    def allowed(self):
+        if self.maximum == math.inf:
+            return f"a number of at least {self.minimum:g}"
+        return f"a number from {self.minimum:g} to {self.maximum:g}"
+
+    def parse(self, value):
+        numeric = isinstance(value, int | float) and not isinstance(value, bool)
+        return float(value) if numeric and math.isfinite(value) and self._within(value) else None
+
+
+class Boolean(Knob):
+    """True or false."""
+
+    type = "bool"
+    allowed = "true or false"
+
+    def parse(self, value):
+        return value if isinstance(value, bool) else None
+
+    def _stated(self, default):
+        return "yes" if default else "no"
+
+
+class Depth(Knob):
+    """Number of edges, -1 for as many as there are, which the attribute has as infinity."""
+
+    type = "int"
+    allowed = "-1 (no limit) or an integer of at least 0"
+
+    def parse(self, value):
+        if isinstance(value, bool) or not isinstance(value, int) or value < -1:
+            return None
+        return math.inf if value == -1 else value
+
+    def show(self, value):
+        return -1 if value == math.inf else value
+
+
+@dataclass(frozen=True)
+class _Worded(Knob):
+    """One or several of the words ``words``."""
+
+    words: tuple[str, ...] = field(kw_only=True)
+
+    type = "string"
+
+    def _quoted(self) -> str:
+        return ", ".join(f'"{word}"' for word in self.words)
+
+    def _stated_words(self) -> str:
+        return ", ".join(f"``{word}``" for word in self.words)
+
+
+class Choice(_Worded):
+    """One of some words."""
+
+    @property
+    def allowed(self):
+        return f"one of {self._quoted()}"
+
+    def parse(self, value):
+        return value if value in self.words else None
+
+    def _stated(self, default):
+        return f"``{default}``"
+
+
+class Words(_Worded):
+    """Any of some words, separated by commas, each at most once; the attribute is a tuple of them."""
+
+    @property
+    def allowed(self):
+        return f"a comma-separated list out of {self._quoted()}"
+
+    def parse(self, value):
+        if not isinstance(value, str):
+            return None
+        found = tuple(word.strip() for word in value.split(",")) if value.strip() else ()
+        return found if set(found) <= set(self.words) and len(set(found)) == len(found) else None
+
+    def show(self, value):
+        return ",".join(value)
+
+    def _stated(self, default):
+        return f"``{default}``" if default else "none"
+
+
+# What all integrators that follow camera rays have in common, with the defaults of Mitsuba's ``path``
+PATH_KNOBS = (
+    Depth(
+        "max_depth", -1,
+        "Longest path from camera to emitter, in edges, counted as Mitsuba's ``path`` counts them: 1 shows emitters "
+        "only, 2 adds direct light, and -1 is no limit.",
+    ),
+    Integer("rr_depth", 5, "Edges after which paths may end by Russian roulette.", minimum=1),
+    Boolean("hide_emitters", False, "Do not show area emitters and environments to the camera."),
+)  # fmt: skip
+
+
+def knobs_of(plugin: type) -> tuple[Knob, ...]:
+    """All knobs of a class: its own, then those of its base classes that it has no knob of the same name for."""
+    found: dict[str, Knob] = {}
+    for one in plugin.__mro__:
+        for knob in vars(one).get("knobs", ()):
+            found.setdefault(knob.name, knob)
+    return tuple(found.values())
+
+
+def read_knobs(plugin, props) -> None:
+    """Set an attribute of ``plugin`` for each of its knobs, after Mitsuba's own constructor has read what it knows.
+
+    Raises ValueError where a value is not allowed, and where there is a property that nobody reads, with the one that
+    may have been meant.
+    """
+    knobs = knobs_of(type(plugin))
+    for knob in knobs:
+        setattr(plugin, knob.name, knob.read(plugin, props))
+    for name in props.unqueried():
+        names = [*(knob.name for knob in knobs), *_OF_MITSUBA]
+        near = difflib.get_close_matches(name, names, 1)
+        help = f'did you mean "{near[0]}"?' if near else "there are " + ", ".join(f'"{known}"' for known in names)
+        raise ValueError(f'{props.plugin_name()}: unknown property "{name}"; {help}')
+
+
+def show_knobs(plugin) -> str:
+    """One line a knob, as Mitsuba's plugins print themselves."""
+    lines = [f"  {knob.name} = {knob.show(getattr(plugin, knob.name))}" for knob in knobs_of(type(plugin))]
+    return f"{type(plugin).__name__}[\n" + ",\n".join(lines) + "\n]"
