@@ -27,10 +27,10 @@ def import_oidn():
     """Return the module; raises ModuleNotFoundError that says what to install."""
     try:
         import mitsuba_oidn
-    except ModuleNotFoundError as missing:
+    except ModuleNotFoundError:
         raise ModuleNotFoundError(
-            f"denoising needs the package '{missing.name}'; pip install 'manylights[denoise]' brings it"
-        ) from missing
+            "denoising needs the package 'mitsuba_oidn'; pip install 'manylights[denoise]' brings it"
+        ) from None
     return mitsuba_oidn
 
 
