@@ -89,7 +89,9 @@ class LightcutsIntegrator(ManyLightIntegrator):
         wanted = upload(mi.Float, self.error * np.maximum(spent.radiance, self.dark_floor * job.mean))
         threshold, sizes, searched = limited_cuts(job.lights, job.batch, wanted, self.max_cut)
         clock.lap("cut")
-        radiance, rays, collected = evaluate_cuts(job.scene, job.traits, job.lights, job.batch, threshold, sizes)
+        radiance, rays, collected = evaluate_cuts(
+            job.scene, job.traits, job.lights, job.batch, threshold, sizes, stopped=job.stopped
+        )
         clock.lap("evaluate")
         bounds = searched + collected + spent.upper_bounds
         return Shaded(radiance, rays + spent.shadow_rays, bounds, sum(sizes.count), clock.seconds)

@@ -15,6 +15,8 @@ from .visibility import shadow_ray, transmittance
 
 # Lights whose contributions one kernel adds up in single precision; between kernels sums are in double precision
 _LIGHTS_PER_KERNEL = 4096
+# Shadow rays of a kernel of all points and some lights: no render can be stopped before its kernel has ended
+_RAYS_PER_KERNEL = 1 << 26
 
 
 def evaluate_pairs(scene, traits: SceneTraits, lights: LightSet, group: LightGroup, surface, light, scale, seen=None):
@@ -126,11 +128,12 @@ def sum_all_lights(scene, traits: SceneTraits, lights: LightSet, batch: Batch, s
     """
     precise = dr.float64_array_t(mi.UnpolarizedSpectrum)
     total, rays = dr.zeros(precise, batch.count), dr.zeros(mi.UInt32, batch.count)
+    most = max(1, min(_LIGHTS_PER_KERNEL, _RAYS_PER_KERNEL // batch.count))
     for group in lights.groups:
-        for first in range(0, group.count, _LIGHTS_PER_KERNEL):
+        for first in range(0, group.count, most):
             if stopped():
                 break
-            last = min(first + _LIGHTS_PER_KERNEL, group.count)
+            last = min(first + most, group.count)
             begin, end = dr.opaque(mi.UInt32, first, batch.count), dr.opaque(mi.UInt32, last)
             radiance, traced = sum_lights(scene, traits, lights, group, batch.surfaces, begin, end, group.pick)
             total += precise(radiance)
