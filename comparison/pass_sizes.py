@@ -1,9 +1,10 @@
 """How many samples per pixel the next pass of a render has: passes of about two seconds, whatever they cost.
 
 Sizes are powers of two, from 4 on if a pixel allows it: Mitsuba compiles one kernel for all of these, and others for
-one, for two, and for numbers between. The first pass is small, since nothing is known; each later one is as large as
-the one before, or larger by a factor that the time of that one allows. As the first pass of a kernel compiles it, time
-says at most what a pass costs, so that growing by it is safe; shrinking needs a second pass of the same size.
+numbers between and, with some filters of the film, for fewer. The first pass is small, since nothing is known; each
+later one is as large as the one before, or larger by a factor that the time of that one allows. As the first pass of a
+kernel compiles it, time says at most what a pass costs, so that growing by it is safe; shrinking needs a second pass of
+the same size.
 """
 
 import math

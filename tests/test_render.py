@@ -2,7 +2,9 @@
 
 import itertools
 import signal
+import threading
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -39,6 +41,27 @@ def test_the_image_is_the_average_of_its_passes(scene):
     parts = [spp * mi.render(scene, spp=spp, seed=rendering.pass_seed(3, k)).numpy() for k, spp in enumerate((4, 4, 2))]
     np.testing.assert_allclose(image.numpy(), sum(parts) / 10, rtol=1e-5)
     assert took.error > 0
+
+
+def test_later_passes_compile_nothing(scene):
+    compiled = []
+
+    def progress(took, image):
+        compiled.append(sum(not kernel.get("cache_hit", True) for kernel in dr.kernel_history()))
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        _, took = manylights.render(scene, spp=400, progress=progress)
+    assert len(compiled) == took.passes > 2
+    assert sum(compiled[1:]) == 0
+
+
+def test_threads_other_than_the_main_one_render_too(scene):
+    found = []
+    thread = threading.Thread(target=lambda: found.append(manylights.render(scene, spp=4)[1].spp))
+    thread.start()
+    thread.join()
+    assert found == [4]
 
 
 def test_without_limits_the_samples_are_the_scenes(scene):
