@@ -33,6 +33,11 @@ def of_lights(rng, spp):
     return 0.3 * rng.normal(size=X.shape)
 
 
+def of_lights_for_all(rng, spp):
+    """The same, but all pixels have the same error."""
+    return np.full(X.shape, 0.3 * rng.normal())
+
+
 def grey(plane):
     return np.repeat(plane[..., None], 3, axis=-1)
 
@@ -53,7 +58,7 @@ def simulate(noise, error, seed):
             if goal.is_reached(found):
                 break
     share = np.array(weights) / sum(weights)
-    each = 0.3 * np.ones(len(weights)) if noise is of_lights else 1 / np.sqrt(weights)
+    each = 0.3 * np.ones(len(weights)) if noise in (of_lights, of_lights_for_all) else 1 / np.sqrt(weights)
     scale = np.sqrt(MEAN**2 + (0.1 * MEAN.mean()) ** 2)
     truth = DEVIATION * np.sqrt(np.sum((share * each) ** 2))
     return found, np.percentile(truth / scale, 95), (total / sum(weights) - MEAN) / truth, len(weights)
@@ -68,15 +73,17 @@ def simulate(noise, error, seed):
         (with_outliers, 0.1, 0.95, 1.15),
         (of_the_whole_image, 0.1, 0.9, 1.1),
         (of_lights, 0.3, 1.0, 1.3),
+        (of_lights_for_all, 0.3, 0.75, 1.0),
     ],
 )
 def test_reported_error_is_the_true_one_though_the_render_ended_by_it(noise, error, least, most):
-    """On average over renders; too high rather than too low. And the ending does not shift the image."""
+    """On average over renders; too high rather than too low, but for the last. Nor does the ending shift the image."""
     runs = [simulate(noise, error, seed) for seed in range(40)]
     assert all(found <= error and passes >= LEAST_PASSES for found, _, _, passes in runs)
     assert least < np.mean([found / truth for found, truth, _, _ in runs]) < most
     shift = np.array([of_image.mean() for _, _, of_image, _ in runs])
-    assert abs(shift.mean()) < max(4 * shift.std() / np.sqrt(len(runs)), 0.02)
+    bound = 0.6 if noise is of_lights_for_all else max(4 * shift.std() / np.sqrt(len(runs)), 0.02)
+    assert abs(shift.mean()) < bound
 
 
 def test_standard_error_of_equal_passes_is_the_textbooks():
