@@ -34,6 +34,7 @@ from pathlib import Path
 try:
     from comparison import baseline, command_line, machine, metrics, references, report, sweeps, tables
     from comparison.command_line import UsageError, parameter, positive
+    from comparison.denoising import import_oidn
     from comparison.pictures import REFERENCE
     from comparison.progress import Progress
     from comparison.runs import Runs, locked
@@ -97,6 +98,9 @@ def _add_effort(parser):
         help="render with each of several values of a parameter, or of spp or time, such as "
              "lightcuts:error=0.04,0.02,0.01 or path:spp=4,16,64; repeat for others; several parameters of a label "
              "make a grid. Alone or as 'all', and for labels without one: over what trades error for time")  # fmt: skip
+    add("--denoise", action="store_true",
+        help="show each image denoised by Open Image Denoise, too, and count the time of that (pip install "
+             "'manylights[denoise]')")  # fmt: skip
     add("--seeds", type=positive(int), metavar="N",
         help=f"how many seeds, beginning with --seed (default: 1, with --sweep {SWEEP_SEEDS})")  # fmt: skip
     add("--seed", type=command_line.seed, default=0, metavar="N", help="first seed (default: 0)")
@@ -220,6 +224,8 @@ def check_scenes(paths, reference):
 
 def run(options, command):
     """Compare on all scenes; return the exit status."""
+    if options.denoise:
+        import_oidn()
     command_line.set_variant(options.mode)
     settings = chosen_settings(options)
     check_scenes(options.scenes, options.reference)

@@ -3,26 +3,36 @@ plugins written in Python. Options that both have mean the same.
 
     manylights scenes/hall.xml --integrator lightcuts --param error=0.02 --spp 16 -o hall.exr
 
-Images are rendered in passes whose average is written at the end, or after Ctrl-C from those that were finished. The
-first pass has the seed that was given, pass k a hash of that and k; see comparison/rendering.py. An EXR file gets all
-channels, and how it was made as metadata; a PNG file is tone-mapped.
+An image ends by itself: with --spp samples per pixel, after --time seconds, or when the relative standard error of 95%
+of the pixels is below --error, whichever comes first. It is rendered in passes of about two seconds, whose average is
+written at the end, every ten seconds, and after Ctrl-C. The first pass has the seed that was given, pass k a hash of
+that and k; see comparison/rendering.py. An EXR file gets all channels, and how it was made as metadata; a PNG file is
+tone-mapped. With --denoise an EXR file FILE.exr gets a denoised one, FILE.denoised.exr, beside it; a PNG file shows the
+denoised image.
+
+In Python, `manylights.render(scene, error=0.02)` does the same.
 
 Exit status: 0; 1 if rendering failed; 2 for a command that makes no sense; 130 after Ctrl-C.
 """
 
 import argparse
-import signal
 import sys
 import time
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 from tqdm import tqdm
 
 from comparison import command_line, images
 from comparison.command_line import UsageError, parameter, positive
-from comparison.rendering import Progressive, pass_sizes
+from comparison.denoising import import_oidn
+from comparison.interruption import Deadline
+from comparison.render import Took, render
 from comparison.scene_files import SceneFile
+
+__all__ = ["Took", "main", "render"]
+CHECKPOINT_SECONDS = 10.0
 
 
 def parse(arguments):
@@ -38,10 +48,18 @@ def parse(arguments):
         help="replace the scene's integrator, keeping its max_depth, rr_depth and hide_emitters")  # fmt: skip
     add("-p", "--param", action="append", type=parameter, default=[], metavar="KEY=VALUE",
         help="parameter of the integrator, such as error=0.02; repeat for more")  # fmt: skip
-    add("--spp", type=positive(int), metavar="N", help="samples per pixel (default: the scene's)")
+    add("--spp", type=positive(int), metavar="N",
+        help="samples per pixel, at most (default: the scene's, unless --time or --error is given)")  # fmt: skip
+    add(
+        "--time", type=positive(float), metavar="SECONDS", help="seconds of rendering, at most; one pass is always made"
+    )
+    add("--error", type=positive(float), metavar="FRACTION",
+        help="end when 95%% of the pixels have a relative standard error, estimated from the spread of the passes, "
+             "below this, such as 0.02")  # fmt: skip
+    add("--denoise", action="store_true", help="denoise by Open Image Denoise (pip install 'manylights[denoise]')")
     add("-s", "--seed", type=command_line.seed, default=0, metavar="N", help="seed (default: 0)")
     add("--pass-spp", type=positive(int), metavar="N",
-        help="samples per pixel of one pass (default: as many as make two million in all)")  # fmt: skip
+        help="samples per pixel of one pass (default: as many as take two seconds)")  # fmt: skip
     add("--exposure", type=float, metavar="STOPS",
         help="scale PNG images by 2^STOPS (default: bring the 95th percentile of the brightness to 0.8)")  # fmt: skip
     command_line.add_common_options(parser)
@@ -75,83 +93,98 @@ def load(options):
     return scene, name, parameters
 
 
-class Interruption:
-    """While in force, a first Ctrl-C sets `asked`, for the loop over the passes to end; a second one acts at once."""
+class Output:
+    """The file that an image is written to, with what is known of it before it is rendered (`metadata`, a dict)."""
 
-    asked = False
+    def __init__(self, options, metadata):
+        self._options, self._metadata = options, metadata
+        self._image, self._took, self._written = None, None, time.monotonic()
 
-    def __enter__(self):
-        self._before = signal.signal(signal.SIGINT, self._ask)
-        return self
+    def keep(self, took, image):
+        """Take an image, and write it if that was not done for some time."""
+        self._image, self._took = np.array(image), took
+        if time.monotonic() - self._written > CHECKPOINT_SECONDS:
+            self.write()
+            self._written = time.monotonic()
 
-    def __exit__(self, *_):
-        signal.signal(signal.SIGINT, self._before)
+    def end_early(self):
+        """Write the last image that was taken, say so, and return the exit status."""
+        if self._took is None:
+            print("manylights: interrupted before the first pass was finished; nothing was written", file=sys.stderr)
+        else:
+            self.write()
+            done = f"{self._took.spp} samples per pixel to {self._options.output}"
+            print(f"manylights: interrupted; wrote {done}", file=sys.stderr)
+        return 130
 
-    def _ask(self, *_):
-        self.asked = True
-        signal.signal(signal.SIGINT, self._before)
-        print("\nmanylights: stopping; Ctrl-C again to stop at once", file=sys.stderr)
-
-
-def render(scene, options):
-    """Render all passes, or those until Ctrl-C; return a `Progressive` and whether it was interrupted."""
-    progressive = Progressive(scene, options.seed, options.sensor)
-    spp = options.spp or scene.sensors()[options.sensor].sampler().sample_count()
-    sizes = pass_sizes(spp, progressive.pixels, options.pass_spp)
-    with tqdm(total=spp, unit="spp", disable=None) as bar, Interruption() as interruption:
-        for size in sizes:
-            try:
-                # Ctrl-C tells Mitsuba, too, to stop, so that pass may be unfinished.
-                one = progressive.render(size, accept=lambda: not interruption.asked)
-            except KeyboardInterrupt:
-                one = None
-            if one is None:
-                return progressive, True
-            bar.update(one.spp)
-    return progressive, False
-
-
-def write(progressive, options, metadata):
-    """Write the image to the output file."""
-    if options.output.suffix == ".exr":
-        images.write_exr(options.output, progressive.image, progressive.channels, metadata)
-        return
-    rgb = images.colour(progressive.image, progressive.channels)
-    exposure = images.automatic_exposure(rgb) if options.exposure is None else 2.0**options.exposure
-    images.write_png(options.output, images.tone_map(rgb, exposure))
+    def write(self):
+        """Write the last image that was taken."""
+        path, took, image = self._options.output, self._took, self._image
+        if path.suffix == ".png":
+            rgb = images.colour(image, took.channels)
+            exposure = images.automatic_exposure(rgb) if self._options.exposure is None else 2.0**self._options.exposure
+            images.write_png(path, images.tone_map(rgb, exposure))
+            return
+        metadata = self._metadata | {
+            "spp": took.spp,
+            "passes": took.passes,
+            "render_seconds": took.seconds,
+            "estimated_error": took.error,
+            "ended_by": took.ended_by,
+            "statistics": took.statistics,
+        }
+        if took.raw is not None:
+            described = metadata | {"denoise_seconds": took.denoise_seconds}
+            images.write_exr(path.with_suffix(".denoised.exr"), image, took.channels, described)
+            image = np.array(took.raw)
+        images.write_exr(path, image, took.channels, metadata)
 
 
 def run(options):
     """Load, render and write; return the exit status."""
     begin = time.perf_counter()
+    if options.denoise:
+        import_oidn()
     scene, name, parameters = load(options)
-    load_seconds = time.perf_counter() - begin
     if options.verbose:
         mi.set_log_level(mi.LogLevel.Info)
-    progressive, interrupted = render(scene, options)
-    if not progressive.passes:
-        print("manylights: interrupted before the first pass was finished; nothing was written", file=sys.stderr)
-        return 130
-    metadata = {
+    output = Output(options, {
         "scene": str(options.scene),
         "integrator": name,
         "parameters": parameters,
         "variant": options.mode,
         "seed": options.seed,
-        "spp": progressive.spp,
-        "passes": len(progressive.passes),
-        "load_seconds": load_seconds,
-        "render_seconds": progressive.seconds,
+        "load_seconds": time.perf_counter() - begin,
         **command_line.versions(),
-    }
-    write(progressive, options, metadata)
-    if interrupted:
-        print(
-            f"manylights: interrupted; wrote {progressive.spp} samples per pixel to {options.output}", file=sys.stderr
-        )
-        return 130
-    print(f"{options.output}: {name}, {progressive.spp} samples per pixel, {progressive.seconds:.2f} s")
+    })  # fmt: skip
+    try:
+        image, took = _render(scene, options, output)
+    except KeyboardInterrupt:
+        return output.end_early()
+    output.keep(took, image)
+    if took.ended_by == "interruption":
+        return output.end_early()
+    output.write()
+    error = "" if took.error is None else f", error {took.error:.2%}"
+    print(f"{options.output}: {name}, {took.spp} samples per pixel, {took.seconds:.2f} s{error}")
     return 0
+
+
+def _render(scene, options, output):
+    """Render with a bar, and write now and then."""
+    limited = options.spp or not (options.time or options.error)
+    spp = options.spp or (scene.sensors()[options.sensor].sampler().sample_count() if limited else None)
+    with tqdm(total=spp, unit="spp", disable=None) as bar, Deadline(output.end_early):
+
+        def progress(took, image):
+            bar.set_postfix({} if took.error is None else {"error": f"{took.error:.2%}"}, refresh=False)
+            bar.update(took.spp - bar.n)
+            output.keep(took, image)
+
+        return render(
+            scene, sensor=options.sensor, error=options.error, time=options.time, spp=spp, seed=options.seed,
+            denoise=options.denoise, progress=progress, pass_spp=options.pass_spp,
+        )  # fmt: skip
 
 
 def main(arguments=None):

@@ -2,6 +2,9 @@
 
 `scene_files`   parse a scene file, change its integrator or its size, and load it
 `rendering`     average passes of different seeds, within samples or seconds
+`render`, `pass_sizes`, `convergence`, `interruption`
+                an image that ends by itself: passes of about two seconds, the error that is left, Ctrl-C
+`denoising`     Open Image Denoise, and the albedo and normals that guide it
 `images`        EXR files with metadata, tone mapping, false colours
 `metrics`       how far an image is from a reference
 `references`    references from files, and path-traced ones that are kept and continued

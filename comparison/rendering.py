@@ -7,6 +7,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .convergence import ErrorEstimate
+from .images import colour
+
 MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of one pass: it bounds memory, and the wait for the first image
 
 
@@ -43,18 +46,20 @@ class Pass:
 class Progressive:
     """The running average of passes of one scene, weighted by their samples per pixel.
 
-    `channels` are the names of the image's channels ("R", "G", "B", and those of AOVs), known after the first pass.
+    `channels` are the names of the image's channels ("R", "G", "B", and those of AOVs), known after the first pass;
+    `integrator` is the scene's unless another one is given; `estimate` is the `ErrorEstimate` of the passes.
     """
 
-    def __init__(self, scene, seed, sensor=0):
+    def __init__(self, scene, seed, sensor=0, integrator=None):
         self._scene, self.seed = scene, seed
         self._sensor = scene.sensors()[sensor]
+        self.integrator = integrator or scene.integrator()
         self.channels = []
         self.restart()
 
     def restart(self):
         """Forget all passes."""
-        self.passes, self._sum = [], 0.0
+        self.passes, self._sum, self.estimate = [], 0.0, ErrorEstimate()
 
     def render(self, spp, seed=None, accept=lambda: True):
         """Render one more pass of `spp` samples per pixel and return it (a `Pass`).
@@ -65,7 +70,7 @@ class Progressive:
         """
         seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
         begin = time.perf_counter()
-        image = mi.render(self._scene, sensor=self._sensor, seed=seed, spp=spp)
+        image = mi.render(self._scene, sensor=self._sensor, integrator=self.integrator, seed=seed, spp=spp)
         dr.eval(image)
         dr.sync_thread()
         seconds = time.perf_counter() - begin
@@ -75,10 +80,12 @@ class Progressive:
         # Not the image that `mi.render` returned: it lacks channels of nested integrators, and names.
         bitmap = self._sensor.film().bitmap()
         self.channels = [entry.name for entry in bitmap.struct_()]
-        statistics = dict(getattr(self._scene.integrator(), "statistics", None) or {})
+        statistics = dict(getattr(self.integrator, "statistics", None) or {})
         height, width = bitmap.size()[1], bitmap.size()[0]
         # In double precision, as a long sum of floats would drift.
-        self._sum = self._sum + spp * np.array(bitmap, dtype=np.float64).reshape(height, width, -1)
+        planes = np.array(bitmap, dtype=np.float64).reshape(height, width, -1)
+        self._sum = self._sum + spp * planes
+        self.estimate.add(_shown(planes, self.channels), spp)
         self.passes.append(Pass(seed, spp, seconds, statistics))
         return self.passes[-1]
 
@@ -101,6 +108,14 @@ class Progressive:
     def image(self):
         """The average, (height, width, channels) float64."""
         return self._sum / self.spp
+
+
+def _shown(planes, channels):
+    """Return the colour of an image, or all of it where its film has other channels."""
+    try:
+        return colour(planes, channels)
+    except ValueError:
+        return planes
 
 
 def total_statistics(passes):

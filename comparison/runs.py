@@ -17,7 +17,15 @@ from . import images
 from .command_line import UsageError
 
 FOLDER = "runs"
-NOT_OF_THE_RUN = ("label", "output", "run", "scene", "kernel_cache", "vpl_folder")  # where files are, and names
+NOT_OF_THE_RUN = (
+    "label",
+    "output",
+    "run",
+    "scene",
+    "kernel_cache",
+    "vpl_folder",
+    "denoised_output",
+)  # where files are, and names
 
 
 class Runs:
@@ -36,7 +44,8 @@ class Runs:
     def key(self, job, scene_hash):
         """Return what a run is recognised by: 32 hexadecimal digits."""
         described = {key: value for key, value in asdict(job).items() if key not in NOT_OF_THE_RUN}
-        described |= {"with_vpl": job.vpl_folder is not None, "hash": scene_hash, **self._made_by}
+        described |= {"with_vpl": job.vpl_folder is not None, "denoised": job.denoised_output is not None}
+        described |= {"hash": scene_hash, **self._made_by}
         return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:32]
 
     def find(self, job):
@@ -50,7 +59,10 @@ class Runs:
         # Other settings may have written their image to the same place since.
         if _run_of(job.output) != job.run or (result["vpl_output"] and not Path(result["vpl_output"]).is_file()):
             return None
-        return result | {"label": job.label, "output": job.output, "scene": job.scene}
+        if job.denoised_output and _run_of(job.denoised_output) != job.run:
+            return None
+        files = {"output": job.output, "denoised_output": job.denoised_output}
+        return result | files | {"label": job.label, "scene": job.scene}
 
     def save(self, result):
         """Keep the result of a run that went well."""

@@ -62,7 +62,7 @@ class SceneComparison:
         if self._reference:
             self._describe_reference()
             self.pictures.show(REFERENCE, None, REFERENCE, self._reference.image)
-        labels = list(self.settings)
+        labels = [label for raw in self.settings for label in (raw, denoised_label(raw))]
         for result in sorted(self._finished(), key=lambda result: labels.index(result["label"])):
             try:
                 self._assess(result)
@@ -71,8 +71,9 @@ class SceneComparison:
         names = {setting.title: setting.file_name for of in self.settings.values() for setting in of}
         if aovs := self.pictures.write_aovs(names):
             self.result["aovs"] = aovs
-        self.result |= analysis.analyse(self.result["renders"], list(self.settings), self.options.metric)
-        self.result["paper_tables"] = paper_tables.make(self.result["renders"])
+        self.result |= analysis.analyse(self.result["renders"], labels, self.options.metric)
+        raw = [result for result in self.result["renders"] if not result["denoised"]]
+        self.result["paper_tables"] = paper_tables.make(raw)
         self.result["pictures"] = {"exposure": self.pictures.exposure, "block": self.pictures.block}
 
     # --- References ---
@@ -144,21 +145,25 @@ class SceneComparison:
             result = worker.run(job, self._progress.tick)
             if "error" not in result:
                 self._store.save(result)
-        result |= {"setting": setting.name, "swept": setting.swept}
+        result |= {"setting": setting.name, "swept": setting.swept, "denoised": False}
         self._progress.end(kept)
         self.result["renders"].append(result)
+        if self.options.denoise and "error" not in result:
+            self.result["renders"].append(_denoised(result))
 
     def _job(self, setting, seed):
         options, name = self.options, self.result["name"]
         # Mitsuba's own integrators have no virtual lights to share.
         with_vpl = options.reference.kind == "vpl" and setting.integrator in own_integrators()
-        file_name = setting.file_name + (f".seed{seed}" if len(options.seeds) > 1 else "")
+        of_seed = f".seed{seed}" if len(options.seeds) > 1 else ""
+        denoised = options.out / f"{name}.{setting.file_name}.denoised{of_seed}.exr"
         return worker.Job(
             label=setting.label,
             integrator=setting.integrator,
             parameters=setting.parameters,
             scene=str(self.path),
-            output=str(options.out / f"{name}.{file_name}.exr"),
+            output=str(options.out / f"{name}.{setting.file_name}{of_seed}.exr"),
+            denoised_output=str(denoised) if options.denoise else None,
             vpl_folder=str(options.out) if with_vpl else None,
             variant=options.mode,
             defines=dict(options.define),
@@ -192,7 +197,8 @@ class SceneComparison:
             file_name = Path(result["output"]).name[len(self.result["name"]) + 1 : -len(".exr")]
             file_name = file_name.removesuffix(f".seed{result['seed']}")
             self.pictures.show(title, result["label"], file_name, image, reference.image if reference else None, flip)
-            self.pictures.add_aovs(self.options.aovs, title, planes, channels)
+            if not result["denoised"]:
+                self.pictures.add_aovs(self.options.aovs, title, planes, channels)
 
     @staticmethod
     def _errors(image, reference):
@@ -200,6 +206,23 @@ class SceneComparison:
 
     def _fail(self, error):
         self.result |= _failure(error)
+
+
+def denoised_label(label):
+    """Return what the denoised images of a label are called."""
+    return f"{label}, denoised"
+
+
+def _denoised(result):
+    """Return the result of a run as that of its denoised image, which takes a little longer."""
+    cold = result["cold_seconds"]
+    return result | {
+        "label": denoised_label(result["label"]),
+        "output": result["denoised_output"],
+        "seconds": result["seconds"] + result["denoise_seconds"],
+        "cold_seconds": None if cold is None else cold + result["cold_denoise_seconds"],
+        "denoised": True,
+    }
 
 
 def _failure(error):

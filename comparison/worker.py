@@ -23,6 +23,7 @@ import numpy as np
 
 from . import images, machine
 from .command_line import explain, set_variant, versions
+from .denoising import Denoiser
 from .rendering import Progressive, largest_pass, pass_seed, pass_sizes, total_statistics
 from .scene_files import SceneFile
 
@@ -40,7 +41,8 @@ class Job:
     """What to render: either for `budget` seconds or with `spp` samples per pixel, in passes of `pass_spp` (None
     chooses). `output` is the EXR file to write, which `run` is noted in. `vpl_folder`, if given, is where to keep the
     same passes rendered by `vpl`, with the same virtual lights: once for all jobs that share them. `kernel_cache` is
-    the folder of compiled kernels, a fresh one if None."""
+    the folder of compiled kernels, a fresh one if None. `denoised_output`, if given, is the EXR file for the denoised
+    image."""
 
     label: str
     integrator: str
@@ -57,6 +59,7 @@ class Job:
     pass_spp: int | None = None
     threads: int | None = None
     vpl_folder: str | None = None
+    denoised_output: str | None = None
     kernel_cache: str | None = None
     run: str | None = None
 
@@ -69,7 +72,9 @@ def run(job, tick=lambda: None):
     are in the image, None if there are none); `seconds`, `spp`, `passes` (of the image); `pass_spp`;
     `cold_pass_kept`; `peak_memory_bytes`; `statistics` (the integrator's counters, added up, {} if it has none);
     `rays_per_sample`, `bounds_per_sample`, `cut_size_per_sample` (per pixel sample, None if not counted); `vpl_output`
-    (the EXR file with what `vpl` made of the same passes, None if not asked for).
+    (the EXR file with what `vpl` made of the same passes, None if not asked for); `denoise_seconds` and
+    `cold_denoise_seconds` (what denoising takes beyond that, the second time and, compilation included, the first; None
+    if not asked for).
 
     After a failure it holds `error` (one line) and `traceback` instead. `tick` is called every half second. The process
     ends with this one, even if this one is killed.
@@ -146,7 +151,22 @@ def render(job):
     described = {key: result[key] for key in ("parameters", "spp", "passes", "seconds")}
     described |= {"integrator": job.integrator, "scene": job.scene, "seed": job.seed, **versions()}
     images.write_exr(job.output, progressive.image, progressive.channels, described | {"run": job.run or ""})
+    result |= _denoise(job, scene, progressive, described)
     return result | {"vpl_output": _render_vpl(job, passes, described) if job.vpl_folder else None}
+
+
+def _denoise(job, scene, progressive, described):
+    """Write the denoised image, if it is asked for; return its times."""
+    if not job.denoised_output:
+        return {"denoise_seconds": None, "cold_denoise_seconds": None}
+    seconds = []
+    for _ in range(2):
+        denoiser = Denoiser(scene, seed=job.seed)
+        image = denoiser.denoise(progressive.image, progressive.channels)
+        seconds.append(denoiser.seconds)
+    described = described | {"run": job.run or "", "denoise_seconds": seconds[1]}
+    images.write_exr(job.denoised_output, image, progressive.channels, described)
+    return {"denoise_seconds": seconds[1], "cold_denoise_seconds": seconds[0]}
 
 
 def _parse(job):

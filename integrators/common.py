@@ -201,6 +201,8 @@ class ManyLightIntegrator(GatheringIntegrator):
         prepared = self._prepare(scene, sampler, camera)
         radiance, totals = prepared.direct, {}
         for job in prepared.jobs:
+            if self.should_stop():
+                break
             part = self.shade(job)
             dr.scatter_add(radiance, part.radiance, job.batch.index)
             for name in self.offered_aovs:

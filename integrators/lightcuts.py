@@ -82,7 +82,7 @@ class LightcutsIntegrator(ManyLightIntegrator):
         wanted = upload(mi.Float, self.error * np.maximum(spent.radiance, self.dark_floor * job.mean))
         threshold, sizes, searched = limited_cuts(job.lights, job.batch, wanted, self.max_cut)
         clock.lap(Stage.CUT)
-        radiance, rays, collected = evaluate_cuts(job.transport, job.batch, threshold, sizes)
+        radiance, rays, collected = evaluate_cuts(job.transport, job.batch, threshold, sizes, stopped=job.stopped)
         clock.lap(Stage.EVALUATE)
         bounds = searched + collected + spent.upper_bounds
         return ShadeResult(radiance, rays + spent.shadow_rays, bounds, sum(sizes.count), clock.seconds)

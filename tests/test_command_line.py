@@ -115,6 +115,9 @@ def test_single_thread_does_not_hang(tmp_path):
         ([CORNELL, "-o", "nosuch/a.exr"], 2, "for the output"),
         ([CORNELL, "-o", "a.jpg"], 2, "must be an .exr or a .png"),
         ([CORNELL, "--sensor", "1"], 2, "no sensor 1: the scene has 1"),
+        ([CORNELL, "--error", "0"], 2, "'0' is not a positive number"),
+        ([CORNELL, "--time", "-1"], 2, "'-1' is not a positive number"),
+        ([CORNELL, "--time", "nan"], 2, "'nan' is not a positive number"),
         ([CORNELL, "--spp", "0"], 2, "'0' is not a positive whole number"),
         ([CORNELL, "--seed", "-1"], 2, "'-1' is not a whole number"),
         (["SENSORLESS"], 1, "no sensor"),
@@ -179,6 +182,63 @@ def test_interruption_writes_what_is_there(tmp_path, monkeypatch, capsys, interr
     else:
         assert "nothing was written" in said and not list(tmp_path.iterdir())
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_image_ends_by_itself(tmp_path, capsys):
+    output = tmp_path / "a.exr"
+    assert run(CORNELL, *TINY, "-o", output, "--error", "0.3", "--time", "1000") == 0
+    metadata = images.read_exr(output)[2]
+    assert metadata["ended_by"] == "error" and 0 < metadata["estimated_error"] <= 0.3 and metadata["passes"] >= 8
+    assert f"error {metadata['estimated_error']:.2%}" in capsys.readouterr().out
+    assert run(CORNELL, *TINY, "-o", output, "--time", "1e-6") == 0
+    # What was there before has no part in it
+    metadata = images.read_exr(output)[2]
+    assert (metadata["ended_by"], metadata["passes"], metadata["spp"]) == ("time", 1, 4)
+
+
+def test_image_is_written_while_it_is_rendered(tmp_path, monkeypatch):
+    output, found, original = tmp_path / "a.exr", [], mi.render
+
+    def render(*arguments, **keywords):
+        found.append(images.read_exr(output)[2]["spp"] if output.exists() else 0)
+        return original(*arguments, **keywords)
+
+    monkeypatch.setattr(mi, "render", render)
+    monkeypatch.setattr(manylights, "CHECKPOINT_SECONDS", 0.0)
+    assert run(CORNELL, *TINY, "-o", output, "--spp", 8, "--pass-spp", 2) == 0
+    assert found == [0, 2, 4, 6]
+    assert [file.name for file in tmp_path.iterdir()] == ["a.exr"]
+
+
+@pytest.mark.parametrize("passes", [0, 3])
+def test_interruption_does_not_wait_for_a_pass(tmp_path, passes):
+    """Of an integrator that hears nothing for as long as it renders."""
+    output = tmp_path / "a.exr"
+    script = f"""
+import sys, time
+import mitsuba as mi
+from comparison import interruption
+import manylights
+interruption.PATIENCE = 0.1
+render, calls = mi.render, []
+def slow(*arguments, **keywords):
+    calls.append(1)
+    if len(calls) == {passes + 1}:
+        print("waiting", flush=True)
+        time.sleep(600)
+    return render(*arguments, **keywords)
+mi.render = slow
+sys.exit(manylights.main({[CORNELL, *TINY, "-o", str(output), "--spp", "100", "--pass-spp", "2"]!r}))
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", script], cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as rendering:
+        assert rendering.stdout.readline() == "waiting\n"
+        rendering.send_signal(signal.SIGINT)
+        _, said = rendering.communicate(timeout=60)
+    assert rendering.returncode == 130
+    assert ("wrote 6 samples per pixel" if passes else "nothing was written") in said
+    assert [images.read_exr(file)[2]["spp"] for file in tmp_path.iterdir()] == ([6] if passes else [])
 
 
 def test_interruption_reaches_a_process(tmp_path):

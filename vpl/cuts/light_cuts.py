@@ -203,15 +203,20 @@ def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
             yield CutChunk(group, part, points, offset, written, rows, nodes, visits)
 
 
-def evaluate_cuts(transport: Transport, batch: Batch, threshold, sizes: CutSizes, second=False):
+def evaluate_cuts(
+    transport: Transport, batch: Batch, threshold, sizes: CutSizes, second=False, stopped=lambda: False
+):  # fmt: skip
     """Radiance of every point from its cut: representatives, scaled to the intensity of their clusters.
 
-    ``second``: use the second representative of every cluster, for an estimate that another cut may depend on.
-    Returns (radiance, shadow rays, nodes visited) per point of the batch.
+    ``second``: use the second representative of every cluster, for an estimate that another cut may depend on;
+    ``stopped``: asked between kernels; once true the sum ends early.  Returns (radiance, shadow rays, nodes visited)
+    per point of the batch.
     """
     radiance = dr.zeros(mi.UnpolarizedSpectrum, batch.count)
     rays, visits = dr.zeros(mi.UInt32, batch.count), dr.zeros(mi.UInt32, batch.count)
     for chunk in collect_cuts(transport.lights, batch, threshold, sizes):
+        if stopped():
+            break
         tree = chunk.group.tree
         light, intensity = tree.representative(chunk.nodes, second=second), tree.summed_intensity(chunk.nodes)
         value, traced = evaluate_representatives(transport, chunk.group, chunk.batch, chunk.rows, light, intensity)

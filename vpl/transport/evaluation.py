@@ -16,6 +16,8 @@ from .contribution import contribution, shadow_ray, transmittance
 
 # Lights whose contributions one kernel adds up in single precision; between kernels sums are in double precision
 _LIGHTS_PER_KERNEL = 4096
+# Shadow rays of a kernel of all points and some lights: no render can be stopped before its kernel has ended
+_RAYS_PER_KERNEL = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -133,8 +135,9 @@ def sum_all_lights(transport: Transport, batch: Batch, stopped=lambda: False):
     """
     precise = dr.float64_array_t(mi.UnpolarizedSpectrum)
     total, rays = dr.zeros(precise, batch.count), dr.zeros(mi.UInt32, batch.count)
+    most = max(1, min(_LIGHTS_PER_KERNEL, _RAYS_PER_KERNEL // batch.count))
     for group in transport.lights.groups:
-        for first, last in even_chunks(group.count, most=_LIGHTS_PER_KERNEL):
+        for first, last in even_chunks(group.count, most=most):
             if stopped():
                 break
             begin, end = dr.opaque(mi.UInt32, first, batch.count), dr.opaque(mi.UInt32, last)

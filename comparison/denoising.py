@@ -1,0 +1,144 @@
+"""Denoising by Open Image Denoise, on the CPU, guided by the albedo and the normal of what the camera sees.
+
+The package is `mitsuba-oidn`, which `pip install 'manylights[denoise]'` brings. Albedo and normal are those of the
+first surface that is neither mirror nor glass, have little noise after a few samples per pixel, and lose that by a
+filter of their own ("prefiltering"), so that the image can be taken to have exactly their edges.
+
+Noise that neighbouring pixels share looks like detail to the filter: a film with a wide reconstruction filter is
+denoised less well than one with a box filter.
+"""
+
+import time
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .images import colour
+
+FEATURE_SPP = 16
+FEATURE_SEED = 0xFEA7  # combined with the image's, whose noise it must not share
+DEEPEST = 16  # mirrors, panes and masks behind each other
+FEATURES = ("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z")
+
+
+def import_oidn():
+    """Return the module; raises ModuleNotFoundError that says what to install."""
+    try:
+        import mitsuba_oidn
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "denoising needs the package 'mitsuba_oidn'; pip install 'manylights[denoise]' brings it"
+        ) from None
+    return mitsuba_oidn
+
+
+class Denoiser:
+    """Denoises images of a scene by its sensor of a number.
+
+    `seconds`: what it has taken so far, with the passes for albedo and normal, which are made at once;
+    `filter_seconds`: what `denoise` will take, about.
+    """
+
+    def __init__(self, scene, sensor=0, seed=0):
+        self._oidn, begin = import_oidn(), time.perf_counter()
+        self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
+        features = auxiliary_features(scene, scene.sensors()[sensor], FEATURE_SPP, seed)
+        filtering = time.perf_counter()
+        self._features = {name: self._filtered({name: plane}) for name, plane in features.items()}
+        end = time.perf_counter()
+        self.seconds, self.filter_seconds = end - begin, end - filtering
+
+    def denoise(self, image, channels):
+        """Return an image, (height, width, channels), with its colour denoised; other channels are left as they are,
+        and pixels that are not finite are taken as black."""
+        begin = time.perf_counter()
+        names = ("R", "G", "B") if "R" in channels else ("Y",)
+        planes = np.array(image, np.float32)
+        rgb = np.nan_to_num(colour(planes, channels), nan=0.0, posinf=0.0, neginf=0.0)
+        filtered = self._filtered({"color": rgb, **self._features}, hdr=True, clean_aux=True)
+        where = [list(channels).index(name) for name in names]
+        planes[..., where] = filtered if len(where) == 3 else filtered.mean(axis=-1, keepdims=True)
+        self.seconds += time.perf_counter() - begin
+        return type(image)(planes) if isinstance(image, mi.TensorXf) else planes
+
+    def _filtered(self, inputs, **settings):
+        """Filter the first of the images `inputs` (name -> (height, width, 3) float32), guided by the others."""
+        arrays = {name: np.ascontiguousarray(plane, np.float32) for name, plane in inputs.items()}
+        output = np.empty_like(next(iter(arrays.values())))
+        network = self._device.new_filter("RT")
+        for name, plane in (*arrays.items(), ("output", output)):
+            network.set_image(name, plane)
+        for name, value in settings.items():
+            setattr(network, name, value)
+        network.execute()
+        return output
+
+
+def auxiliary_features(scene, sensor, spp, seed):
+    """Return a dict of "albedo" and "normal", (height, width, 3) float32, of the first surfaces seen by a sensor (a
+    `mi.Sensor`) that are neither mirror nor glass, by `spp` samples per pixel through the film's filter.
+
+    The albedo, 0 to 1, is what the surface scatters of the light from all directions, by single samples of the BSDF,
+    times what mirrors and glass before it leave, plus what is emitted; black where there is nothing. The shading normal
+    is in world space and turned towards the viewer; 0 where there is nothing.
+    """
+    seed = int(np.random.SeedSequence((FEATURE_SEED, seed)).generate_state(1)[0])
+    mi.render(scene, sensor=sensor, integrator=_feature_integrator(mi.variant()), spp=spp, seed=seed)
+    bitmap = sensor.film().bitmap()
+    names = [entry.name for entry in bitmap.struct_()]
+    planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
+    features = np.nan_to_num(planes[..., [names.index(name) for name in FEATURES]])
+    return {"albedo": np.clip(features[..., :3], 0, 1), "normal": np.clip(features[..., 3:], -1, 1)}
+
+
+@cache
+def _feature_integrator(variant):
+    """Return an integrator of a variant (the current one, by which Mitsuba chooses its base) with albedo and normal as
+    further channels of an image that is otherwise black."""
+
+    class FeatureIntegrator(mi.SamplingIntegrator):
+        def aov_names(self):
+            return list(FEATURES)
+
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            albedo, normal, valid = _first_rough_surface(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
+            finite = dr.all(dr.isfinite(albedo)) & dr.all(dr.isfinite(normal))
+            albedo, normal = dr.select(finite, dr.minimum(albedo, 1), 0), dr.select(finite, normal, 0)
+            return mi.Spectrum(0), valid, [*albedo, *normal]
+
+    return FeatureIntegrator(mi.Properties())
+
+
+@dr.syntax
+def _first_rough_surface(scene, sampler, ray, active):
+    """Follow camera rays through mirrors, glass and masks; return albedo and normal of what they meet, and whether that
+    is anything."""
+    throughput, depth = mi.Color3f(1), mi.UInt32(0)
+    albedo, normal, valid = mi.Color3f(0), mi.Normal3f(0), mi.Bool(False)
+    while active:
+        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 0, active=active)
+        hit = active & si.is_valid()
+        albedo += throughput * _three(si.emitter(scene).eval(si, active))
+        bsdf = si.bsdf(ray)
+        sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(hit), sampler.next_2d(hit), hit)
+        throughput *= _three(weight)
+        # Where a surface has a smooth lobe too, as plastic has, that is what is seen of it.
+        smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        passed = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
+        onward = hit & (passed | (mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta) & ~smooth))
+        ends = hit & ~onward
+        albedo[ends] += throughput
+        normal[ends] = mi.Normal3f(dr.mulsign(si.sh_frame.n, si.wi.z))
+        valid |= hit
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        depth += 1
+        active = onward & (depth < DEEPEST)
+    return albedo, normal, valid
+
+
+def _three(value):
+    """Return a spectrum as three channels: the mean of its wavelengths where it has no colours."""
+    value = mi.unpolarized_spectrum(value)
+    return mi.Color3f(value) if mi.is_rgb else mi.Color3f(dr.mean(value))

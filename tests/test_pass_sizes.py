@@ -1,0 +1,88 @@
+"""Sizes of passes, with integrators whose cost is made up."""
+
+from collections import Counter
+
+import pytest
+
+from comparison.pass_sizes import PASS_SECONDS, PassSizes
+from comparison.rendering import MAXIMUM_PASS_SAMPLES, Pass
+
+SQUARE = 256 * 256
+
+
+def render(pixels, start, each, compilation=3.0, **limits):
+    """Passes that take `start` seconds and `each` per sample, and once for each kernel `compilation`: (passes, why the
+    render ended)."""
+    sizes, passes, elapsed, kernels = PassSizes(pixels, **limits), [], 0.0, set()
+    while len(passes) < 2000:
+        spp = sizes.next(passes, elapsed)
+        if isinstance(spp, str):
+            return passes, spp
+        kernel = spp if spp < 4 or spp & (spp - 1) else "usual"
+        seconds = start + each * spp + (0 if kernel in kernels else compilation)
+        kernels.add(kernel)
+        passes.append(Pass(0, spp, seconds))
+        elapsed += seconds
+    raise AssertionError("endless")
+
+
+@pytest.mark.parametrize("spp", [*range(1, 20), 64, 100, 1023])
+@pytest.mark.parametrize("each", [0.001, 0.3, 40.0])
+def test_samples_are_those_that_were_asked_for(spp, each):
+    passes, ended_by = render(SQUARE, 0.1, each, spp=spp)
+    assert sum(one.spp for one in passes) == spp and ended_by == "spp"
+
+
+@pytest.mark.parametrize("start", [0.0, 0.5])
+@pytest.mark.parametrize("each", [0.001, 0.02, 0.3])
+def test_passes_take_about_two_seconds_and_repeat(start, each):
+    passes, _ = render(SQUARE // 16, start, each, time=120)
+    usual, count = Counter(one.spp for one in passes).most_common(1)[0]
+    assert count > 0.7 * len(passes)
+    assert passes[-2].seconds <= PASS_SECONDS
+    assert 2 * (start + each * usual) > PASS_SECONDS or usual * SQUARE // 16 == MAXIMUM_PASS_SAMPLES
+    assert len({one.spp for one in passes if one.spp < 4}) == 0
+
+
+def test_passes_that_take_long_are_as_small_as_can_be():
+    passes, _ = render(SQUARE, 1.0, 5.0, spp=64)
+    assert passes[0].spp == passes[1].spp == 4
+    assert {one.spp for one in passes[2:]} == {1}
+
+
+def test_large_images_begin_with_one_sample():
+    passes, _ = render(1 << 21, 0.1, 0.2, spp=20)
+    assert [one.spp for one in passes] == [1] * 20
+    passes, _ = render(1 << 19, 0.1, 0.1, compilation=0.1, spp=20)
+    assert [one.spp for one in passes] == [1, 4, 4, 4, 4, 3]
+
+
+@pytest.mark.parametrize("each", [0.002, 0.1, 0.4])
+@pytest.mark.parametrize("time", [5, 11, 60])
+def test_time_is_used_and_not_exceeded_by_much(each, time):
+    passes, ended_by = render(SQUARE // 4, 0.05, each, time=time)
+    assert ended_by == "time"
+    least = min(one.seconds for one in passes)
+    assert abs(sum(one.seconds for one in passes) - time) <= least + 0.1
+
+
+def test_there_is_always_one_pass():
+    passes, ended_by = render(SQUARE, 5.0, 1.0, time=1)
+    assert len(passes) == 1 and ended_by == "time"
+
+
+def test_what_comes_first_ends_a_render():
+    assert render(SQUARE, 0.0, 0.1, time=1000, spp=20)[1] == "spp"
+    assert render(SQUARE, 0.0, 0.1, time=10, spp=2000)[1] == "time"
+
+
+def test_sizes_that_are_given_stay():
+    passes, _ = render(SQUARE, 0.0, 0.1, spp=20, fixed=6)
+    assert [one.spp for one in passes] == [6, 6, 6, 2]
+
+
+def test_for_an_error_there_are_many_passes_of_similar_sizes():
+    passes, done = render(SQUARE // 16, 0.0, 1e-4, time=20, many=True)[0], 0
+    for one in passes[:100]:
+        assert one.spp <= max(4, done / 8)
+        done += one.spp
