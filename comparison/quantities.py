@@ -1,4 +1,4 @@
-"""What the tables of the papers list, by name: how each quantity follows from the result of a run (see worker.run).
+"""Quantities in the tables of the papers, by name: how each quantity follows from the result of a run (see worker.run).
 
 Shadow rays and upper bounds are those per pixel, of all its samples; seconds are those of all passes in the image.
 """
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from . import analysis
 
-# What is made before a method begins: virtual lights and their trees
+# What is made before a method begins: VPLs and their trees
 LIGHT_STAGES = ("trace", "tree")
 CHOOSING_STAGES = {
     "matrixrecovery": ("slices", "initial_cut", "columns", "prediction"),

@@ -150,7 +150,7 @@ class SceneComparison:
 
     def _job(self, setting, seed):
         options, name = self.options, self.result["name"]
-        # Mitsuba's own integrators have no virtual lights to share.
+        # Mitsuba's own integrators have no VPLs to share.
         with_vpl = options.reference.kind == "vpl" and setting.integrator in own_integrators()
         file_name = setting.file_name + (f".seed{seed}" if len(options.seeds) > 1 else "")
         return worker.Job(
