@@ -66,7 +66,7 @@ def _rate(found: Found, pixels: int) -> float:
 def table(names, options) -> None:
     """Part "table"."""
     print(f"\n## equal error and equal rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
-    print("scene | method | s | rays/px | rate | columns | mean absolute | RMSE | fewer rays | faster | break-even, +ns")
+    print("scene | method | s | rays/px | rate | columns | mean absolute | RMSE | fewer rays | faster | break-even, ns")
     ratios: dict = {}
     for name in names:
         problem = Problem(name, SAMPLES, options.width, options.points)
