@@ -92,7 +92,7 @@ def _add_effort(parser):
                              f"{sweeps.DEFAULT_SPP})")  # fmt: skip
     add = parser.add_argument
     add("--pass-spp", type=positive(int), metavar="N",
-        help="samples per pixel of one pass, which has virtual lights of its own (default: chosen)")  # fmt: skip
+        help="samples per pixel of one pass, which has VPLs of its own (default: chosen)")  # fmt: skip
     add("--sweep", action="append", type=sweeps.sweep, nargs="?", const=("all", None, ()), default=[],
         metavar="LABEL:KEY=VALUE,...",
         help="render with each of several values of a parameter, or of spp or time, such as "
@@ -112,7 +112,7 @@ def _add_reference(parser):
         help="an EXR file, or a folder that holds SCENE.exr, which also gives the width; path:SPP (path traced, kept, "
              "continued); path:auto or path:auto:FRACTION (continued until its noise is at most that fraction of the "
              f"smallest error that is measured, {references.AUTOMATIC_FRACTION:g}); vpl (each image by all of its own "
-             "virtual lights) (default: path:1024)")  # fmt: skip
+             "VPLs) (default: path:1024)")  # fmt: skip
     add("--reference-limit", type=positive(int), default=2**17, metavar="SPP",
         help="most samples per pixel of path:auto (default: 131072)")  # fmt: skip
     add("--cache", type=Path, default=references.default_cache(), metavar="FOLDER",

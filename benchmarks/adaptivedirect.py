@@ -62,7 +62,7 @@ class Problem:
         if not cached.exists():
             self._make_reference(cached)
         self.reference = references.read(cached)
-        # The edges of lamps, a thousand times brighter than what is around them, would drown all other errors
+        # The edges of emitters, a thousand times brighter than what is around them, would drown all other errors
         shown = np.array(mi.render(self.scene, integrator=plugin("path", max_depth=1), spp=256, seed=0))
         self.lit = shown[..., :3].max(-1) == 0
 

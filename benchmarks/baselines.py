@@ -41,7 +41,7 @@ _TRIES, _NEAR = 5, 0.03
 
 @dataclass(frozen=True)
 class Quality:
-    """What decides how good a method is: a property, a first guess of it, and its limits; the error goes as about its
+    """Property that decides how good a method is, with a first guess and its limits; the error goes as about its
     ``power``-th power."""
 
     name: str

@@ -29,7 +29,7 @@ def draw_slice(plugin, job, number: int, file, note: dict) -> None:
 
 
 def _panels(block, found, number: int) -> dict:
-    """What is drawn, (rows, columns) each: matrices of the columns that were separated."""
+    """Matrices to draw, (rows, columns) each: those of the columns that were separated."""
     part, piece = found.part, number - block.begin
     rows = part.counts[piece][1]
 

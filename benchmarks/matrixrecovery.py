@@ -5,8 +5,8 @@
 table     [MSR] Table 1: shadow rays, sampling rate, columns, time by stage and error; the other methods with the
           parameter that gives the same mean absolute error of pixels, and with that which takes as many rays; and what
           a shadow ray would have to cost more for both to take as long.
-cost      the same at equal error in scenes/veils.xml, with more and more veils, which make shadow rays dearer and
-          dearer: whether and where the method is the fastest.  Only where it is asked for, whatever the scenes.
+cost      the same at equal error in scenes/veils.xml, with more and more veils, which make shadow rays more and
+          more expensive: whether and where the method is the fastest.  Only where it is asked for, whatever the scenes.
 steps     [MSR] figure 8: error and rays with one step after another left out, and with light separated as in the paper.
 pictures  [MSR] figure 7: the matrices of one slice of each scene, as PNG files below --out (needs matplotlib).
 
@@ -70,7 +70,7 @@ def _rate(found: Found, pixels: int) -> float:
 def table(names, options) -> None:
     """Part "table"."""
     print(f"\n## equal error and equal rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
-    print("scene | method | s | rays/px | rate | columns | mean absolute | RMSE | fewer rays | faster | dearer ray, ns")
+    print("scene | method | s | rays/px | rate | columns | mean absolute | RMSE | fewer rays | faster | break-even, ns")
     ratios: dict = {}
     for name in names:
         problem = Problem(name, SAMPLES, options.width, options.points)
@@ -103,7 +103,7 @@ def _equal_plugins(problem: Problem, measures) -> dict:
 
 def costs(_, options) -> None:
     """Part "cost"."""
-    print(f"\n## dearer and dearer rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
+    print(f"\n## more and more expensive rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
     print("veils | method | s | rays/px | mean absolute | RMSE | ns a ray, all in all | fewer rays | faster")
     for veils in VEILS:
         with tempfile.TemporaryDirectory() as folder:
@@ -130,10 +130,10 @@ def _show(name: str, label: str, one: Found, ours: Found, problem: Problem) -> N
     if label == METHOD:
         rate = f"{100 * _rate(one, problem.pixels):.1f}%"
     saved, spent = one.rays - ours.rays, ours.seconds - one.seconds
-    dearer = f"{1e9 * spent / (saved * problem.pixels):.0f}" if saved > 0 and spent > 0 else ""
+    break_even = f"{1e9 * spent / (saved * problem.pixels):.0f}" if saved > 0 and spent > 0 else ""
     print(
         f"{name} | {label} | {one.seconds:.2f} | {one.rays:.1f} | {rate} | {columns} | {100 * one.absolute:.2f}% | "
-        f"{one.rmse:.4f} | {one.rays / ours.rays:.1f} | {one.seconds / ours.seconds:.2f} | {dearer}",
+        f"{one.rmse:.4f} | {one.rays / ours.rays:.1f} | {one.seconds / ours.seconds:.2f} | {break_even}",
         flush=True,
     )
     if label == METHOD:

@@ -1,4 +1,4 @@
-"""What `manylights.py` and `compare.py` share: loading scenes, rendering them in passes, images, errors, and reports.
+"""Parts of `manylights.py` and `compare.py`: loading scenes, rendering them in passes, images, errors, and reports.
 
 `scene_files`   parse a scene file, change its integrator or its size, and load it
 `rendering`     average passes of different seeds, within samples or seconds

@@ -1,4 +1,4 @@
-"""What the two commands share: options of the form key=value, variants and integrators by name, errors in one line."""
+"""Parts of both commands: options of the form key=value, variants and integrators by name, errors in one line."""
 
 import re
 import sys

@@ -90,8 +90,8 @@ class Curve:
         return _read_off(error, errors[::-1], costs[::-1], hidden)
 
     def error_at(self, cost, without=None):
-        """Return the error at a cost as (error, at most): the second where a point that costs less, be it the dearest
-        or one that the noise hides, is better, (None, None) where even the cheapest costs more."""
+        """Return the error at a cost as (error, at most): the second where a point that costs less, be it the most
+        expensive or one that the noise hides, is better, (None, None) where even the cheapest costs more."""
         hidden = [noise for at, noise in self.bounds(without) if at <= cost]
         return _read_off(cost, *self.front(without), hidden)
 

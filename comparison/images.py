@@ -94,7 +94,7 @@ def colour(image, channels, layer=""):
 
 def automatic_exposure(rgb):
     """Return the factor that brings the 95th percentile of the brightness to 0.8, or 1 for a black image. A
-    percentile, unlike a mean, ignores lamps in view; unlike a log average, it ignores a black background."""
+    percentile, unlike a mean, ignores emitters in view; unlike a log average, it ignores a black background."""
     brightness = np.nan_to_num(rgb, posinf=0, neginf=0).mean(axis=-1)
     level = np.percentile(brightness, 95) or brightness.max()
     return 0.8 / level if level > 0 else 1.0

@@ -1,4 +1,4 @@
-"""What a measurement depends on besides the scene: machine, load, software."""
+"""Circumstances that a measurement depends on besides the scene: machine, load, software."""
 
 import hashlib
 import os

@@ -36,7 +36,7 @@ class Progress:
         self.tick()
 
     def skip(self, scene):
-        """What was planned for a scene and is not done will not be."""
+        """Drop the runs that were planned for a scene and are not done."""
         left = [run for run in self._planned if run[0] != str(scene)]
         self._bar.update(len(self._planned) - len(left))
         self._planned = left

@@ -41,7 +41,7 @@ _IC = {
     "metric": "rmse",
 }
 _IC_DEPARTURES = (
-    "The paper's images have 1600 × 1200 pixels and are made on 20 cores, with about 650 000 virtual lights. Its "
+    "The paper's images have 1600 × 1200 pixels and are made on 20 cores, with about 650 000 VPLs. Its "
     "errors are against the image of all these lights (as with --reference vpl), ours against this run's reference. "
     "lights: to trace them and to build their trees, in the paper the trees alone; render: all else. How the paper "
     "normalises its RMSE it does not say; so none is set beside ours. Its relative error is a mean over pixels, our "
@@ -125,7 +125,7 @@ _ILLUMINATION_CUT = (
     Table(
         paper="IC",
         name="Table 5",
-        title="peak memory by the number of virtual lights",
+        title="peak memory by the number of VPLs",
         methods=(  # 50, 300, 600 and 1200 thousand lights in Banquet
             _lightcuts("LC(1%)", lights=(50e3, 300e3, 600e3, 1.2e6), memory=(0.31, 0.62, 1.02, 1.74)),
             _light_slice("LS(800)", lights=(50e3, 300e3, 600e3, 1.2e6), memory=(2.95, 14.18, 29.53, 55.10)),
@@ -241,7 +241,7 @@ _ADAPTIVE_SAMPLING = (
         needed=("adaptivedirect",),
         quantities=("passes", "clusters", "rays", "relmse_trimmed"),
         departures="Means over gather points, the paper's passes over pixels. Clusters are those of emitters and of "
-        "regions of a sky together, also where a point's light is summed over all emitters instead.",
+        "regions of an environment together, also where a point's light is summed over all emitters instead.",
     ),
 )
 
@@ -261,7 +261,7 @@ _MSR = {
     "metric": "relative_l1",
 }  # fmt: skip
 _MSR_DEPARTURES = (
-    "The paper's images have 1600 × 1200 or 1920 × 1080 pixels with 4 samples, a million virtual lights, and are made "
+    "The paper's images have 1600 × 1200 or 1920 × 1080 pixels with 4 samples, a million VPLs, and are made "
     "with 16 threads. Its errors are against the image of all these lights (as with --reference vpl), ours against the "
     "reference of this run. columns or cut: a mean over samples, in the paper the most that there may be. choosing: "
     "slices, columns and prediction of matrixrecovery (the paper's matrix generation); slices, rows and columns of "

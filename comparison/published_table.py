@@ -1,4 +1,4 @@
-"""What describes a table of a paper: its methods with their published figures, its columns, which runs fill it."""
+"""Description of a table of a paper: its methods with their published figures, its columns, which runs fill it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field

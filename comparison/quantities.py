@@ -1,4 +1,4 @@
-"""What the tables of the papers list, by name: how each quantity follows from the result of a run (see worker.run).
+"""Quantities in the tables of the papers, by name: how each quantity follows from the result of a run (see worker.run).
 
 Shadow rays and upper bounds are those per pixel, of all its samples; seconds are those of all passes in the image.
 """
@@ -10,7 +10,7 @@ from vpl.core.stages import Stage
 
 from . import analysis
 
-# What is made before a method begins: virtual lights and their trees
+# What is made before a method begins: VPLs and their trees
 LIGHT_STAGES = (Stage.TRACE, Stage.TREE)
 CHOOSING_STAGES = {
     "matrixrecovery": (Stage.SLICES, Stage.INITIAL_CUT, Stage.COLUMNS, Stage.PREDICTION),

@@ -1,4 +1,4 @@
-"""What a comparison writes: the table, `results.json` and `report.html`. results.schema.json documents the second."""
+"""Files of a comparison: the table, `results.json` and `report.html`. results.schema.json documents the second."""
 
 import json
 from datetime import UTC, datetime
@@ -52,7 +52,7 @@ def reference_text(scene):
     """Say in a few words what a scene's images were compared with."""
     reference = scene.get("reference")
     if reference is None:
-        return "vpl, with the same virtual lights" if any(map(_has_vpl, scene["renders"])) else "none"
+        return "vpl, with the same VPLs" if any(map(_has_vpl, scene["renders"])) else "none"
     text = ", ".join(
         f"{reference[key]}{unit}" for key, unit in (("integrator", ""), ("spp", " spp")) if key in reference
     )

@@ -44,7 +44,7 @@ class Setting:
 
     @property
     def name(self):
-        """What tells it from the other settings of its label, such as "error=0.02"; empty if it is the only one."""
+        """Text that tells it from others of its label, such as "error=0.02"; empty if it is the only one."""
         return ",".join(f"{key}={text(value)}" for key, value in self.swept.items())
 
     @property

@@ -38,11 +38,10 @@ UNUSED_PASSES = 2**31  # passes that are not in the image are numbered from here
 
 @dataclass
 class Job:
-    """What to render: either for `budget` seconds or with `spp` samples per pixel, in passes of `pass_spp` (None
+    """Render to make: either for `budget` seconds or with `spp` samples per pixel, in passes of `pass_spp` (None
     chooses). `output` is the EXR file to write, which `run` is noted in. `vpl_folder`, if given, is where to keep the
-    same passes rendered by `vpl`, with the same virtual lights: once for all jobs that share them. `kernel_cache` is
-    the folder of compiled kernels, a fresh one if None. `denoised_output`, if given, is the EXR file for the denoised
-    image."""
+    same passes rendered by `vpl`, with the same VPLs: once for all jobs that share them. `kernel_cache` is the folder
+    of compiled kernels, a fresh one if None. `denoised_output`, if given, is the EXR file for the denoised image."""
 
     label: str
     integrator: str
@@ -225,7 +224,7 @@ def _samples_of_a_pass(progressive, budget, seeds):
     """Return the samples per pixel of the passes that a budget is divided into, found by rendering some, and the
     seconds that starting one takes.
 
-    Of about `PASSES_IN_BUDGET` passes, or of fewer where starting them (every pass has virtual lights of its own, and
+    Of about `PASSES_IN_BUDGET` passes, or of fewer where starting them (every pass has VPLs of its own, and
     trees) would take more than `START_SHARE` of the time; one sample, and no time to start that is known, if even that
     takes half of the budget.
     """

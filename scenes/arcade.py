@@ -1,8 +1,8 @@
 """Write a sunlit arcade: a walk between a wall and a row of columns, under a roof of slats, open to a sky with a sun.
 
-The scene is for environments that arrive through gaps: most of the walk sees the sky through narrow openings, the sun
+The scene is for environment emitters behind gaps: most of the walk sees the sky through narrow openings, the sun
 falls in stripes on floor and wall, and what is bright elsewhere is lit by these stripes. Methods that draw from the
-whole sky lose most of their samples to columns and slats, those without indirect light most of the picture.
+whole environment lose most of their samples to columns and slats, those without indirect light most of the picture.
 
     python scenes/arcade.py --output scenes/arcade.xml
 """

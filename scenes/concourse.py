@@ -1,8 +1,8 @@
-"""Write the concourse of a railway station, lit by 613 point lights and 219 glowing globes.
+"""Write the concourse of a railway station, lit by 613 point emitters and 219 glowing globes.
 
 The scene is for methods that find out, pixel by pixel, which of many lights matter. It has the lights of `GCT` in
-Donikian et al., "Accurate direct illumination using iterative adaptive sampling" (2006), Table 1: 613 point lights and
-219 spherical area lights, of which about a third is visible from an average point. Here the points are stars below
+Donikian et al., "Accurate direct illumination using iterative adaptive sampling" (2006), Table 1: 613 point and 219
+spherical area emitters, of which about a third is visible from an average point. Here the points are stars below
 the vault, lamps behind the cornices and under the balconies, and bulbs in the side passages, booths and stairs; the
 globes hang in chandeliers and stand on columns, balustrades and the clock. Columns, piers, balusters, booths and
 arches hide them. The floor and the brass are glossy.

@@ -1,5 +1,5 @@
 """Building blocks of the generated scenes, as XML text: what hall.py has, and what the other generators share
-beyond it (glossy materials, turned slabs, lamps, skies, the command line).
+beyond it (glossy materials, turned slabs, emitters, skies, the command line).
 """
 
 import argparse
@@ -47,7 +47,7 @@ def header(command, title, fov, origin, target, depth=2):
 
 
 def material(name, colour, gloss=None, roughness=0.2):
-    """Return a two-sided material: matt, or with the `gloss` of "plastic" or "metal"."""
+    """Return a two-sided material: diffuse, or with the `gloss` of "plastic" or "metal"."""
     if gloss is None:
         inner = f'<bsdf type="diffuse"><rgb name="reflectance" value="{numbers(colour)}"/></bsdf>'
     else:

@@ -1,11 +1,11 @@
 """Write a hall with many lights: the scene that many-light methods are for.
 
 A two-storey hall (36 m long, a nave with pillars, galleries above twelve side rooms whose doors stand ajar) holds any
-number of lights of mixed kinds: bulbs on strings across the nave and in the rooms (points), uplights at the pillars and
-wall washers in the galleries (spots, whose light arrives by way of ceilings and walls), globes and panels (small area
-lights). Most lights are hidden from most points, each contributes something somewhere, and every surface is matt, so a
-path tracer that picks its lights uniformly is noisy while the image itself is simple. Neither the total power nor the
-building depends on the number of lights, so renders with different numbers of lights compare.
+number of lights of mixed kinds: bulbs on strings across the nave and in the rooms (point emitters), uplights at the
+pillars and wall washers in the galleries (spots, whose light arrives by way of ceilings and walls), globes and panels
+(small area emitters). Most lights are hidden from most points, each contributes something somewhere, and every surface
+is diffuse, so a path tracer that picks its lights uniformly is noisy while the image itself is simple. Neither the
+total power nor the building depends on the number of lights, so renders with different numbers of lights compare.
 
     python scenes/hall.py --lights 1000 --seed 1 --output scenes/hall.xml
 """
@@ -235,7 +235,7 @@ def area(random, power):
 
 
 def lights(count, random):
-    """Return `count` lights: a tenth area lights, three tenths spots, the rest points; the total power is constant."""
+    """Return `count` lights: a tenth area, three tenths spot, the rest point emitters; total power is constant."""
     power = 1500.0 / count  # radiant intensity of an average bulb, W/sr
     areas, spots = count // 10, 3 * count // 10
     yield from (area(random, power) for _ in range(areas))

@@ -1,4 +1,4 @@
-"""Write a kitchen lit by 72 area lights, most of which are hidden from most points.
+"""Write a kitchen lit by 72 area emitters, most of which are hidden from most points.
 
 The scene is for methods that find out, pixel by pixel, which of many lights matter. It has the lights of `Kitchen` in
 Donikian et al., "Accurate direct illumination using iterative adaptive sampling" (2006), Table 1: 72 area lights, of

@@ -1,5 +1,5 @@
 """Render the small pictures beside the scenes, by `lightcuts` with adaptive direct light, the forest by direct light,
-the veils with lamps that are virtual lights.
+the veils with emitters that are virtual lights.
 
 ./run -- python scenes/previews.py [NAME...]
 """

@@ -1,10 +1,10 @@
 """Write a hall with rows of gauze veils on both sides of an aisle.
 
-The scene is for shadow rays that are dear: what lets light pass unscattered is found surface by surface, and rays from
-wall to wall meet a dozen of them. With `--veils` it tells at what cost of a ray a method that traces few of them pays;
-without veils it is a plain room. Emitter sampling does not pass veils, in Mitsuba's integrators as here, so that `path`
-finds the lamps behind them by chance only; `direct="vpl"` sees them. Every veil on the way to a surface is an edge of
-the path.
+The scene is for shadow rays that are expensive: what lets light pass unscattered is found surface by surface, and rays
+from wall to wall meet a dozen of them. With `--veils` it tells at what cost of a ray a method that traces few of them
+pays; without veils it is a plain room. Next-event estimation does not pass veils, in Mitsuba's integrators as here, so
+that `path` finds the emitters behind them by chance only; `direct="vpl"` sees them. Every veil on the way to a surface
+is an edge of the path.
 
     python scenes/veils.py --output scenes/veils.xml
 """

@@ -1,4 +1,4 @@
-"""What Mitsuba offers, one small example of each: materials, emitters, sensors and films for the tests of all of them.
+"""Small examples of all that Mitsuba offers: materials, emitters, sensors and films for the tests of all of them.
 
 Functions that return dictionaries for ``mi.load_dict``; they are called when the variant is set.
 """
@@ -131,7 +131,7 @@ EMITTERS = {
 
 
 def stage(emitters, objects, size=24, spp=4, **camera):
-    """A floor and a wall with ``objects`` (dictionaries of shapes) in front, open to the sky."""
+    """A floor and a wall with ``objects`` (dictionaries of shapes) in front, open to the environment."""
     return {
         "type": "scene",
         "sensor": sensor(size, spp, fov=45, **camera),

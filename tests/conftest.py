@@ -97,7 +97,7 @@ def closed_box(emitters, size=32, spp=4, scale=1.0, **more):
 
 
 def area_light(scale=1.0, radiance=(4.0, 4.0, 4.0)):
-    """A small square lamp below the ceiling of the closed box."""
+    """A small square area emitter below the ceiling of the closed box."""
     transform = mi.ScalarTransform4f().translate([0, 0.9 * scale, 0]).rotate([1, 0, 0], 90).scale(0.3 * scale)
     radiance = {"type": "rgb", "value": list(radiance)}
     return {"type": "rectangle", "to_world": transform, "emitter": {"type": "area", "radiance": radiance}}

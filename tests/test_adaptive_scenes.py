@@ -14,8 +14,8 @@ from comparison.scene_files import SceneFile
 from .conftest import VARIANT
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
-# Of each: the generator, its options, how many lights there are (points, areas, skies), how many of them an average
-# pixel may see, and how much of the image may show the sky.
+# Of each: the generator, its options, how many emitters there are (point, area, environment), how many of them an
+# average pixel may see, and how much of the image may show the sky.
 TRAITS = {
     "kitchen_lamps": ("kitchen_lamps", [], (0, 72, 0), (0.05, 0.35), 0),
     "kitchen_windows": ("kitchen_lamps", ["--windows"], (0, 72, 1), (0.05, 0.35), 0),

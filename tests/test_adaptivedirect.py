@@ -47,7 +47,7 @@ def mixed_emitters():
 
 
 def mixed_scene(emitters):
-    """Matt and glossy surfaces and an occluder, with all kinds of films (sensors 1 and up)."""
+    """Diffuse and glossy surfaces and an occluder, with all kinds of films (sensors 1 and up)."""
     films = {
         "cropped": {"width": 40, "height": 30, "crop_offset_x": 3, "crop_offset_y": 5, "crop_width": 21,
                     "crop_height": 11, "rfilter": {"type": "box"}},
@@ -323,7 +323,7 @@ def test_scenes_without_light_are_black(plugin, name):
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
-def test_sky_without_geometry_is_shown(plugin):
+def test_environment_without_geometry_is_shown(plugin):
     scene = mi.load_dict(
         {"type": "scene", "sensor": sensor(16, 2), "sky": {"type": "constant", "radiance": rgb(1, 2, 3)}}
     )
@@ -490,9 +490,9 @@ def test_mirrors_show_direct_light_of_what_they_reflect(plugin):
     assert compare(scene, 2, 2).max() > 0.5
 
 
-def test_lamp_in_glass_is_found_by_bsdf_samples(variant):
-    # The lamp lies within the glass: it reaches the floor by refraction alone, and light from the floor returns to it
-    # by way of the glass only after the fourth edge
+def test_emitter_in_glass_is_found_by_bsdf_samples(variant):
+    # The emitter lies within the glass: its light reaches the floor by refraction alone, and light from the floor
+    # returns to it by way of the glass only after the fourth edge
     def ball(radius, **more):
         return {"type": "sphere", "radius": radius, "center": [0, -0.3, 0], **more}
 
@@ -506,7 +506,7 @@ def test_lamp_in_glass_is_found_by_bsdf_samples(variant):
     path = repeat(scene, "path", 12, 512, 1000, max_depth=4)
     ours = repeat(scene, "adaptivedirect", 12, 2, max_depth=4, bsdf_share=1.0, error=0.2, lights="clusters")
     assert_same_expectation(ours, path)
-    # Only rays that see the lamp directly are left
+    # Only rays that see the emitter directly are left
     blind = repeat(scene, "adaptivedirect", 1, 4, max_depth=4, bsdf_share=0.0)
     assert blind.mean() < 0.9 * path.mean()
 

@@ -1,4 +1,4 @@
-"""Sums over all sources, and the table of a sky: what many points of a pixel and a sharp sun ask of them."""
+"""Sums over all sources, and the table of an environment: what many points of a pixel and a sharp sun ask of them."""
 
 import mitsuba as mi
 import numpy as np
@@ -33,7 +33,7 @@ def test_one_ray_a_light_is_enough_for_one_point_a_pixel():
 
 
 @pytest.mark.parametrize("direction", [[0.3, 0.4, 0.8], [0.0, 0.7, 0.7], [0.9, 0.2, 0.1]])
-def test_the_table_of_a_sky_holds_the_edge_of_the_sun(direction):
+def test_the_table_of_an_environment_holds_the_edge_of_the_sun(direction):
     """Evaluations may all miss the part of the sun in a cell; then nearly no sample would ever go there."""
     sun = {"type": "sunsky", "sky_scale": 0.0, "sun_direction": direction}
     scene = mi.load_dict({"type": "scene", "sensor": sensor(), "ball": {"type": "sphere"}, "sun": sun})

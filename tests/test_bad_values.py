@@ -22,7 +22,7 @@ def texture(value):
 
 
 def lit(lights=None, **objects):
-    """A closed box with a good lamp, so that an image that is black or too dark shows what one bad value spoilt."""
+    """A closed box with a good emitter, so that an image that is black or too dark shows what one bad value spoilt."""
     return closed_box({"good": area_light(), **(lights or {})}, 16, **objects)
 
 
@@ -80,7 +80,7 @@ MATTER = {
 
 
 def assert_renders_well(description, name, least=0.1):
-    """Render by a plugin of the catalogue: finite, not negative, and hardly darker than the good lamp makes it."""
+    """Render by a plugin of the catalogue: finite, not negative, and hardly darker than the good emitter makes it."""
     found = render(mi.load_dict(description), mi.load_dict(plugin(name, max_depth=3)), 2)
     assert np.isfinite(found).all()
     assert found.min() >= 0
@@ -106,7 +106,7 @@ def test_no_bad_value_spoils_any_plugin(name, source, value):
     assert_renders_well((LIGHTS | MATTER)[source](BAD[value]), name)
 
 
-def sky_only(value, kind):
+def environment_only(value, kind):
     sky = {
         "envmap": lambda: {"type": "envmap", "bitmap": mi.Bitmap(texture(value))},
         "constant": lambda: {"type": "constant", "radiance": rgb(value)},
@@ -115,7 +115,7 @@ def sky_only(value, kind):
 
 
 def error_of(scene, name, **more):
-    """What a render that is refused says, with what caused it."""
+    """Message of a render that is refused, with that of its cause."""
     with pytest.raises(RuntimeError) as error:
         render(scene, mi.load_dict(plugin(name, **more)), 2)
     said = f"{error.value} {error.value.__cause__}"
@@ -127,14 +127,14 @@ def error_of(scene, name, **more):
 @pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])
 @pytest.mark.parametrize("value", ["nan", "inf", "huge"])
 def test_an_environment_map_that_cannot_be_sampled_is_refused_by_name(name, value):
-    said = error_of(sky_only(BAD[value], "envmap"), name)
+    said = error_of(environment_only(BAD[value], "envmap"), name)
     assert 'environment map "sky" has 2 texel(s)' in said and "row 1 and column 2" in said
 
 
 @pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])
 def test_negative_texels_of_an_environment_are_black(name):
     found, black = (
-        render(sky_only(value, "envmap"), mi.load_dict(plugin(name, max_depth=2)), 64) for value in (-1.0, 0.0)
+        render(environment_only(value, "envmap"), mi.load_dict(plugin(name, max_depth=2)), 64) for value in (-1.0, 0.0)
     )
     assert found.min() >= 0
     assert found.mean() < black.mean() * 1.02
@@ -143,9 +143,9 @@ def test_negative_texels_of_an_environment_are_black(name):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])
 @pytest.mark.parametrize("value", ["nan", "negative", "huge"])
-def test_a_bad_constant_sky_is_dropped_and_counted(name, value):
+def test_a_bad_constant_environment_is_dropped_and_counted(name, value):
     integrator = mi.load_dict(plugin(name))
-    assert render(sky_only(BAD[value], "constant"), integrator, 2).max() == 0
+    assert render(environment_only(BAD[value], "constant"), integrator, 2).max() == 0
     assert integrator.statistics["dropped"] == 1
 
 
@@ -172,7 +172,7 @@ def test_area_emitters_on_shapes_that_cannot_be_sampled_are_refused(name, shape)
     assert 'shape "lamp" (' in error_of(mi.load_dict(closed_box({"lamp": lamp})), name)
 
 
-def test_a_sky_that_mitsuba_cannot_evaluate_is_refused_by_name():
+def test_an_environment_that_mitsuba_cannot_evaluate_is_refused_by_name():
     said = error_of(mi.load_dict(stage({"sky": {"type": "timed_sunsky"}}, {}, 8)), "lightcuts")
     assert '"sky" (TimedSunskyEmitter) is not supported' in said
 

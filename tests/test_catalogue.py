@@ -94,7 +94,7 @@ def test_every_way_of_direct_light_under_every_emitter(direct, emitter):
 
 
 def measured(sensor, **film_options):
-    """The stage with a plastic ball under a lamp, seen by some sensor of the catalogue."""
+    """The stage with a plastic ball under an area emitter, seen by some sensor of the catalogue."""
     description = stage(EMITTERS["rectangle"](), one_of(MATERIALS["roughplastic"]()), 16)
     size = (1, 1) if sensor in ONE_PIXEL else (16, 16)
     return mi.load_dict(description | {"sensor": SENSORS[sensor](film(*size, **film_options))})
@@ -119,7 +119,7 @@ def test_every_sensor_with_every_plugin(sensor, name):
 
 @pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])
 def test_a_meter_on_a_surface(name):
-    """The floor measures the irradiance that a small lamp sends to it."""
+    """The floor measures the irradiance that a small emitter sends to it."""
     description = stage(EMITTERS["sphere"](), {}, 16)
     meter = {"type": "irradiancemeter", "film": film(1, 1), "sampler": {"type": "independent"}}
     del description["sensor"]

@@ -1,4 +1,4 @@
-"""Images that a formula knows: lamps over a plane, two parallel disks, a furnace whose walls glow."""
+"""Images that a formula knows: emitters over a plane, two parallel disks, a furnace whose walls glow."""
 
 import mitsuba as mi
 import numpy as np
@@ -30,7 +30,7 @@ def assert_mean(name, scene, expected, spp=16, tolerance=2e-3, **more):
 
 
 def floor_seen_from(eye, half_size=20.0, kind="rectangle"):
-    """A matt floor of reflectance 1/2, of which a camera at ``eye`` sees hardly more than the origin."""
+    """A diffuse floor of reflectance 1/2, of which a camera at ``eye`` sees hardly more than the origin."""
     camera = sensor(8, 16) | {
         "to_world": mi.ScalarTransform4f().look_at(eye, [0, 0, 0], [0, 0, 1]), "fov": 0.5, "near_clip": 1e-5,
     }  # fmt: skip

@@ -139,10 +139,10 @@ def test_a_sun_has_regions_of_its_own():
     own = np.unique(labels[sun])
     assert not set(own) & set(labels[~sun])
     assert len(own) == np.round(300 * importance(radiance, sun) / importance(radiance, radiance > 0))
-    assert 10 < len(own) < 100, "the sky keeps most of the samples"
+    assert 10 < len(own) < 100, "the rest keeps most of the samples"
 
 
-def test_lamps_get_their_shares():
+def test_bright_disks_get_their_shares():
     shape, count = (128, 256), 200
     great, little = disk(shape, SUN, 0.15), disk(shape, LAMP, 0.08)
     radiance = np.where(great, 40.0, np.where(little, 70.0, 0.1))
@@ -153,7 +153,7 @@ def test_lamps_get_their_shares():
         assert len(own) == np.round(count * importance(radiance, lamp) / importance(radiance, radiance > 0))
 
 
-def test_the_lamps_that_miss_most_come_first():
+def test_the_disks_that_miss_most_come_first():
     radiance = np.zeros((64, 128))
     lamps = 30, np.arange(0, 128, 16)
     radiance[lamps] = 1.03, 1.07, 1.01, 1.05, 1.0, 1.06, 1.02, 1.04
@@ -163,7 +163,7 @@ def test_the_lamps_that_miss_most_come_first():
     assert len(set(labels[lamps][radiance[lamps] > 1.025])) == 5
 
 
-def test_a_small_lamp_counts_as_a_hundredth_of_a_steradian():
+def test_a_small_disk_counts_as_a_hundredth_of_a_steradian():
     radiance = np.full((256, 512), 1e-9)
     radiance[128:131, 200:203] = 1
     assert solid_angles(256, 512)[128:131, 200:203].sum() < 0.002
@@ -184,7 +184,7 @@ def test_samples_of_a_brighter_level_count_in_the_darker_one():
     assert parts[0] + parts[1] == shares[1]
 
 
-def test_a_lamp_across_the_seam_is_one():
+def test_a_disk_across_the_seam_is_one():
     shape = (32, 64)
     radiance = np.full(shape, 1e-9)
     radiance[15:17, [0, 1, -1, -2]] = 1
@@ -196,7 +196,7 @@ def test_a_lamp_across_the_seam_is_one():
     assert labels[15, 0] not in labels[~inside]
 
 
-def test_black_cells_join_the_nearest_lamp():
+def test_black_cells_join_the_nearest_bright_one():
     shape = (32, 64)
     lamps = np.zeros(shape)
     lamps[16, 16] = lamps[16, 48] = 1

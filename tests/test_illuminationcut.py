@@ -37,7 +37,7 @@ def assert_same(one, other):
 
 
 def open_floor(size=64, lamps=60):
-    """A floor below a ring of bulbs: nothing is in the way of any light."""
+    """A floor below a ring of point emitters: nothing is in the way of any light."""
     bulbs = {}
     for k in range(lamps):
         position = [math.cos(k), math.sin(k), 1 - 0.01 * k]
@@ -171,7 +171,7 @@ def test_aovs_count_what_statistics_count_and_leave_the_image_alone(visibility):
 
 
 def test_phase_one_is_a_rough_copy_of_the_image():
-    """Without lamps: the image shows them, and what a surface reflects is all that the first phase estimates."""
+    """Without area emitters: the image shows them, the first phase estimates only what a surface reflects."""
     scene = many_kinds()
     del scene["lamp"]
     image, _ = rendered(mi.load_dict(scene), 4, vpl_count=2000, max_depth=5, aovs="phase_one")

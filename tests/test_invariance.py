@@ -11,7 +11,7 @@ from .conftest import area_light, closed_box, relative_error, render
 QUICK = ("lightcuts", "adaptivedirect")
 
 
-def lamps():
+def emitters():
     """One of each kind that has a place."""
     ball = {"type": "sphere", "center": [0.4, -0.3, 0.2], "radius": 0.15, "bsdf": {"type": "roughplastic"}}
     bulbs = {
@@ -22,8 +22,8 @@ def lamps():
 
 
 def moved(transform, factor=1.0):
-    """The closed box with its lamps and camera, each moved; intensities of points grow with the square of a scale."""
-    scene = closed_box(lamps(), 16)
+    """The closed box with its emitters and camera, each moved; intensities grow with the square of a scale."""
+    scene = closed_box(emitters(), 16)
     for part in scene.values():
         if not isinstance(part, dict):
             continue
@@ -98,7 +98,7 @@ def test_place(name, distance, tolerance):
 @pytest.mark.parametrize("name", PLUGINS)
 @pytest.mark.parametrize("distance", [1e5, 1e6, 1e7, 1e12])
 def test_places_where_nothing_is_resolved_do_no_harm(name, distance):
-    """What is rendered has little to do with the scene, in ``path`` as well; it is still an image."""
+    """The image has little to do with the scene, in ``path`` as well; it is still finite."""
     assert np.isfinite(change(name, mi.ScalarTransform4f().translate([distance, -distance, 0.5 * distance])))
 
 
@@ -121,7 +121,7 @@ def test_unit_of_light(name, unit):
 @pytest.mark.parametrize("name", QUICK)
 def test_order_of_shapes_and_lights(name):
     """Emitters and shapes listed the other way round give the same image: lights are sorted before anything random."""
-    scene = closed_box(lamps(), 16)
+    scene = closed_box(emitters(), 16)
     parts = list(scene.items())
     integrator = mi.load_dict(plugin(name, max_depth=3))
     first, second = (
@@ -136,7 +136,7 @@ def test_order_of_shapes_and_lights(name):
 @pytest.mark.parametrize("name", ["lightcuts", "mdlightcuts", "illuminationcut", "illuminationcut-adaptive"])
 def test_numbers_of_virtual_lights(name, count):
     """From one to two million; more lights are another estimate of the same image."""
-    scene = mi.load_dict(closed_box(lamps(), 16))
+    scene = mi.load_dict(closed_box(emitters(), 16))
     found = render(scene, mi.load_dict(plugin(name, vpl_count=count, max_depth=4)), 4)
     expected = render(scene, mi.load_dict(plugin("lightcuts", vpl_count=20_000, max_depth=4)), 4)
     assert np.isfinite(found).all() and found.min() >= 0

@@ -22,7 +22,7 @@ COATED = {"type": "roughplastic", "alpha": 0.15, "diffuse_reflectance": {"type":
 
 
 def many_kinds():
-    """A closed box with point lights, spots, a sun that cannot get in, a lamp and glossy things."""
+    """A closed box with point, spot and area emitters, a directional one that cannot get in, and glossy things."""
     rng = np.random.default_rng(0)
     lights = {"lamp": area_light(), "sun": {"type": "directional", "direction": [0, -1, 0]}}
     for k in range(12):
@@ -213,7 +213,7 @@ def test_thresholds_do_not_bias_the_image():
 
 
 @pytest.mark.parametrize("direct", ["nee", "vpl"])
-def test_a_sky_behind_masks_and_coloured_panes_is_seen_as_path_sees_it(direct):
+def test_an_environment_behind_masks_and_coloured_panes_is_seen_as_path_sees_it(direct):
     tint = {"type": "rgb", "value": [1.0, 0.3, 0.1]}
     scene = {
         "type": "scene", "sensor": sensor(16), "sky": {"type": "constant"},
@@ -227,7 +227,7 @@ def test_a_sky_behind_masks_and_coloured_panes_is_seen_as_path_sees_it(direct):
     assert np.allclose(ours, render(scene, "path", 256, 5, max_depth=4).mean((0, 1)), rtol=0.06)
 
 
-def test_alpha_is_that_of_path_with_and_without_a_sky():
+def test_alpha_is_that_of_path_with_and_without_an_environment():
     for sky in ({}, {"sky": {"type": "constant"}}):
         camera = sensor(16)
         camera["film"]["pixel_format"] = "rgba"

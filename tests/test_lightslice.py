@@ -150,9 +150,9 @@ def test_pruned_forests_hold_every_column_once_and_split_what_costs_most(seed, t
         left = np.setdiff1d(whole, forest.columns)
         assert len(split) == 0 or len(left) == 0 or cost[split].min() >= cost[left].max()
         # All that there is room for, but for nodes that cost the same as those that there is none for
-        dearest = np.sort(cost[forest.inner])[::-1]
-        worthwhile = dearest[dearest > 0][: most - len(trees)]
-        first_left = dearest[most - len(trees)] if most - len(trees) < len(dearest) else 0
+        costliest = np.sort(cost[forest.inner])[::-1]
+        worthwhile = costliest[costliest > 0][: most - len(trees)]
+        first_left = costliest[most - len(trees)] if most - len(trees) < len(costliest) else 0
         assert len(split) >= np.count_nonzero(worthwhile > first_left * (1 + 1e-9))
 
 
@@ -343,7 +343,7 @@ def given_to_all(given):
 
 
 def dark_corners():
-    """A box whose floor is shaded by a shelf from half of some red and green bulbs: most rows see few lights."""
+    """A box whose floor is shaded by a shelf from half of ten red and green emitters: most rows see few lights."""
     bulbs = {}
     for k in range(10):
         color = {"type": "rgb", "value": [1.0, 0.05, 0.1] if k % 2 else [0.05, 1.0, 0.1]}
@@ -459,7 +459,7 @@ def test_one_point_and_one_light():
 
 
 def test_rows_that_see_nothing_leave_the_choice_to_bounds():
-    """The only bulb is behind a screen, seen from all but a sliver of the floor."""
+    """The only point emitter is behind a screen, seen from all but a sliver of the floor."""
     scene = closed_box({"bulb": {"type": "point", "position": [0, 0.9, 0], "intensity": 1.0}}, size=16)
     scene = mi.load_dict(scene | {"screen": wall([0, 0.85, 0], [1, 0, 0], -90, 0.97)})
     given = {"max_depth": 2}

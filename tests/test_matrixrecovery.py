@@ -145,8 +145,8 @@ def test_sparse_errors_are_told_from_low_rank():
     true, wrong = planted(0, (3, 60, 90), 4, 0.04)
     error, found = separated(wrong, residual=0.01, progress=-1.0, relative=0.12)
     assert not found.failed.any() and (found.rank == 4).all()
-    mended = wrong - np.round(error)
-    assert (mended != true).mean() < 0.1 * (wrong != true).mean()
+    corrected = wrong - np.round(error)
+    assert (corrected != true).mean() < 0.1 * (wrong != true).mean()
 
 
 def test_entries_that_were_traced_are_never_wrong():
@@ -233,7 +233,7 @@ def dark_error(image, expected):
 
 @pytest.fixture(scope="module")
 def shadows():
-    """A room with a plate below the lamp: half of it is in shadow."""
+    """A room with a plate below the area emitter: half of it is in shadow."""
     plate = wall([0, 0.4, 0], [1, 0, 0], -90, 0.55)
     return mi.load_dict(closed_box({"lamp": area_light()}, size=48, plate=plate))
 

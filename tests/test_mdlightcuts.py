@@ -171,7 +171,7 @@ def test_max_cut_bounds_pairs_about():
     scene = glossy_room()
     given = {"vpl_count": 20000, "max_depth": 5, "error": 0.002, "direct": "vpl"}
     limited, free = (rendered(scene, 4, max_cut=most, **given)[1] for most in (100, 0))
-    # Pixels that see matt and glossy surfaces have two cuts
+    # Pixels that see diffuse and glossy surfaces have two cuts
     pixels = limited["gather_points"] / 4
     assert limited["cut_size"] < 250 * pixels < free["cut_size"] / 2
 

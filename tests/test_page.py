@@ -22,7 +22,7 @@ def results_of(out):
 
 
 def unpack(packed):
-    """What viewer.js does."""
+    """Image codes as viewer.js unpacks them."""
     planes = np.frombuffer(zlib.decompress(base64.b64decode(packed["data"])), np.uint8)
     shape = (packed["depth"], packed["channels"], packed["height"], packed["width"])
     planes = planes.reshape(shape).astype(np.uint16)

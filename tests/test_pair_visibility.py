@@ -26,7 +26,7 @@ SIDE = 16
 
 
 class Tiles:
-    """Four tiles of points in a row, under an open sky, a roof, half a roof and a veil; lights above all of them.
+    """Four tiles of points in a row, under nothing, a roof, half a roof and a veil; lights above all of them.
 
     ``tiles``: for every node of the point tree, the tiles that its points lie on; ``dark``: points that no light
     reaches; both along the tree.

@@ -57,7 +57,7 @@ def emitters(draw):
 
 @st.composite
 def scenes(draw):
-    """A floor, so that something is seen, some shapes, and one to four emitters; at most one sky."""
+    """A floor, so that something is seen, some shapes, and one to four emitters; at most one environment."""
     floor = mi.ScalarTransform4f().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(2)
     scene = {"type": "scene", "sensor": sensor(8, 2), "floor": {"type": "rectangle", "to_world": floor}}
     for number, shape in enumerate(draw(st.lists(shapes(False), max_size=4))):

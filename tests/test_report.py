@@ -1,4 +1,4 @@
-"""What a sweep writes, strips of pictures, and --check."""
+"""Files that a sweep writes, strips of pictures, and --check."""
 
 import json
 from pathlib import Path

@@ -27,7 +27,7 @@ def generator():
 
 
 def kinds(text):
-    """Count the points, the spots and the area lights of a scene's XML."""
+    """Count the point, spot and area emitters of a scene's XML."""
     return [len(re.findall(f'<emitter type="{kind}">', text)) for kind in ("point", "spot", "area")]
 
 
@@ -51,7 +51,7 @@ def test_shipped_hall_is_what_the_generator_makes(generator, tmp_path):
     assert (tmp_path / "hall.xml").read_text() == (ROOT / "scenes" / "hall.xml").read_text()
 
 
-# Points, spots and areas of the scenes that have one number of them
+# Point, spot and area emitters of the scenes that have one number of them
 OTHERS = {"banquet": [0, 60, 66], "arcade": [0, 0, 0], "corridor": [0, 0, 32], "veils": [0, 0, 6]}
 
 

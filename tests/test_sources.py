@@ -439,13 +439,13 @@ def test_regions_share_out_all_light(name):
     assert np.allclose(light.sum(0), expected, rtol=5e-3, atol=5 * expected_error.max())
 
 
-def test_regions_of_a_constant_sky_fill_the_sphere():
+def test_regions_of_a_constant_environment_fill_the_sphere():
     regions = EnvironmentRegions(environment(SKIES["constant"]()), 50)
     assert regions.count == 50
     assert regions.irradiance.sum() == pytest.approx(4 * np.pi * 2, rel=1e-4)
 
 
-def test_a_black_sky_gives_nothing_and_no_nan():
+def test_a_black_environment_gives_nothing_and_no_nan():
     for plugin in (sky(np.zeros((8, 16, 3))), {"type": "constant", "radiance": 0.0}):
         regions = EnvironmentRegions(environment(plugin), 10)
         assert regions.count >= 1
@@ -698,14 +698,14 @@ def test_lights_without_power_are_never_drawn():
         "t": {"type": "disk", "to_world": down(1, 1, 1), "emitter": area(texture(np.zeros((4, 4, 3), np.float32)))},
     }
     assert sources_of(lit_plane(dark)).count == 0
-    # Behind the dark ones in every list: a lamp among the pieces, a projector after a black sky
+    # Behind the dark ones in every list: an area emitter among the pieces, a projector after a black environment
     lit = {"z": {"type": "rectangle", "to_world": down(-0.5, 0.4, 1.8, scale=0.5), "emitter": area()}}
     scene = lit_plane(dark | many_points([1, 2]) | lit | LIGHTS["projector"]())
     sources = sources_of(scene)
     assert sources.count == 4
     assert (sources.nodes.intensity > 0).all()
     assert_same_light(scene)
-    # A dark lamp that a ray meets is no source
+    # A dark emitter that a ray meets is no source
     ray = mi.Ray3f(dr.zeros(mi.Point3f, 1) + mi.Point3f(0.35, -0.1, 1.5), mi.Vector3f(0, 0, 1))
     hit = scene.ray_intersect_preliminary(ray)
     assert download(hit.is_valid())[0]

@@ -1,4 +1,4 @@
-"""What --sweep varies, the order of runs, the time left, and runs that are kept."""
+"""Settings that --sweep varies, the order of runs, the time left, and runs that are kept."""
 
 import argparse
 

@@ -70,7 +70,7 @@ def test_same_seed_same_lights():
     assert first.lights.count != other.lights.count or not np.array_equal(first.lights.position, other.lights.position)
 
 
-def test_a_light_that_cannot_get_in_does_not_starve_the_lamp_inside():
+def test_a_light_that_cannot_get_in_does_not_starve_the_emitter_inside():
     scene = closed_box({"lamp": area_light(), "sky": {"type": "constant", "radiance": 1000.0}})
     scene = mi.load_dict(scene)
     lights = trace_lights(scene, read_emitters(scene), 5000, 0, PathLimits(3, 5, 1.0)).lights
