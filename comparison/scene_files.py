@@ -56,11 +56,11 @@ class SceneFile:
 
     def set_integrator(self, name, parameters=None, keep=KEPT_PARAMETERS):
         """Replace the scene's integrator. Of the old one's parameters it keeps those named by `keep` (None: all),
-        unless given anew, or unknown to a new one of another name. Raises RuntimeError or ValueError if the new one
-        cannot be created."""
+        unless given anew, or unknown to the new one; but if all are kept for one of the same name, unknown ones are
+        refused. Raises RuntimeError or ValueError if the new one cannot be created."""
         given, (old_name, old) = dict(parameters or {}), self.integrator
         kept = {key: old[key] for key in old if key not in given and (keep is None or key in keep)}
-        if name != old_name:
+        if name != old_name or keep is not None:
             # Nothing lists the parameters of a plugin, but one that was created, or refused those that it does not
             # know, tells which it asked for
             tried = _properties(name, kept | given)
