@@ -64,8 +64,8 @@ class AdaptiveDirectIntegrator(DirectLightIntegrator):
         ),
         Number(
             "cluster_angle", DirectOptions.cluster_angle,
-            "Largest solid angle of a cluster as seen from a point, in steradians. Clusters that would send less than "
-            "0.5% of the light, if nothing was between, may fill up to 0.3.",
+            "Largest solid angle of a cluster as seen from a point, in steradians. Clusters whose unoccluded "
+            "contribution is less than 0.5% of the light may fill up to 0.3.",
             minimum=0,
         ),
         Integer("max_passes", DirectOptions.max_passes, "Most passes over a pixel.", minimum=1),

@@ -1,4 +1,4 @@
-"""Rendering an image in bands of rows: memory that does not grow with the film, for methods that need a pixel whole.
+"""Images rendered in bands of rows: memory that does not grow with the film, for methods that need a pixel whole.
 
 Mitsuba divides large renders into passes of fewer samples a pixel.  A method that decides for each pixel when to stop
 would do so in every pass anew, so its images are divided by rows instead.

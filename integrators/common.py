@@ -187,7 +187,7 @@ class ManyLightIntegrator(GatheringIntegrator):
 
     def _adaptive(self, scene, camera: CameraPass, grid):
         """Direct light of extended emitters by adaptive sampling: (radiance, rays)."""
-        # Points, spots and directional emitters are virtual lights already
+        # Point, spot and directional emitters are virtual lights already
         sources = Sources(scene, camera.emitters.extended_only())
         options = DirectOptions(error=self.direct_error)
         found = light_directly(

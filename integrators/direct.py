@@ -24,7 +24,7 @@ _LEVEL_RAYS = 4096
 
 @dataclass
 class Band:
-    """What a band of rows knows of the image: how its pixels lie, the mean radiance, and its share of the time."""
+    """Band of rows, with what it knows of the image: how its pixels lie, the mean radiance, its share of the time."""
 
     grid: PixelGrid
     level: float
@@ -126,7 +126,7 @@ class DirectLightIntegrator(GatheringIntegrator):
         return float(download(found.radiance).sum(dtype="float64")) / (3 * _LEVEL_RAYS)
 
     def pixel_grid(self, scene, sampler):
-        """How the camera rays of this pass or band lie in the image."""
+        """Layout of the camera rays of this pass or band in the image."""
         return self._band.grid if self._band else super().pixel_grid(scene, sampler)
 
     def light(self, scene, sampler, camera: CameraPass):

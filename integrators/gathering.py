@@ -136,7 +136,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         return CameraPass(seed, emitters, traits, paths, paths.valid | (active & sky), clock)
 
     def pixel_grid(self, scene, sampler) -> PixelGrid:
-        """How the camera rays of this pass lie in the image.
+        """Layout of the camera rays of this pass in the image.
 
         Mitsuba puts the rays of a pixel next to each other. A wrapper may render in passes of its own, in which no
         sensor has as many pixels as there would have to be: then every ray counts as a pixel, eight to a row.

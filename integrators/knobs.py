@@ -36,7 +36,7 @@ class Knob:
 
     @property
     def allowed(self) -> str:
-        """What may be given, in words."""
+        """Values that may be given, in words."""
         raise NotImplementedError
 
     def parse(self, value):
@@ -44,7 +44,7 @@ class Knob:
         raise NotImplementedError
 
     def show(self, value):
-        """What is printed of an attribute: that which would have to be given for it."""
+        """Text of an attribute: that which would have to be given for it."""
         return value
 
     def read(self, plugin, props):

@@ -50,8 +50,8 @@ class LightSliceIntegrator(ManyLightIntegrator):
 
     {what is estimated}
 
-    There is no bound on the error. On diffuse surfaces it falls about as 1 / ``columns``; next to corners, and wherever
-    there is gloss, single pixels can be far too bright, because no sampled row was as near to a light or in its lobe.
+    There is no bound on the error. On diffuse surfaces it falls about as 1 / ``columns``; next to corners and on glossy
+    surfaces single pixels can be far too bright, because no sampled row was as near to a light or in its lobe.
     With few gather points to a slice (small images) the sampled rows cost more than they save; take fewer slices.
 
     **Departures from the paper.** Clusters are nodes of the light trees, split where the sampled rows say that it
@@ -61,7 +61,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
     expectation, and no light is lost because no row saw it. Rows of neighbours count less the farther away they are.
     Neighbouring pixels take different lights of a cluster (interleaved sampling), which makes noise of what would be
     seams between slices; ``sets`` 1 is the paper's. At glossy points one of several lights of a cluster is traced
-    (``candidates``; resampled importance sampling); at matt ones that gained less than it cost. See
+    (``candidates``; resampled importance sampling); at diffuse ones that gained less than it cost. See
     :mod:`vpl.points.slices`, :mod:`vpl.matrix.light_matrix`, :mod:`vpl.matrix.slice_columns`. Lambertian points and all
     others are in slices of their own.
 

@@ -88,7 +88,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
         ),
         Integer(
             "leaf_points", 4,
-            "Neighbouring samples of a pixel, on surfaces without gloss, that are never told apart: for every cluster "
+            "Neighbouring samples of a pixel, on diffuse surfaces, that are never told apart: for every cluster "
             "of lights one of them, drawn at random, stands for all, whatever ``error`` says. 1: there are none.",
             minimum=1,
         ),
@@ -138,7 +138,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
                 yield group, pairs
 
     def _allowed(self, job: ShadeJob, estimate: Estimate, pixel: np.ndarray) -> np.ndarray:
-        """What a pair may add to the radiance of its pixel at most, for every point, (n,) float64."""
+        """Most that a pair may add to the radiance of its pixel, for every point, (n,) float64."""
         weighted = estimate.radiance * download(job.weight).mean(1, dtype=np.float64)
         radiance = np.bincount(pixel, weighted)[pixel] / job.grid.samples
         return self.error * np.maximum(radiance, self.dark_floor * job.mean)

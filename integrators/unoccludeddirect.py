@@ -26,9 +26,9 @@ class UnoccludedDirectIntegrator(DirectLightIntegrator):
      {knobs}
 
     The reference solution of Donikian et al. 2006 [IAS section 5.1], with which ``adaptivedirect`` is compared: at
-    every point emitters are drawn in proportion to what each would send if nothing was between, one camera ray of the
-    pixel after another, until its error is below ``error`` by the same rule. Needs a sampler with several samples a
-    pixel to antialias; it goes round them as often as it has to.
+    every point emitters are drawn in proportion to their unoccluded contribution, one camera ray of the pixel after
+    another, until its error is below ``error`` by the same rule. Needs a sampler with several samples a pixel to
+    antialias; it goes round them as often as it has to.
 
     {what direct light is estimated}
 
