@@ -1,4 +1,4 @@
-"""What all other packages stand on: no light, no gather point, no method.
+"""Foundations of all other packages: no light, no gather point, no method.
 
 - ``arrays``: the only safe ways between NumPy and Dr.Jit (``upload``, ``download``); which values count as numbers
   (``usable``, ``finite_or_zero``); rows worked off in chunks that fit in memory (``chunks``)

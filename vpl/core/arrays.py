@@ -1,4 +1,4 @@
-"""Moving arrays between NumPy and Dr.Jit, in the only two ways that are safe.
+"""Arrays that move between NumPy and Dr.Jit, in the only two ways that are safe.
 
 On the LLVM backend ``mi.Float(ndarray)`` aliases NumPy's memory, and kernels read it in whole packets, past the end
 when the length is no multiple of the packet width.  Memory that Dr.Jit allocated is padded, so every upload goes
@@ -109,7 +109,7 @@ def upload_limit(limit: float):
 
 
 def usable(value):
-    """Where a radiance, an intensity or a density is a number from 0 to ``LARGEST_VALUE``; NumPy or Dr.Jit."""
+    """Mask of where a radiance, an intensity or a density is a number from 0 to ``LARGEST_VALUE``; NumPy or Dr.Jit."""
     return (value >= 0) & (value <= LARGEST_VALUE)
 
 
@@ -131,6 +131,6 @@ def chunks(sizes: np.ndarray, most: int):
 
 
 def even_chunks(rows: int, width: int = 1, most: int | None = None):
-    """The same for ``rows`` rows of ``width`` entries each; by default at most ENTRIES of them together."""
+    """Chunks, as of :func:`chunks`, of ``rows`` rows of ``width`` entries each; by default at most ENTRIES together."""
     step = max((most or ENTRIES) // width, 1)
     return ((first, min(first + step, rows)) for first in range(0, rows, step))

@@ -1,4 +1,4 @@
-"""What has to be right underneath Mitsuba, checked before it goes wrong in ways that nobody can read.
+"""Libraries underneath Mitsuba that have to be right, checked before they go wrong in ways that nobody can read.
 
 Two libraries come from the system and not with the Python wheels. Without libatomic, ``import drjit`` (and so
 ``import mitsuba``) dies with a NameError that names neither. And libLLVM, which compiles every kernel of the ``llvm_*``

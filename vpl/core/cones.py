@@ -1,4 +1,4 @@
-"""What cones around directions have in common: an axis, and a cosine of the half-angle that is rounded down."""
+"""Cones around directions, whatever is in them: their axes, and by how much their cosines are rounded down."""
 
 from __future__ import annotations
 

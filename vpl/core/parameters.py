@@ -34,12 +34,12 @@ class Parameters(Mapping):
         return value if cpptype is None else mi.get_property(value, cpptype, node)
 
     def add(self, name: str, value, cpptype, node) -> None:
-        """What Mitsuba says of a parameter."""
+        """Take what Mitsuba says of a parameter."""
         self._found[name] = value, cpptype, node
 
 
 def parameters_of(node, below: bool = True) -> Parameters:
-    """Those of an object and, if wanted, of all objects below it, with the objects' own names before theirs."""
+    """Parameters of an object and, if wanted, of all objects below it, with the objects' own names before theirs."""
     found = Parameters()
     _reader()(node, "", found, {node} if below else None)
     return found

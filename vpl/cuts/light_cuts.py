@@ -68,7 +68,8 @@ def _count_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: 
 
 @dr.syntax
 def _collect_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: float, offset, length, total: int):
-    """The same walk, writing (row of the batch, node) of every node taken: ``length`` of them from ``offset`` on.
+    """Walk as :func:`_count_nodes` does, writing (row of the batch, node) of every node taken: ``length`` of them from
+    ``offset`` on.
 
     Returns (rows, nodes), how many were written per point, and how many were visited.  Should rounding make this walk
     take other nodes than the one that counted, nothing is written outside of a point's part.
@@ -137,7 +138,7 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
     spent, fitting = dr.zeros(mi.UInt32, len(rows)), [dr.zeros(mi.UInt32, len(rows)) for _ in sizes.count]
 
     def too_large(values):
-        """Which cuts are too large at these thresholds; keeps the sizes of those that are not."""
+        """Mask of the cuts that are too large at these thresholds; keeps the sizes of those that are not."""
         nonlocal spent, fitting
         found = cut_sizes(lights, part, upload_thresholds(values), max_cut)
         over = found.total() > max_cut

@@ -37,14 +37,14 @@ _ENTRIES = 12_000_000
 _SUM_WORTH = 4
 # Sites of the pilot, which finds the mean radiance of the image
 _PILOT_SITES = 1024
-# Clusters that would send less than this share of the light at a group of points, if nothing was between, may be coarse
+# Clusters whose unoccluded contribution is less than this share of the light at a group of points may be coarse
 FAINT_SHARE = 0.005
 FIELDS = ("noise", "passes", "shadow_rays", "visible")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DirectOptions:
-    """What users choose, under the names of the properties of ``adaptivedirect`` and ``unoccludeddirect``.
+    """Options that users choose, under the names of the properties of ``adaptivedirect`` and ``unoccludeddirect``.
 
     ``lights``: "clusters", "all" or "auto"; or "unoccluded", the reference method.
     """
@@ -136,7 +136,7 @@ class _BatchLight:
         if options.lights == "auto" and self._beyond is None:
             a_pass = np.maximum(SiteEstimates.samples_per_cluster * self._cuts.size, SiteEstimates.least_samples)
             self._summed = (extended == 0) & (self._held <= _SUM_WORTH * a_pass)
-        # Emitter samples alone are enough for small sources and matt surfaces, unless light comes by way of a mirror
+        # Emitter samples alone are enough for small sources and diffuse surfaces, unless light comes by way of a mirror
         self._bsdf = np.ones(count) * options.bsdf_share
         if isinstance(self.batch.surfaces, LambertianSurface) and self._beyond is None:
             self._bsdf *= has_wide_source(self.nodes, self._bounds, self._cuts)

@@ -1,4 +1,4 @@
-"""Which clusters of sources light a group of gather points: cuts through the cluster forest [IAS section 4.3].
+"""Clusters of sources that light a group of gather points: cuts through the cluster forest [IAS section 4.3].
 
 A cluster is fine enough where its bounding sphere fills less than a given solid angle from every point of the group;
 single sources always are.  Clusters that cannot light any point of the group are left out: those behind its surfaces,
@@ -68,7 +68,7 @@ class GroupCuts:
         return GroupCuts(self.node[ranges(self.first[groups], size)], np.concatenate([[0], np.cumsum(size)]))
 
     def without_empty(self) -> GroupCuts:
-        """The same with the first node for groups that have none."""
+        """These cuts, with the first node for groups that have none."""
         empty = np.flatnonzero(self.size == 0)
         size = np.maximum(self.size, 1)
         node = np.insert(self.node, self.first[empty], np.zeros(len(empty), np.uint32))
@@ -78,8 +78,8 @@ class GroupCuts:
 def cut_clusters(nodes: Nodes, groups: PointGroups, solid_angle: float, faint_share: float = 0.0) -> GroupCuts:
     """The coarsest clusters that are fine enough, per group; a ``solid_angle`` of 0 gives single sources.
 
-    Clusters that fill at most ``solid_angle`` steradians are, and so are those up to 0.3 steradians that would send
-    less than ``faint_share`` of the group's light if nothing was between: their statistics hardly matter.
+    Clusters that fill at most ``solid_angle`` steradians are, and so are those up to 0.3 steradians whose unoccluded
+    contribution is less than ``faint_share`` of the group's light: their statistics hardly matter.
     """
     roots, pairs = _roots(nodes), [np.zeros((2, 0), np.int64)]
     # How far cuts go down is not known: few groups at a time where there are many nodes
@@ -116,7 +116,7 @@ def _descend(nodes: Nodes, groups: PointGroups, group, node, solid_angle: float)
 
 
 def _unoccluded_light(nodes: Nodes, node, groups: PointGroups, group) -> np.ndarray:
-    """Irradiance, if nothing was between, at the middle of a group that faces a cluster, roughly."""
+    """Unoccluded irradiance at the middle of a group that faces a cluster, roughly."""
     extent = np.linalg.norm(groups.high - groups.low, axis=1)[group] / 2
     offset = nodes.centroid[node] - ((groups.low + groups.high) / 2)[group]
     nearest = np.maximum(nodes.radius[node], extent)

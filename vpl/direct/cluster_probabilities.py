@@ -1,7 +1,7 @@
-"""With which probability a site samples its clusters [IAS section 4.1].
+"""Probabilities with which a site samples its clusters [IAS section 4.1].
 
-First by what each cluster would send if nothing was between; then more and more by what the samples of the site and of
-its whole group found.
+First by the unoccluded contribution of each cluster; then more and more by what the samples of the site and of its
+whole group found.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _EVEN_SHARE = 0.1
 
 @dataclass
 class Mixture:
-    """How the functions of a pass are blended [IAS eq. 6]: shares of the uniform, the block's and the pixel's; weight
-    of the belief that all is visible, in samples."""
+    """Blend of the functions of a pass [IAS eq. 6]: shares of the uniform, the block's and the pixel's; weight of the
+    belief that all is visible, in samples."""
 
     uniform: object
     block: object
@@ -32,7 +32,7 @@ class Mixture:
 
 
 def cluster_importance(surface, normal, two_sided, node):
-    """Radiance (mean over channels) that a cluster would send to a surface if nothing was between, roughly.
+    """Unoccluded contribution (mean over channels) of a cluster to the radiance of a surface, roughly.
 
     From the point of its bounding sphere that stands highest above the surface, so that what is partly below the
     horizon counts; facing as much as any of its sources could.

@@ -15,7 +15,7 @@ from .site_table import SEEN, Lanes, Scenery, SiteTable
 
 @dataclass
 class Drawn:
-    """What a pass found, per lane: ``radiance``; ``variance`` of its mean over channels; ``rays``; ``seen``: samples
+    """Findings of a pass, per lane: ``radiance``; ``variance`` of its mean over channels; ``rays``; ``seen``: samples
     that found light."""
 
     radiance: object

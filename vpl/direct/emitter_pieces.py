@@ -125,7 +125,7 @@ class EmitterPieces:
         return found, dr.select(active, finite_or_zero(radiance / found.pdf), 0)
 
     def found(self, preliminary, ray, active):
-        """What a ray met: (piece, whether it is one, radiance towards the ray's origin, density of :meth:`sample`)."""
+        """Hit of a ray: (piece, whether it is one, radiance towards the ray's origin, density of :meth:`sample`)."""
         row = self._area.row(preliminary, active & preliminary.is_valid())
         active = active & (row > 0)
         row -= 1

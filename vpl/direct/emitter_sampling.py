@@ -1,8 +1,8 @@
-"""Direct light of emitters with an extent (areas, environments) and of those that only their own code can evaluate.
+"""Direct light of emitters with an extent (area, environment) and of those that only their own code can evaluate.
 
 One emitter sample and one BSDF sample, combined by the power heuristic as in Mitsuba's ``path``; a BSDF sample goes on
-through delta surfaces, so that lamps behind glass light the scene as they do there.  Emitters are chosen by power, with
-a uniform share.  Point lights, spots and directional emitters are not sampled here: they are virtual lights.
+through delta surfaces, so that emitters behind glass light the scene as they do there.  Emitters are chosen by power,
+with a uniform share.  Point, spot and directional emitters are not sampled here: they are virtual lights.
 """
 
 from __future__ import annotations

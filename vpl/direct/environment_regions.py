@@ -18,7 +18,7 @@ from ..core.sampling import find_interval, independent_sampler
 from .environment_strata import cones, stratify
 
 _EVALUATIONS = 2  # along each of both axes of a cell, at least
-# The same in cells of skies that are no image next to others that are this many times as bright: the sun has an edge
+# The same in cells of environments without an image, next to others so many times as bright: the sun has an edge
 _EDGE_EVALUATIONS, _EDGE_CONTRAST = 16, 2.0
 _STRATA_WIDTH = 256  # columns of the grid that regions are made of
 _DEFAULT_WIDTH, _LARGEST_WIDTH = 1024, 2048

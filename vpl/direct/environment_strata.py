@@ -10,7 +10,8 @@ brighter levels have already placed inside it.  The missing ones are placed fart
 where the distance to all centres of the component is greatest.
 
 A component's layer is what is left of it without the layers of brighter components.  At the end, every cell joins the
-nearest of the centres that lie in its layer, so that a lamp which is due a sample shares no region with the sky around.
+nearest of the centres that lie in its layer, so that a bright spot which is due a sample shares no region with what is
+around it.
 
 Directions are (sin θ cos φ, sin θ sin φ, cos θ): z is up, θ = 0 is the upper edge of the first row, and φ grows from +x
 towards +y along the columns.
@@ -19,8 +20,8 @@ Departures from the paper, and why:
 
 - The component of t_0 is every cell that is not black, connected or not, instead of the whole sphere: samples of black
   areas are wasted.  Black cells join the nearest of all centres.
-- Shares are rounded to the nearest number, so that a lamp worth half a sample gets one; where that makes too many, the
-  components that miss most come first.  t_0 gets all samples that are left.
+- Shares are rounded to the nearest number, so that a bright spot worth half a sample gets one; where that makes too
+  many, the components that miss most come first.  t_0 gets all samples that are left.
 - A layer in which no centre lies is dissolved into the darker layer around it, as it was not worth a sample.
 - The first centre of a component that has none is its brightest cell (the first of several in the order of the rows).
 - Levels and shares are found from radiances relative to the greatest one in single precision: the rounding that a scale

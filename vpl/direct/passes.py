@@ -76,7 +76,7 @@ class SiteEstimates:
         np.add.at(self.rays, site, download(drawn.rays))
 
     def _weights(self, samples: np.ndarray, variance: np.ndarray, weight: float) -> np.ndarray:
-        """What the estimates of a pass count, per half and site that was sampled.
+        """Weights of the estimates of a pass, per half and site that was sampled.
 
         Weights that do not depend on what was found leave the combination unbiased; in the paper they are the inverse
         of the variance that each pass estimates (eq. 7, 8).
@@ -171,11 +171,11 @@ class SitePasses:
             wanted = estimates.wanted(number, *estimates.halves())
 
     def _evaluate_importance(self, two_sided) -> None:
-        """What clusters would send if nothing was between."""
+        """Take the unoccluded contributions of clusters for their importance."""
         update_importance(self.scenery, two_sided, dr.arange(mi.UInt32, self.scenery.table.count))
 
     def _places(self, active: np.ndarray) -> np.ndarray:
-        """Where the nodes of the cuts of some sites' groups are."""
+        """Places of the nodes of the cuts of some sites' groups."""
         first, at = np.unique(self._cut[active], return_index=True)
         return ranges(first, self.estimates.size[active[at]])
 

@@ -63,7 +63,7 @@ class SiteTable:
 
 @dataclass
 class Statistics:
-    """What was seen of every entry, by each half (the second after all entries of the first): ``counts``: samples and
+    """Observations of every entry, by each half (the second after all entries of the first): ``counts``: samples and
     those that saw the source; ``gain``: sum of their contributions over the entry's importance."""
 
     counts: object
@@ -76,7 +76,7 @@ class Statistics:
 
 @dataclass
 class Scenery:
-    """What all lanes of a pass have in common.
+    """Context that all lanes of a pass have in common.
 
     ``importance``, ``probability``: Float per entry; ``statistics``: of all entries; a ``probability`` of None means
     that every cluster is sampled for certain.  ``max_depth``: UInt32, or None where no path goes beyond a gather point
@@ -96,7 +96,7 @@ class Scenery:
 
 @dataclass
 class Lanes:
-    """What a pass samples: for each lane a site, its half (0, 1), and how many emitter and BSDF samples to take."""
+    """Lanes of a pass: for each a site, its half (0, 1), and how many emitter and BSDF samples to take."""
 
     site: object
     half: object

@@ -1,9 +1,9 @@
-"""Everything that lights a scene directly, behind one interface: sources as rows, grouped into clusters.
+"""Sources, which are everything that lights a scene directly, behind one interface: rows, grouped into clusters.
 
-A *source* is a point light, a spot, a piece of an area emitter, a directional emitter, a region of the environment, or
-an emitter that only its own routines can sample.  Those at finite places form the cluster forest [IAS section 4.3.1];
-all others are clusters of their own.  *Nodes* number the clusters: those of the forest in preorder, then the others.
-A source's *rank* is its place along the leaves of all nodes, so that every node holds a range of ranks.
+A *source* is a point or spot emitter, a piece of an area emitter, a directional emitter, a region of the environment,
+or an emitter that only its own routines can sample.  Those at finite places form the cluster forest [IAS section
+4.3.1]; all others are clusters of their own.  *Nodes* number the clusters: those of the forest in preorder, then the
+others.  A source's *rank* is its place along the leaves of all nodes, so that every node holds a range of ranks.
 """
 
 from __future__ import annotations
@@ -127,11 +127,11 @@ class Sources:
         return joined, np.concatenate([order, more]), intensity
 
     def _finite_sources(self):
-        """(centre, radius, axis, cosine of the cone, intensity) of points, spots and pieces that emit; their rows."""
+        """(centre, radius, axis, cosine of the cone, intensity) of sources at finite places that emit; their rows."""
 
         def of(lights: VirtualLights):
             level = lights.intensity.mean(1, dtype=np.float64)
-            # A spot that shines backwards too is as good as a point for clustering
+            # A spot emitter that shines backwards too is as good as a point emitter for clustering
             cosine = np.where(lights.cone[:, 0] <= np.pi / 2, 1.0, -1.0)
             return lights.position.astype(np.float64), np.zeros(lights.count), lights.direction, cosine, level
 
@@ -146,7 +146,7 @@ class Sources:
         return [column[keep] for column in columns], keep
 
     def _single_nodes(self, scene, rank: int) -> tuple[Nodes, np.ndarray]:
-        """Nodes of one source each, from ``rank`` on, and their sources' rows: suns, regions, other emitters."""
+        """Nodes of one source each, from ``rank`` on, and their sources' rows: directional ones, regions, others."""
         suns, regions, sphere = self.emitters.directional, self._regions, bounding_sphere(scene)
         rows = [(-d, 1.0, i) for d, i in zip(suns.direction, suns.intensity.mean(1, dtype=np.float64), strict=True)]
         if regions is not None:
@@ -242,7 +242,7 @@ class Sources:
         return (row >= int(begin)) & (row < int(begin) + count)
 
     def find(self, hit, ray, active):
-        """What a ray from a gather point met, for multiple importance sampling.
+        """Source that a ray from a gather point met, for multiple importance sampling.
 
         ``hit``: preliminary intersection. Returns (radiance towards the ray's origin, rank of the source or ``count``
         where there is none, density with which :meth:`sample` would have drawn the direction given the source).

@@ -1,6 +1,6 @@
 """Rays that leave the emitters: the first edge of every light path.
 
-Emitters are taken group by group (points and spots, areas, directional, and each of the others by itself); every group
+Emitters are taken group by group (point and spot, area, directional, and each of the others by itself); every group
 gets paths in proportion to its power, and inside a group an emitter is chosen by power with stratified numbers.
 """
 
@@ -65,7 +65,7 @@ def bounding_sphere(scene):
 
 
 class OmniEmission:
-    """Rays from point lights and spots."""
+    """Rays from point and spot emitters."""
 
     def __init__(self, points: VirtualLights, spots: VirtualLights):
         lights = VirtualLights.concatenate([points, spots])

@@ -1,8 +1,8 @@
-"""Reading the scene's emitters into flat arrays, once, without ever dispatching a kernel over emitter objects.
+"""Emitters of a scene read into flat arrays, once, without ever dispatching a kernel over emitter objects.
 
 A virtual call on emitter pointers makes Dr.Jit trace every emitter instance of the process: a minute of compilation
-for some thousands of lights.  Here points, spots, directional and area emitters become rows of arrays; the few that
-cannot (environment maps, projectors, textured spots) are called directly, one by one.
+for some thousands of lights.  Here point, spot, directional and area emitters become rows of arrays; the few that
+cannot (environment maps, projectors, textured spot emitters) are called directly, one by one.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Emitters:
     dropped: int
 
     def extended_only(self) -> Emitters:
-        """These emitters without points, spots and directional ones."""
+        """These emitters without point, spot and directional ones."""
         none = {name: getattr(self, name).select(slice(0)) for name in ("points", "spots", "directional")}
         return replace(self, **none)
 
@@ -150,7 +150,7 @@ def _can_be_sampled(shape) -> bool:
 
 
 def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
-    """Area emitters, the number of rows with values that are not finite, and emitters that only look like areas."""
+    """Area emitters, the number of rows with values that are not finite, and emitters that only look like area ones."""
     indices, radiances, textured, unusual = [], [], [], []
     glowing = [(index, shape) for index, shape in registered_shapes(scene) if shape.is_emitter()]
     # Mitsuba loads shapes in parallel, in an order that changes from run to run; the same seed must give the same image

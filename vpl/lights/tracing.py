@@ -44,7 +44,7 @@ class PathLimits:
 
 @dataclass
 class TracedLights:
-    """What tracing gives: the lights, how many paths were emitted for them, how many bad values were dropped."""
+    """Result of tracing: the lights, how many paths were emitted for them, how many bad values were dropped."""
 
     lights: VirtualLights
     paths: int
@@ -54,7 +54,7 @@ class TracedLights:
 def _bounce(scene, sampler, ray, throughput, power, depth, limits: PathLimits):
     """One edge of all paths, in one kernel that is the same at every depth.
 
-    ``throughput`` starts at 1 and ``power`` stays what the emitter gave, so that roulette sees relative values only.
+    ``throughput`` starts at 1 and ``power`` stays what the emitter gave: Russian roulette sees relative values only.
     Returns (stored mask, position, normal, flux / pi), (alive mask, origin, direction, throughput), all evaluated.
     """
     si = scene.ray_intersect(ray)
@@ -127,11 +127,11 @@ def _trace_group(scene, group, number: int, paths: int, seed: int, limits: PathL
 
 
 def _shares(scene, groups, count: int, seed: int, limits: PathLimits) -> list[int]:
-    """How many paths each group gets, from a pilot whose lights are thrown away.
+    """Numbers of paths that each group gets, from a pilot whose lights are thrown away.
 
-    Lights are wanted where flux arrives: a sky that shines on a closed building has nearly all the power and leaves
-    hardly a light.  So each group should leave lights in proportion to the flux that its pilot stored; a small part is
-    kept for groups whose pilot was unlucky.
+    Lights are wanted where flux arrives: an environment emitter around a closed building has nearly all the power
+    and leaves hardly a light.  So each group should leave lights in proportion to the flux that its pilot stored; a
+    small part is kept for groups whose pilot was unlucky.
     """
     flux, lights_per_path = np.zeros(len(groups)), np.zeros(len(groups))
     for number, group in enumerate(groups):

@@ -46,7 +46,7 @@ class ColumnForest:
 
     @cached_property
     def inner(self) -> np.ndarray:
-        """Which nodes have children, (m,) bool."""
+        """Mask of the nodes that have children, (m,) bool."""
         return self.escape > np.arange(self.size) + 1
 
     @cached_property
@@ -87,7 +87,7 @@ class ColumnForest:
 
 
 def split_threshold(cost: np.ndarray, splits: int) -> np.ndarray:
-    """What a node must cost more than to be split, so that in each row at most ``splits`` are, (s,).
+    """Cost above which nodes are split, so that in each row at most ``splits`` are, (s,).
 
     ``cost`` (s, m): of nodes that can be split, in no order.  Nodes that cost nothing are never split.
     """

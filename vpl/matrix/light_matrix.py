@@ -163,12 +163,12 @@ class NearRows:
         return cls(np.concatenate(rows), relevance)
 
     def part(self, first: int, last: int) -> NearRows:
-        """Those of some consecutive groups."""
+        """Rows near some consecutive groups."""
         return NearRows(self.rows[first:last], self.relevance[first:last])
 
 
 class ColumnWeights:
-    """What every column counts, and what every cluster of them costs, for some groups of gather points.
+    """Weights of every column, and costs of every cluster of them, for some groups of gather points.
 
     ``cumulative``: float64, the running sums of the weights of the columns, group by group, each of which adds 1, or 0
     if nothing can arrive: lights are drawn with probabilities proportional to weights.  ``cost``: Float, of every node,

@@ -55,7 +55,7 @@ class Recovered:
 
     @property
     def failed(self) -> int:
-        """How many slices could not be separated, so that what was in question there is traced."""
+        """Number of slices that could not be separated, so that what was in question there is traced."""
         return int(self.separation.failed.sum()) if self.separation else 0
 
 
@@ -85,7 +85,7 @@ def recover(
 
 
 def _mixed_columns(predictors: Predictors, first: int, count: int) -> np.ndarray:
-    """Which of ``count`` columns have samples that differ: the others have nothing that could be told apart."""
+    """Columns, of ``count``, that have samples that differ: the others have nothing that could be told apart."""
     sums = (download(values)[first : first + count] for values in (predictors.in_light, predictors.in_shadow))
     return np.flatnonzero(np.minimum(*sums) > _LEAST_ERROR)
 
@@ -159,7 +159,7 @@ def _predicted(block: MatrixBlock, predictors: Predictors, best: np.ndarray, fir
 
 
 def whole_entries(unoccluded, present):
-    """What an entry of the separated matrix is where all arrives: of V, 1; 0 where there is no entry."""
+    """Entries of the separated matrix where all arrives: of V, 1; 0 where there is no entry."""
     return dr.select(present, mi.Float(1), 0)
 
 

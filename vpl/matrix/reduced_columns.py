@@ -141,7 +141,7 @@ def _nearby_largest(values: np.ndarray, segment: np.ndarray) -> np.ndarray:
 
 
 def _to_split(columns: Columns, inner: np.ndarray, gamma: np.ndarray, alpha: float, most: int) -> np.ndarray:
-    """Which columns are too large [MSR equation 8], and can be split without having more than ``most`` in a slice.
+    """Columns that are too large [MSR equation 8], and can be split without having more than ``most`` in a slice.
 
     ``inner``: which of them are of several lights.
     """

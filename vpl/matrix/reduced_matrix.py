@@ -1,7 +1,7 @@
 """Reduced light matrices, whose rows are pixels of a slice and whose columns are clusters of lights [MSR 3].
 
-An entry is E V: what the representative of a cluster would send to a row if nothing was between, times how much of it
-arrives.  E is evaluated at one point of the row, V traced at a random one [MSR 7.2].
+An entry is E V: the unoccluded contribution of a cluster's representative to a row, times how much of it arrives.
+E is evaluated at one point of the row, V traced at a random one [MSR 7.2].
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class MatrixRows:
         return dr.gather(mi.UInt32, self._slice, row)
 
     def place(self, row):
-        """Where rows are in the plane of their slice, from 0 to 1: two arrays."""
+        """Places of rows in the plane of their slice, from 0 to 1: two arrays."""
         return tuple(dr.gather(mi.Float, column, row) for column in self.places)
 
     def shown_surface(self, row, active=True):

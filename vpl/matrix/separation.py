@@ -151,7 +151,7 @@ class _State:
         return self._free & (self._weight > 0)
 
     def target(self) -> np.ndarray:
-        """What XY is fitted to: D − Z less the multipliers, (s, n, m)."""
+        """Matrices that XY is fitted to: D − Z less the multipliers, (s, n, m)."""
         return download(self._target).reshape(self._shape)
 
     def step(self, product, active: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Which lights light a slice: columns of the light matrix, clustered for all slices together, then for each [LS].
+"""Lights that light a slice: columns of the light matrix, clustered for all slices together, then for each [LS].
 
 First some rows of the matrix are sampled at clusters of lights that are as small as can be afforded, and of those only
 the clusters that matter for the image are kept apart: the columns that all slices share.  Then each slice gets a row of
@@ -100,7 +100,7 @@ def shared_columns(
 
 
 def slice_places(clusters: PointClusters) -> np.ndarray:
-    """Where slices are, and where they face, as :func:`vpl.points.slices.six_dimensional` has it: (slices, 6)."""
+    """Places of slices, and where they face, as :func:`vpl.points.slices.six_dimensional` has it: (slices, 6)."""
     receiver = clusters.gather(upload(mi.UInt32, clusters.tree.leaves)).receiver
     return six_dimensional(download(receiver.position), download(receiver.normal))
 

@@ -1,4 +1,4 @@
-"""What is known of the visibility of some columns: rows that were traced, as lists and as bits.
+"""Samples of the visibility of some columns: rows that were traced, as lists and as bits.
 
 Only rows where light would arrive are traced.  They follow each other by steps of the golden ratio along the curve
 through all rows of the slice, which never leave a large gap, from a start that depends on the slice and the light.
@@ -33,11 +33,11 @@ class FirstSamples:
     following: np.ndarray
 
     def select(self, index) -> FirstSamples:
-        """Those of some columns."""
+        """Samples of some of the columns."""
         return FirstSamples(self.rows[index], self.values[index], self.following[index])
 
     def joined(self, other: FirstSamples) -> FirstSamples:
-        """Those of these columns, then those of others."""
+        """Samples of these columns, then those of others."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return FirstSamples(*(np.concatenate(pair) for pair in pairs))
 

@@ -26,7 +26,7 @@ _CURVE_BITS = 10
 
 @dataclass(frozen=True)
 class SceneTraits:
-    """What the surfaces of a scene can do, found once, so that what no surface needs is left out of the kernels.
+    """Abilities of the surfaces of a scene, found once, so that what no surface needs is left out of the kernels.
 
     ``perturbed``: registry indices of shapes whose material shades with a normal of its own (bump and normal maps);
     ``open_shapes``: registry indices of shapes that light may pass unscattered, None for all;
@@ -79,7 +79,10 @@ class GatherPoints:
 
 @dataclass
 class CameraPaths:
-    """``emission``, ``valid``: per camera ray, radiance of emitters seen directly and whether it met anything."""
+    """Result of following camera rays.
+
+    ``emission``, ``valid``: per camera ray, radiance of emitters seen directly and whether it met anything.
+    """
 
     emission: object
     valid: object
@@ -260,7 +263,7 @@ def _collect(mask, si, weight, depth, along_curve: bool) -> GatherPoints:
 
 @dataclass
 class PixelGrid:
-    """How camera rays lie in the image: ``samples`` of a pixel follow each other, ``width`` pixels make a row.
+    """Layout of camera rays in the image: ``samples`` of a pixel follow each other, ``width`` pixels make a row.
 
     ``known``: whether that is so, or every ray counts as a pixel because nothing better is known.
     """

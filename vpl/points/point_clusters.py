@@ -147,7 +147,7 @@ class NodeBounds:
         self._points = upload(mi.UInt32, tree.count)
 
     def reduce(self, values, join: Callable):
-        """``join``: combines two arrays lane by lane, such as ``dr.maximum``."""
+        """Values of nodes from their points'.  ``join``: combines two arrays lane by lane, such as ``dr.maximum``."""
         at_leaves = _over_points(values, self._first, self._count, join)
         return self._towards_root(at_leaves, lambda first, second, node, child: join(first, second))
 

@@ -125,7 +125,7 @@ def point_codes(position: np.ndarray, normal: np.ndarray, material: np.ndarray |
 
 
 def _split(codes: np.ndarray, first: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Where the second half of each range of sorted codes begins."""
+    """Places at which the second half of each range of sorted codes begins."""
     low, high = codes[first], codes[first + count - 1]
     differing = low ^ high
     # Every bit below the highest one that differs, by filling downwards

@@ -56,13 +56,13 @@ def build_row_slices(pixel: np.ndarray, most: int, position: np.ndarray, normal:
 
 
 def rows_of(pixel: np.ndarray, leaf: np.ndarray) -> np.ndarray:
-    """Where each row begins, and the number of points, (rows + 1,): from pixels and leaves of points along a tree."""
+    """Places where rows begin, and the number of points, (rows + 1,): from pixels and leaves of points along a tree."""
     begins = (pixel[1:] != pixel[:-1]) | (leaf[1:] != leaf[:-1])
     return np.concatenate([[0], np.flatnonzero(begins) + 1, [len(pixel)]])
 
 
 def _rows(pixel: np.ndarray, enough: int) -> int:
-    """How many different pixels there are; at most the number of points, where that is enough to know."""
+    """Number of different pixels; at most the number of points, where that is enough to know."""
     return len(pixel) if len(pixel) <= enough else len(np.unique(pixel))
 
 

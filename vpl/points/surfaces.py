@@ -26,7 +26,7 @@ class Surface:
 
 @dataclass
 class LambertianSurface(Surface):
-    """``normal``: shading normal on the viewer's side; ``albedo``: reflectance / pi."""
+    """Diffuse surfaces.  ``normal``: shading normal on the viewer's side; ``albedo``: reflectance / pi."""
 
     normal: object
     albedo: object

@@ -1,4 +1,4 @@
-"""Turning choices into radiance: here and only here pairs of a gather point and a light are shaded and traced."""
+"""Evaluation of what was chosen: here and only here pairs of a gather point and a light are shaded and traced."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def evaluate_representatives(transport: Transport, group: LightGroup, batch: Bat
 
 
 def evaluate_one_of(transport: Transport, group: LightGroup, surface, candidates: list, number):
-    """Shade several lights that stand for the same cluster, and trace the ray of one, drawn by what they would send.
+    """Shade several lights that stand for the same cluster, and trace the ray of one, drawn by unoccluded contribution.
 
     ``candidates``: (light, factor on its intensity) pairs, any of which alone would do; ``number``: UInt32 that differs
     wherever a draw is to.  Their mean, in expectation, with the visibility of one: resampled importance sampling
@@ -88,7 +88,7 @@ def evaluate_one_of(transport: Transport, group: LightGroup, surface, candidates
 
 
 def probe_visibility(transport: Transport, group: LightGroup, surface: Surface, light, active=True):
-    """The fraction of light that arrives, (surface, light) pair by pair, where any would if nothing was between.
+    """Fraction of light that arrives, (surface, light) pair by pair, where the unoccluded contribution is not 0.
 
     Returns (fraction, mask of the lanes for which it was asked).
     """
@@ -98,7 +98,7 @@ def probe_visibility(transport: Transport, group: LightGroup, surface: Surface, 
 
 
 def unoccluded(lights: LightSet, group: LightGroup, surface: Surface, light):
-    """What lights would send to surfaces if nothing was between, pair by pair."""
+    """Unoccluded contribution of lights to surfaces, pair by pair."""
     allowed = lights.allowed(surface.depth, light.depth)
     return contribution(group.kind, surface, light, lights.smallest_distance, allowed)
 
