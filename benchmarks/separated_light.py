@@ -7,7 +7,7 @@ import mitsuba as mi
 
 
 def light_of_entries(unoccluded, present):
-    """What an entry of the separated matrix is where all arrives: E in units of its mean, 0 where there is no entry.
+    """Entries of the separated matrix where all arrives: E in units of its mean, 0 where there is none.
 
     Stands in for :func:`vpl.matrix.recovery.whole_entries`; ``unoccluded``: E, Float.
     """

@@ -15,7 +15,7 @@ from .rendering import Progressive, total_statistics
 
 @dataclass
 class Took:
-    """What an image took.
+    """Cost of an image.
 
     `spp`: samples per pixel; `passes`: how many, each with a seed of its own; `seconds`: wall-clock time of the call,
     with compilation and denoising; `error`: the relative standard error that 95% of the pixels do not exceed, as
