@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # What a user would run, with the kernel that aborts LLVM 15 and 16 behind the check.
 RENDER = """
-from vpl.backend import check_backend
+from vpl.core.backend import check_backend
 check_backend("llvm_ad_rgb")
 import drjit as dr
 from drjit.llvm import Float
@@ -83,7 +83,7 @@ def test_versions_accepted_without_the_libraries(version, monkeypatch):
 
 @pytest.mark.parametrize("variant", ["cuda_ad_rgb", "scalar_rgb"])
 def test_other_variants_need_no_llvm(variant):
-    code = f"from vpl.backend import check_backend; check_backend({variant!r})"
+    code = f"from vpl.core.backend import check_backend; check_backend({variant!r})"
     assert python(code, llvm="/nowhere/libLLVM.so").returncode == 0
 
 
