@@ -45,3 +45,9 @@ class Stage(StrEnum):
     SHADING = "shading"  # unoccluded light of all entries
     SEPARATION = "separation"
     CORRECTION = "correction"
+
+    # ---- The split of `manylights`
+    LIGHTS = "lights"  # surface lights find their irradiance
+    TRACED = "traced"  # what virtual lights do not carry
+    CLUSTERS = "clusters"  # gather vertices of pixels are clustered
+    CUTS = "cuts"  # their light cuts are chosen, shaded and traced

@@ -13,9 +13,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, download, finite_or_zero, spectrum_to_rgb
+from ..core.arrays import channel_mean, download, finite_or_zero, spectrum_to_rgb, upload
 from ..core.cones import COSINE_ROUNDING
-from ..core.sampling import Choice, derived_seed, independent_sampler, stratified
+from ..core.sampling import Choice, derived_seed, find_interval, independent_sampler, running_sums, stratified
 from ..core.stages import Stage
 from .emission import bounding_sphere
 from .emitters import Emitters
@@ -140,6 +140,38 @@ def light_tree(lights: VirtualLights, seed: int) -> DeviceTree:
         tree.records[:, CONE_COS] = np.maximum(np.cos(np.minimum(half_angle, np.pi)) - COSINE_ROUNDING, -1)
     second = _second_representatives(tree, lights.intensity.mean(1), generator)
     return DeviceTree(lights.kind, tree, second)
+
+
+@dataclass
+class ScatteredGroup(LightGroup):
+    """Lights whose clusters have no fixed representative: one is drawn whenever it is asked for.
+
+    ``first``, ``last``: UInt32, of every node the range of its lights in ``order``; ``cumulative``: their summed
+    intensities in that order, in double precision.
+    """
+
+    first: object = None
+    last: object = None
+    order: object = None
+    cumulative: object = None
+
+    @classmethod
+    def of(cls, lights: VirtualLights, seed: int) -> ScatteredGroup:
+        """Lights of one kind, with their tree."""
+        generator = np.random.default_rng(seed)
+        tree = build_light_tree(lights.position, lights.direction, lights.intensity, generator)
+        first, last = (upload(mi.UInt32, column) for column in _leaf_ranges(tree).T)
+        intensity = lights.intensity.mean(1, dtype=np.float64)
+        return cls(
+            lights.kind, DeviceLights(lights), DeviceTree(lights.kind, tree, tree.representative), first, last,
+            upload(mi.UInt32, tree.leaf_order), running_sums(upload(mi.Float, intensity[tree.leaf_order])),
+        )  # fmt: skip
+
+    def draw(self, nodes, sample):
+        """A light of each node by intensity, for a uniform number: (lights, factor on their intensities)."""
+        first, last = dr.gather(mi.UInt32, self.first, nodes), dr.gather(mi.UInt32, self.last, nodes)
+        index = dr.gather(mi.UInt32, self.order, find_interval(self.cumulative, first, last, sample))
+        return self.standing_for(index, self.tree.summed_intensity(nodes))
 
 
 def prepare_lights(scene, emitters: Emitters, options: LightOptions, seed: int) -> LightSet:

@@ -11,13 +11,15 @@ import numpy as np
 from ..core.arrays import upload, usable
 
 # Kinds of virtual light. "point" and "spot" radiate from a point that the scene really has and are never clamped;
-# "oriented" lights stand for a piece of surface. "directional" and "environment" lights lie at infinity; the latter
+# "oriented" lights stand for a piece of surface, and so do "surface" lights, which taper off near them: what they lack
+# is traced. "directional" and "environment" lights lie at infinity; the latter
 # stand for a piece of sky that a camera path could reach, the former for an emitter that it could not.
-KINDS = ("point", "spot", "oriented", "directional", "environment")
+KINDS = ("point", "spot", "oriented", "directional", "environment", "surface")
 
 AT_INFINITY = ("directional", "environment")
 
 _RECORD = 16
+_COLUMNS = ("position", "direction", "intensity", "depth", "cone", "facing")
 
 
 @dataclass
@@ -29,7 +31,8 @@ class VirtualLights:
     ``intensity`` (n, 3) float32: radiant intensity of points and spots, exitant flux / pi of oriented lights (their
     radiance times area), irradiance of lights at infinity;
     ``depth`` (n,) uint32: edges of the light path that ends in the light, 0 for lights that stand for an emitter;
-    ``cone`` (n, 2) float32: cut-off angle and beam angle of spots in radians, (pi, pi) elsewhere.
+    ``cone`` (n, 2) float32: cut-off angle and beam angle of spots in radians, (pi, pi) elsewhere;
+    ``facing`` (n, 3) float32: of surface lights, the shading normal, to whose side they shine (None elsewhere).
     """
 
     kind: str
@@ -38,6 +41,7 @@ class VirtualLights:
     intensity: np.ndarray
     depth: np.ndarray
     cone: np.ndarray
+    facing: np.ndarray | None = None
 
     @property
     def count(self) -> int:
@@ -59,17 +63,14 @@ class VirtualLights:
 
     def select(self, keep) -> VirtualLights:
         """The rows picked by a mask or an index array."""
-        position = None if self.position is None else self.position[keep]
-        return VirtualLights(
-            self.kind, position, self.direction[keep], self.intensity[keep], self.depth[keep], self.cone[keep]
-        )
+        columns = (getattr(self, name) for name in _COLUMNS)
+        return VirtualLights(self.kind, *(None if column is None else column[keep] for column in columns))
 
     @staticmethod
     def concatenate(parts: list[VirtualLights]) -> VirtualLights:
         """Join lights of the same kind."""
-        columns = ("position", "direction", "intensity", "depth", "cone")
         joined = [
-            None if getattr(parts[0], c) is None else np.concatenate([getattr(p, c) for p in parts]) for c in columns
+            None if getattr(parts[0], c) is None else np.concatenate([getattr(p, c) for p in parts]) for c in _COLUMNS
         ]
         return VirtualLights(parts[0].kind, *joined)
 
@@ -92,6 +93,7 @@ class Light:
     intensity: object
     depth: object
     cone: object
+    facing: object = None
 
 
 class DeviceLights:
@@ -105,6 +107,8 @@ class DeviceLights:
         records[:, 4:7] = lights.direction
         records[:, 8:11] = lights.intensity
         records[:, 12:14] = lights.cone
+        if lights.facing is not None:
+            records[:, 12:15] = lights.facing
         self.kind = lights.kind
         self.count = lights.count
         self.scalar_intensity = lights.intensity.mean(1, dtype=np.float64)
@@ -115,12 +119,12 @@ class DeviceLights:
         first = dr.gather(mi.Vector4f, self._records, index * 4, active)
         second = dr.gather(mi.Vector4f, self._records, index * 4 + 1, active)
         third = dr.gather(mi.Vector4f, self._records, index * 4 + 2, active)
-        cone = mi.Vector2f(0)
-        if self.kind == "spot":
+        cone, facing = mi.Vector2f(0), None
+        if self.kind in ("spot", "surface"):
             fourth = dr.gather(mi.Vector4f, self._records, index * 4 + 3, active)
-            cone = mi.Vector2f(fourth.x, fourth.y)
+            cone, facing = mi.Vector2f(fourth.x, fourth.y), fourth.xyz
         depth = dr.reinterpret_array(mi.UInt32, first.w)
-        return Light(first.xyz, second.xyz, mi.Color3f(third.x, third.y, third.z), depth, cone)
+        return Light(first.xyz, second.xyz, mi.Color3f(third.x, third.y, third.z), depth, cone, facing)
 
 
 def spot_falloff(cosine, cone):
@@ -137,8 +141,9 @@ def geometry(kind: str, position, light: Light, smallest_distance):
     """Direction to the light and the factor by which its intensity arrives there.
 
     Returns (unit vector from ``position`` to the light, factor).  The factor is 1/d² for points, times the falloff for
-    spots, cos/d² with d not smaller than ``smallest_distance`` for oriented lights ([IC] section 5: clamping), and 1
-    for lights at infinity.  A light exactly at ``position`` has no direction: its factor is 0.
+    spots, cos/d² with d not smaller than ``smallest_distance`` for oriented lights ([IC] section 5: clamping), cos/d²
+    for surface lights, and 1 for lights at infinity.  A light exactly at ``position`` has no direction: its factor is
+    0.
     """
     if kind in AT_INFINITY:
         return -light.direction, mi.Float(1)
@@ -149,6 +154,9 @@ def geometry(kind: str, position, light: Light, smallest_distance):
     if kind == "oriented":
         cosine = dr.maximum(-dr.dot(light.direction, to_light), 0)
         factor = cosine / dr.maximum(distance2, dr.square(smallest_distance))
+    elif kind == "surface":
+        cosine = dr.maximum(-dr.dot(light.direction, to_light), 0)
+        factor = dr.select(dr.dot(light.facing, to_light) < 0, cosine / distance2, 0)
     else:
         factor = dr.rcp(distance2)
         if kind == "spot":

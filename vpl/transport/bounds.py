@@ -75,6 +75,10 @@ def contribution_bound(kind: str, receiver: Receiver, node: Node, smallest_dista
     if kind not in AT_INFINITY:
         factor = _geometry_bound(kind, node, center, extent, distance2, radius, smallest_distance)
     reflected = channel_mean(_material_bound(proxy, cosine, mirror) * node.intensity)
+    if kind == "surface":
+        # G / (1 + c² G) grows with the geometry term G
+        factor = dr.rcp(1 + dr.rcp(factor * cosine) / dr.square(smallest_distance)) / dr.square(smallest_distance)
+        reflected = channel_mean(proxy.base * node.intensity) & (cosine > 0)
     # A point inside a flat box has an infinite factor and no cosine: that is nothing, not NaN
     return dr.select(reflected > 0, factor * reflected, 0)
 
@@ -98,5 +102,5 @@ def _geometry_bound(kind: str, node: Node, center, extent, distance2, radius, sm
     if kind == "spot":
         # The node's cone already includes the spots' cut-off angle: nothing is emitted outside it
         return dr.select(emission >= 1, dr.rcp(distance2), 0)
-    clamped2 = dr.maximum(distance2, dr.square(smallest_distance))
+    clamped2 = distance2 if kind == "surface" else dr.maximum(distance2, dr.square(smallest_distance))
     return dr.select(emission > 0, emission / clamped2, 0)

@@ -2,7 +2,8 @@
 
 Opaque surfaces block.  Surfaces that let light pass unscattered (masks, thin glass) dim it by their transmission, but
 only for lights that a camera path could also reach by passing through them; towards point lights, spots and directional
-emitters they block, because no path that Mitsuba's ``path`` counts passes there.
+emitters they block, because no path that Mitsuba's ``path`` counts passes there, and towards surface lights because
+what passes there is traced.
 
 Points on emitters that are no virtual lights are sampled in :mod:`vpl.direct`, by ``emitter_sampling`` and
 ``cluster_sampling``, which trace their own shadow rays: as in ``path`` every surface blocks these, and what shines
@@ -21,9 +22,14 @@ from ..lights.virtual_lights import AT_INFINITY, Light, geometry
 def contribution(kind: str, surface, light: Light, smallest_distance, active=True):
     """Radiance that leaves a surface due to an unoccluded light: BSDF × cosine × geometry × intensity.
 
-    ``surface``: see :mod:`vpl.points.surfaces`.  Values that are not finite count as zero.
+    ``surface``: see :mod:`vpl.points.surfaces`, Lambertian for surface lights; ``smallest_distance``: for these, c of
+    :mod:`vpl.split.floors`.  Values that are not finite count as zero.
     """
     to_light, factor = geometry(kind, surface.interaction.p, light, smallest_distance)
+    if kind == "surface":
+        # The share w = 1 / (1 + c² cosθ1 cosθ2 / d²) is theirs
+        cosine = dr.maximum(dr.dot(surface.normal, to_light), 0)
+        factor /= 1 + dr.square(smallest_distance) * cosine * factor
     active = active & (factor > 0)
     reflected = surface.reflected(to_light, active)
     return finite_or_zero(reflected * rgb_to_spectrum(light.intensity) * factor) & active
@@ -42,7 +48,7 @@ def transmittance(scene, traits, kind: str, ray, active):
     Lanes that are not ``active`` give 0.
     """
     passed = mi.Float(1) & active & ~scene.ray_test(ray, active)
-    if not traits.null or kind in ("point", "spot", "directional"):
+    if not traits.null or kind in ("point", "spot", "surface", "directional"):
         return passed
     through = active & (passed == 0)
     if traits.open_scene is not None:
