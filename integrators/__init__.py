@@ -1,5 +1,8 @@
 """Many-light integrators for Mitsuba 3: ``import integrators`` and use them like any other plugin.
 
+``manylights`` renders the image of Mitsuba's ``path``, with less noise in the same time; the others are the methods of
+papers.
+
 The plugins are registered for the current variant, and again whenever ``mi.set_variant`` changes it.  They exist for
 the vectorised ``*_rgb`` and ``*_mono`` variants; elsewhere loading one fails with an error that says so.
 """
@@ -16,6 +19,7 @@ import_drjit()
 import mitsuba as mi  # noqa: E402  (after the check that turns its import error into advice)
 
 PLUGINS = (
+    "manylights",
     "vpl",
     "lightcuts",
     "mdlightcuts",
@@ -25,7 +29,7 @@ PLUGINS = (
     "adaptivedirect",
     "unoccludeddirect",
 )
-_SUPPORTED = (
+VARIANTS = (
     "llvm_ad_rgb",
     "llvm_ad_mono",
     "cuda_ad_rgb",
@@ -40,7 +44,7 @@ _SUPPORTED = (
 def _refuse(name: str, variant: str):
     def plugin(props):
         raise RuntimeError(
-            f'the integrator "{name}" does not support the variant "{variant}": choose one of {", ".join(_SUPPORTED)}'
+            f'the integrator "{name}" does not support the variant "{variant}": choose one of {", ".join(VARIANTS)}'
         )
 
     return plugin
@@ -48,7 +52,7 @@ def _refuse(name: str, variant: str):
 
 def _register(_old: str | None, variant: str) -> None:
     """Register all plugins for ``variant``; classes are made anew because their base class belongs to the variant."""
-    if variant not in _SUPPORTED:
+    if variant not in VARIANTS:
         for name in PLUGINS:
             mi.register_integrator(name, _refuse(name, variant))
         return

@@ -10,6 +10,7 @@ from .conftest import sensor, wall
 
 # Every plugin of ours, with parameters that make a small render quick
 PLUGINS = {
+    "manylights": {},
     "vpl": {"vpl_count": 60},
     "lightcuts": {"vpl_count": 200},
     "mdlightcuts": {"vpl_count": 200},

@@ -15,6 +15,7 @@ BELOW = {
     "direct": ("core", "lights", "points"),
     "cuts": ("core", "lights", "points", "transport"),
     "matrix": ("core", "lights", "points", "transport", "cuts"),
+    "split": ("core", "lights", "points", "transport", "direct", "cuts"),
 }
 
 

@@ -96,7 +96,7 @@ def test_pages_state_the_defaults(name):
     for knob in knobs_of(type(plugin)):
         default = knob.default(plugin) if callable(knob.default) else knob.default
         assert getattr(plugin, knob.name) == knob.parse(default)
-        shown = "no" if default is False else str(default) or "none"
+        shown = {False: "no", True: "yes"}.get(default) if isinstance(default, bool) else str(default) or "none"
         assert f"(Default: {shown}" in said(knob) or f"(Default: ``{shown}``" in said(knob)
 
 
@@ -154,7 +154,7 @@ package.__path__ = [str(folder)]
 from integrators.manual import manual_page
 for name in sys.argv[2:]:
     (plugin,) = [node for node in ast.parse((folder / f"{name}.py").read_text()).body if isinstance(node, ast.ClassDef)
-                 and node.decorator_list]
+                 and "manual_page" in map(ast.unparse, node.decorator_list)]
     plugin.bases, plugin.decorator_list, plugin.body = [], [], plugin.body[:1]
     exec(compile(ast.Module([plugin], []), name, "exec"), found := {})
     print(manual_page(found[plugin.name]).__doc__)

@@ -14,6 +14,7 @@ Packages, each of which imports only from those above it (tests/test_layers.py):
 ``direct``     direct light of emitters: next-event estimation, and adaptive sampling with learned probabilities [IAS]
 ``cuts``       Lightcuts, Multidimensional Lightcuts, IlluminationCut: [LC], [MDLC], [IC]
 ``matrix``     LightSlice and matrix sampling and recovery: [LS], [MSR]
+``split``      the image of ``path`` from virtual lights and what they leave out: the plugin ``manylights``
 =============  =================================================================================================
 
 To read one method, begin with its plugin in ``integrators/`` (the method ``shade``), then with the map that the

@@ -1,0 +1,250 @@
+"""The image of Mitsuba's ``path``, sooner: indirect light from virtual lights, and what they leave out traced."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from vpl.core.arrays import channel_mean, download, upload
+from vpl.core.sampling import derived_seed, independent_sampler
+from vpl.core.stages import Stage
+from vpl.lights.light_set import LightSet, ScatteredGroup
+from vpl.points.camera_paths import SceneTraits, refuse_media
+from vpl.split.balance import Balance, balance, without_lights
+from vpl.split.floors import Perturbed
+from vpl.split.next_event import emitters_of
+from vpl.split.numbers import spread_numbers
+from vpl.split.pilot import Pilot
+from vpl.split.pixel_clusters import PixelClusters, light_clusters
+from vpl.split.remainder import FirstEdge, Found, GatherVertices, Limits, follow
+from vpl.split.surface_lights import surface_lights
+from vpl.transport.evaluation import Transport
+
+from .gathering import Clock, GatheringIntegrator, add_statistics
+from .knobs import Boolean
+from .manual import manual_page
+
+# Camera rays of the pilot, and those that are followed at a time, which bounds memory
+_PILOT, _WAVEFRONT = 1 << 15, 1 << 21
+# c of the split, as a multiple of the distance between lights
+_TAPER = 1.0
+# c of paths that are whole, beyond every distance, world units: nothing is left to virtual lights
+_WHOLE = 1e15
+# Pixels darker than this share of the image's mean are lit as precisely as if they had it
+_DARK_FLOOR = 0.1
+# Nodes of the cut of a cluster, at most
+_MAX_CUT = 1000
+# Surfaces as virtual lights see them: all of them block, for what passes one is traced
+_OPAQUE = SceneTraits(False, False, True, False, False, (), (), None)
+
+
+@dataclass
+class View:
+    """One call of ``sample``: the ``scene`` and how its emitters are sampled (``emission``), its shapes without a
+    floor (``perturbed``); the camera's ``ray`` and which of them are ``active``, evaluated; ``width`` of the image and
+    ``samples`` of a pixel, which lie next to each other; ``seed``."""
+
+    scene: object
+    emission: object
+    perturbed: Perturbed
+    ray: object
+    active: object
+    width: int
+    samples: int
+    seed: int
+
+    @property
+    def count(self) -> int:
+        return dr.width(self.ray.o)
+
+    def follow(self, lane, limits: Limits, *stream: int) -> tuple[Found, GatherVertices]:
+        """Follow the camera rays ``lane`` (UInt32): see :func:`vpl.split.remainder.follow`."""
+        seed, ray = derived_seed(self.seed, *stream), self.ray
+        part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
+        edge = FirstEdge.of_camera(part, dr.gather(mi.Bool, self.active, lane))
+        numbers = spread_numbers(lane, self.samples, derived_seed(seed, 0))
+        sampler = independent_sampler(derived_seed(seed, 1), dr.width(lane))
+        return follow(self.scene, self.emission, edge, numbers, sampler, limits)
+
+
+@manual_page
+class ManyLightsIntegrator(GatheringIntegrator):
+    r"""
+    .. _integrator-manylights:
+
+    Many lights (:monosp:`manylights`)
+    ----------------------------------
+
+    .. pluginparameters::
+
+     {knobs}
+
+    The image of ``path``, with less noise in the same time. It estimates exactly what ``path`` estimates for the same
+    ``max_depth``: the mean over seeds is the same, nothing is clamped and nothing left out.
+
+    **How.** Radiance that the camera's first surface x1 receives by way of a second one, x2, is split in two,
+
+    .. math:: f_1 f_2 = w F_1 F_2 + (f_1 f_2 - w F_1 F_2), \qquad w = 1 / (1 + c^2 \cos\theta_1 \cos\theta_2 / d^2).
+
+    F is the *floor* of a BSDF, its Lambertian part. The first term is left to virtual lights on the surfaces where
+    camera paths arrive, each with the irradiance that one path finds there. They are clustered in a light tree; those
+    gather vertices of a pixel that face the same way share one light cut, as in Multidimensional Lightcuts, with a
+    representative drawn anew for every pair. The second term is traced as by ``path``; most of its paths end at x2,
+    where little is left of them. w keeps lights from being bright spots in corners; c is the distance between lights.
+    See :mod:`vpl.split`.
+
+    **Chooses by itself.** A pilot of some thousand paths tells where lights are wanted, how many, and whether they pay:
+    where little of the noise is that of indirect light, or the image has few samples, there are none, and what is left
+    is ``path`` with well spread samples. What was chosen is in ``statistics``, in the log (level Info) and in files
+    that the command writes. The same seed chooses the same.
+
+    - Values of single pixels may be negative while samples are few: what is traced is a difference.
+    - Surfaces only: a scene with a participating medium is refused.
+    - ``*_rgb`` and ``*_mono`` variants only. Not differentiable.
+    - Materials and emitters: all that ``path`` renders. Light that metals and surfaces with bump or normal maps send
+      on is traced, and so is what passes a mask or thin glass between x1 and x2.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="manylights">
+                <integer name="max_depth" value="8"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            import integrators
+            "integrator": {"type": "manylights", "max_depth": 8}
+    """
+
+    knobs = (
+        Boolean(
+            "virtual_lights", True,
+            "Whether virtual lights may carry indirect light where they pay. Without them all of it is traced.",
+        ),
+    )  # fmt: skip
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        """Radiance along camera rays; see ``mi.SamplingIntegrator.sample`` for this interface."""
+        if medium is not None:
+            raise ValueError("the camera is inside a participating medium; manylights supports surfaces only")
+        refuse_media(scene)
+        with dr.suspend_grad():
+            radiance, valid = self._sample(self._view(scene, sampler, mi.Ray3f(ray), active))
+        return mi.Spectrum(radiance), valid, []
+
+    def _view(self, scene, sampler, ray, active) -> View:
+        seed = int(dr.reinterpret_array(mi.UInt32, dr.detach(sampler.next_1d()))[0])
+        grid, count = self.pixel_grid(scene, sampler), dr.width(ray.d)
+        ray.time += dr.zeros(mi.Float, count)
+        active = mi.Bool(active) & dr.full(mi.Bool, True, count)
+        dr.make_opaque(ray, active)
+        return View(scene, emitters_of(scene), Perturbed(scene), ray, active, grid.width, grid.samples, seed)
+
+    def _sample(self, view: View):
+        """(Radiance of each camera ray, whether it is opaque in the film's alpha)."""
+        clock, self.statistics = Clock(), {}
+        pilot, chosen = self._balance(view)
+        clock.lap(Stage.PILOT)
+        lights = self._lights(view, pilot, chosen, clock)
+        limits = self._limits(view, lights.smallest_distance if lights else _WHOLE, self.max_depth)
+        expected = pilot.indirect_nearby(view.width, -(-view.count // view.samples)) if lights else None
+        radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
+        # Whole pixels at a time
+        most = max(_WAVEFRONT // view.samples, 1) * view.samples
+        for first in range(0, view.count, most):
+            if self.should_stop():
+                break
+            lane = dr.arange(mi.UInt32, min(most, view.count - first)) + dr.opaque(mi.UInt32, first)
+            dr.eval(lane)
+            found, vertices = view.follow(lane, limits, 4, first)
+            clock.lap(Stage.TRACED)
+            if lights:
+                pixels = expected[first // view.samples :][: -(-len(lane) // view.samples)]
+                seed = derived_seed(view.seed, 5, first)
+                found.radiance += self._gather(view, lights, chosen, vertices, found, pixels, seed, clock)
+            dr.scatter(radiance, found.radiance, lane)
+            dr.scatter(valid, found.valid, lane)
+            dr.eval(radiance, valid)
+        if view.scene.environment() is not None and not self.hide_emitters:
+            valid |= view.active
+        finite = dr.all(dr.isfinite(radiance))
+        dropped = int(dr.count(~finite)[0])
+        if dropped:
+            mi.Log(mi.LogLevel.Warn, f"{dropped} sample(s) with values that are not finite were dropped.")
+        self.statistics |= {"balance": chosen.reason, "dropped": dropped, "seconds": clock.seconds}
+        return dr.select(finite & (self.max_depth > 0), radiance, 0), valid & (self.max_depth > 0)
+
+    def _limits(self, view: View, c: float, max_depth: float, rr_depth: int | None = None) -> Limits:
+        longest = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF)))
+        roulette = dr.opaque(mi.UInt32, rr_depth or self.rr_depth)
+        return Limits(longest, roulette, dr.opaque(mi.Float, c**2), view.perturbed, self.hide_emitters)
+
+    def _balance(self, view: View) -> tuple[Pilot | None, Balance]:
+        """The pilot, and what it leads to; no pilot where virtual lights are out of the question."""
+        if not self.virtual_lights:
+            return None, without_lights("virtual_lights is off")
+        if self.max_depth <= 2:
+            return None, without_lights("no light is indirect at this max_depth")
+        if view.perturbed.everywhere:
+            return None, without_lights("bump or normal maps are in shape groups")
+        pairs = max(min(_PILOT, view.count // 4) // 2, 1)
+        apart = max(view.count // pairs // 2 * 2, 2)
+        lane = np.minimum(np.arange(pairs)[:, None] * apart + [0, 1], view.count - 1).reshape(-1)
+        found, vertices = view.follow(upload(mi.UInt32, lane), self._limits(view, _WHOLE, self.max_depth), 1)
+        pilot = Pilot.of(found, vertices, lane // view.samples)
+        chosen = balance(pilot.radiance, pilot.indirect, view.count, view.samples)
+        mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
+        return pilot, chosen
+
+    def _lights(self, view: View, pilot: Pilot | None, chosen: Balance, clock: Clock) -> LightSet | None:
+        """Virtual lights and their tree; None where there are none."""
+        if chosen.light_paths == 0:
+            return None
+        # The path from a light is shorter by the two edges between camera and light
+        limits = self._limits(view, _WHOLE, self.max_depth - 2, rr_depth=1)
+        limits.hide_emitters = False
+        made = surface_lights(
+            view.scene, view.emission, pilot.arrivals, chosen.light_paths, limits, derived_seed(view.seed, 2)
+        )  # fmt: skip
+        clock.lap(Stage.LIGHTS)
+        self.statistics |= {"light_paths": chosen.light_paths, "lights": {"surface": made.lights.count}}
+        if made.lights.count == 0:
+            return None
+        group = ScatteredGroup.of(made.lights, derived_seed(view.seed, 3))
+        clock.lap(Stage.TREE)
+        return LightSet([group], _TAPER * made.spacing, self.max_depth, chosen.light_paths, 0, {})
+
+    def _gather(self, view, lights, chosen, vertices, found, expected, seed, clock):
+        """Light of virtual lights at the vertices of some pixels, per camera ray.
+
+        ``expected``: indirect light that each pixel should have, by which errors are judged together with what its
+        paths found.
+        """
+        samples, count = view.samples, dr.width(found.radiance)
+        step = -(-samples // chosen.vertices)
+        kept = -(-samples // step)
+        lit = dr.zeros(mi.UnpolarizedSpectrum, count)
+        dr.eval(lit)
+        turn = dr.arange(mi.UInt32, count) % dr.opaque(mi.UInt32, samples) % dr.opaque(mi.UInt32, step)
+        rays = dr.compress((turn == 0) & (dr.max(vertices.weight) > 0))
+        if len(rays) == 0:
+            return lit
+        clusters = PixelClusters(vertices.select(rays), rays, samples)
+        clock.lap(Stage.CLUSTERS)
+        traced = np.nan_to_num(download(channel_mean(found.radiance)))
+        level = np.add.reduceat(np.maximum(traced, 0), np.arange(0, count, samples)) / samples + expected
+        level = np.maximum(level, _DARK_FLOOR * level.mean())[clusters.pixel] * kept
+        transport = Transport(view.scene, _OPAQUE, lights)
+        shadow_rays = light_clusters(transport, clusters, level, chosen.error, _MAX_CUT, seed, lit)
+        clock.lap(Stage.CUTS)
+        more = {"shadow_rays": shadow_rays, "gather_points": len(rays), "clusters": clusters.count}
+        add_statistics(self.statistics, more)
+        # Every step-th sample stands for all
+        return lit * dr.opaque(mi.Float, samples / kept)
+
+
+mi.register_integrator("manylights", ManyLightsIntegrator)

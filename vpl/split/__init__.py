@@ -1,0 +1,20 @@
+"""Split of the image of ``path`` into a part that virtual lights carry and one that is traced: plugin ``manylights``.
+
+What a first surface receives by way of a second one is split so that nothing is left out or clamped (``floors``)::
+
+    pilot -> balance -> surface_lights (cells) -> light tree
+    camera rays -> remainder (next_event, numbers) -> gather vertices -> pixel_clusters -> radiance
+
+In the order to read in:
+
+- ``floors``: the split: floors of BSDFs, and the share w of virtual lights
+- ``remainder``: paths as ``path`` follows them, less what virtual lights carry; ``follow``
+- ``next_event``: next-event estimation: how emitters are chosen
+- ``emitter_tree``: a tree over emitters with a place, by which one is drawn for a vertex
+- ``numbers``: random numbers that are spread well over the samples of a pixel
+- ``pilot``: a few paths that tell where light is wanted
+- ``balance``: what the pilot decides: whether lights pay, how many, how finely they are clustered
+- ``cells``: boxes where camera paths arrive, and random lines that meet surfaces in them with a known density
+- ``surface_lights``: a virtual light wherever such a line meets a surface
+- ``pixel_clusters``: one light cut for those gather vertices of a pixel that face the same way
+"""

@@ -1,0 +1,58 @@
+"""Pilot: a few whole paths, which tell where virtual lights are wanted and whether they pay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..core.arrays import channel_mean, download
+from .remainder import Found, GatherVertices
+
+# Tiles of the pilot's image, in pixels
+_TILE = 16
+
+
+@dataclass
+class Arrivals:
+    """Second vertices of paths, (n, 3): ``position`` and the ``normal`` of the side that was met; (n,) float64:
+    ``weight``, what irradiance there contributes to the image, and ``level``, what the path brought from there."""
+
+    position: np.ndarray
+    normal: np.ndarray
+    weight: np.ndarray
+    level: np.ndarray
+
+
+@dataclass
+class Pilot:
+    """Paths of which nothing was left to virtual lights, two next to each other from one pixel.
+
+    ``arrivals``: their second vertices, where they have a floor, as their first ones have; ``pixel``, ``radiance``,
+    ``indirect`` (n,): the pixel of each path, what it found, and the part that came by way of its second vertex.
+    """
+
+    arrivals: Arrivals
+    pixel: np.ndarray
+    radiance: np.ndarray
+    indirect: np.ndarray
+
+    @classmethod
+    def of(cls, found: Found, vertices: GatherVertices, pixel: np.ndarray) -> Pilot:
+        """The pilot of some paths of the pixels ``pixel``."""
+        radiance = np.nan_to_num(download(channel_mean(found.radiance)).astype(np.float64), posinf=0, neginf=0)
+        position, normal, weight, before = (
+            download(x) for x in (vertices.arrival, vertices.arrival_normal, vertices.arrival_weight, vertices.before)
+        )
+        arrived = (weight > 0) & np.isfinite(weight) & np.isfinite(position).all(1)
+        indirect = np.where(arrived, np.maximum(radiance - np.nan_to_num(before), 0), 0)
+        arrivals = Arrivals(position[arrived], normal[arrived], weight[arrived].astype(np.float64), indirect[arrived])
+        return cls(arrivals, pixel, radiance, indirect)
+
+    def indirect_nearby(self, width: int, pixels: int) -> np.ndarray:
+        """Mean indirect light of the tile that each pixel is in, (pixels,), in an image so many pixels wide."""
+        number = np.arange(pixels)
+        tile = number // width // _TILE * (width // _TILE + 1) + number % width // _TILE
+        of_path = tile[self.pixel]
+        count = np.bincount(of_path, minlength=tile.max() + 1)
+        return (np.bincount(of_path, self.indirect, tile.max() + 1) / np.maximum(count, 1))[tile]

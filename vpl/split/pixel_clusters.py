@@ -1,0 +1,154 @@
+"""Light of virtual lights at gather vertices: one light cut for those vertices of a pixel that are alike.
+
+The vertices of a pixel that face the same way form a cluster.  A light cut is chosen for the whole cluster, by bounds
+on its box and cone of normals [MDLC]; for each pair of the cluster and a node of the cut one of its vertices and one of
+the node's lights are drawn, by weight and by intensity, anew for every pair.  So neighbouring pixels do not share what
+stands for a cluster, and errors are noise, which vanishes from one sample to the next and which a denoiser takes for
+what it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import add_at, channel_mean, download, upload
+from ..core.sampling import derived_seed, find_interval, independent_sampler, running_sums
+from ..cuts.light_cuts import collect_cuts, limited_cuts, upload_thresholds
+from ..points.bsdf_proxies import MaterialProxy
+from ..points.surfaces import LambertianSurface, Receiver
+from ..transport.evaluation import Transport, evaluate_pairs
+from .remainder import GatherVertices
+
+
+@dataclass
+class Receivers:
+    """Clusters as :mod:`vpl.cuts.light_cuts` sees gather points: boxes with cones of normals, evaluated."""
+
+    receiver: Receiver
+
+    @classmethod
+    def of(cls, center, extent, axis, cosine) -> Receivers:
+        """Boxes, (n, 3) each, and cones of normals, axes (n, 3) and cosines of half-angles (n,)."""
+        count = len(center)
+        white, no = mi.Color3f(*(dr.opaque(mi.Float, 1.0, count) for _ in range(3))), mi.Bool(False)
+        proxy = MaterialProxy(white, None, None, None, no, no, False, False)
+        center, extent, axis = (
+            _upload_columns(kind, x) for kind, x in ((mi.Point3f, center), (mi.Vector3f, extent), (mi.Vector3f, axis))
+        )
+        return cls(Receiver(center, axis, proxy, extent, upload(mi.Float, cosine)))
+
+    @property
+    def count(self) -> int:
+        return dr.width(self.receiver.position)
+
+    def select(self, index) -> Receivers:
+        """Some of them, evaluated."""
+        one = self.receiver
+        position, normal, extent, cosine, base = (
+            dr.gather(type(x), x, index)
+            for x in (one.position, one.normal, one.extent, one.normal_cosine, one.proxy.base)
+        )
+        dr.eval(position, normal, extent, cosine, base)
+        no = mi.Bool(False)
+        return Receivers(
+            Receiver(position, normal, MaterialProxy(base, None, None, None, no, no, False, False), extent, cosine)
+        )
+
+
+def _upload_columns(kind, columns):
+    return kind(*(upload(mi.Float, columns[:, k]) for k in range(3)))
+
+
+class PixelClusters:
+    """Clusters of the gather vertices of pixels.
+
+    ``vertices``: with weight, evaluated; ``rays``: UInt32, ascending, the camera ray of each; ``samples``: camera rays
+    of a pixel, next to each other.
+    """
+
+    def __init__(self, vertices: GatherVertices, rays, samples: int):
+        position, normal = download(vertices.position), download(vertices.normal)
+        pixel = download(rays).astype(np.int64) // samples
+        key = pixel * 6 + _facing(normal)
+        order = np.argsort(key, kind="stable")
+        position, normal, key = position[order], normal[order], key[order]
+        first = np.flatnonzero(np.diff(key, prepend=-1))
+        low, high = np.minimum.reduceat(position, first), np.maximum.reduceat(position, first)
+        axis = np.add.reduceat(normal, first)
+        axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-20)[:, None]
+        size = np.diff(first, append=len(key))
+        self.cluster = np.repeat(np.arange(len(first)), size)
+        cosine = np.minimum.reduceat((normal * axis[self.cluster]).sum(1), first)
+        self.pixel = key[first] // 6
+        # Rounded down, so that every normal is inside
+        self.receivers = Receivers.of(0.5 * (low + high), 0.5 * (high - low), axis, np.maximum(cosine - 2e-6, -1))
+        self.first, self.size = upload(mi.UInt32, first), upload(mi.UInt32, size)
+        along = upload(mi.UInt32, order)
+        self.ray, self._weight = (
+            dr.gather(mi.UInt32, rays, along),
+            dr.gather(mi.UnpolarizedSpectrum, vertices.weight, along),
+        )
+        at = [dr.gather(type(x), x, along) for x in (vertices.position, vertices.flat, vertices.normal, vertices.depth)]
+        self._level = channel_mean(self._weight)
+        self.cumulative = running_sums(self._level)
+        sums = download(self.cumulative)
+        self.weight = sums[first + size] - sums[first]
+        dr.eval(at, self.ray, self._weight, self._level)
+        self._vertices = at
+
+    @property
+    def count(self) -> int:
+        return self.receivers.count
+
+    def draw(self, cluster, sample):
+        """A vertex of each cluster by weight: (camera ray, Lambertian surface of albedo 1, weight over probability)."""
+        first = dr.gather(mi.UInt32, self.first, cluster)
+        last = first + dr.gather(mi.UInt32, self.size, cluster)
+        row = find_interval(self.cumulative, first, last, sample)
+        whole = dr.gather(type(self.cumulative), self.cumulative, last) - dr.gather(
+            type(self.cumulative), self.cumulative, first
+        )
+        interaction = dr.zeros(mi.Interaction3f, dr.width(row))
+        position, flat, normal, depth = (dr.gather(type(x), x, row) for x in self._vertices)
+        interaction.p, interaction.n = position, flat
+        surface = LambertianSurface(interaction, depth, normal, mi.Color3f(1))
+        factor = mi.Float(whole) / dr.gather(mi.Float, self._level, row)
+        return (
+            dr.gather(mi.UInt32, self.ray, row),
+            surface,
+            dr.gather(mi.UnpolarizedSpectrum, self._weight, row) * factor,
+        )
+
+
+def _facing(normal: np.ndarray) -> np.ndarray:
+    """Which of six ways normals (n, 3) face: 0 to 5."""
+    axis = np.abs(normal).argmax(1)
+    return 2 * axis + (normal[np.arange(len(normal)), axis] < 0)
+
+
+def light_clusters(
+    transport: Transport, clusters: PixelClusters, level: np.ndarray, error: float, max_cut: int, seed: int, result
+):
+    """Add to ``result`` (per camera ray) what virtual lights send to the clusters: shadow rays traced.
+
+    ``level``: per cluster, what the vertices of its pixel contribute together, by which bounds are judged: a pair may
+    add ``error`` of it at most.
+    """
+    allowed = error * level / np.maximum(clusters.weight, np.finfo(np.float64).tiny)
+    threshold, sizes, _ = limited_cuts(transport.lights, clusters.receivers, upload_thresholds(allowed), max_cut)
+    rays = 0
+    for number, chunk in enumerate(collect_cuts(transport.lights, clusters.receivers, threshold, sizes)):
+        sampler = independent_sampler(derived_seed(seed, number), dr.width(chunk.rows))
+        cluster = dr.gather(mi.UInt32, chunk.points, chunk.rows)
+        ray, surface, weight = clusters.draw(cluster, sampler.next_1d())
+        light, scale = chunk.group.draw(chunk.nodes, sampler.next_1d())
+        value, traced = evaluate_pairs(transport, chunk.group, surface, light, scale)
+        value = mi.UnpolarizedSpectrum(value) * weight
+        add_at(result, dr.select(dr.all(dr.isfinite(value)), value, 0), ray)
+        dr.eval(result, traced)
+        rays += int(dr.count(traced)[0])
+    return rays

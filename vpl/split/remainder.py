@@ -1,0 +1,255 @@
+"""The traced part of the split: paths as Mitsuba's ``path`` follows them, less what virtual lights carry.
+
+A path from the camera goes on through mirrors and glass to its first vertex with a floor, x1, where virtual lights are
+gathered.  What its next vertex x2 would send back by w F1 F2 is theirs (:mod:`vpl.split.floors`) and is taken off the
+BSDF of x2, in next-event estimation as well as in the throughput of the path, which goes on from x2 as ``path`` would.
+The rest may be negative.  Russian roulette by how much is left ends most paths at x2: nearly all of them where both
+surfaces are Lambertian and far apart.
+
+The same kernel follows paths of which nothing is taken off: those that find the irradiance of a virtual light.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import channel_mean, ones
+from ..direct.emitter_sampling import power_heuristic
+from .floors import Perturbed, agrees, carried_share, floor_of, side_of
+
+# Where a path is: before its first vertex with a floor; on its way from that to the next vertex; and past it
+SEEKING, CONNECTING, PAST = range(3)
+# No path is ended with more than this probability because little is left of it: what is left is known only roughly
+_LEAST_SURVIVAL = 0.02
+
+
+@dataclass
+class Limits:
+    """``max_depth`` (edges), ``rr_depth``: as in ``path``, UInt32; ``squared_c``: of the split, world units²; all
+    opaque.  ``perturbed``: shapes without a floor; ``hide_emitters``: of Python."""
+
+    max_depth: object
+    rr_depth: object
+    squared_c: object
+    perturbed: Perturbed
+    hide_emitters: bool
+
+
+@dataclass
+class FirstEdge:
+    """First edges of paths, one per lane, evaluated.
+
+    ``vertex``: where they begin; ``ray``; ``throughput``: unpolarized spectrum; ``density``: of the direction, per
+    solid angle; ``delta``: whether it was drawn from none; ``state``: see above; ``active``.
+    """
+
+    vertex: object
+    ray: object
+    throughput: object
+    density: object
+    delta: object
+    state: object
+    active: object
+
+    @classmethod
+    def of_camera(cls, ray, active) -> FirstEdge:
+        """Camera rays."""
+        count = dr.width(ray.d)
+        return cls.of(ray.o, ray, ones(count), dr.opaque(mi.Float, 1.0, count), True, SEEKING, active)
+
+    @classmethod
+    def of(cls, vertex, ray, throughput, density, delta: bool, state: int, active) -> FirstEdge:
+        """Rays in directions of a density."""
+        count = dr.width(ray.d)
+        # Opaque and of full width, so that all paths are followed by one kernel
+        wide = dr.opaque(mi.Float, 0.0, count)
+        ray = mi.Ray3f(ray.o + wide, ray.d + wide, ray.time + wide)
+        ray.maxt = dr.largest(mi.Float) + wide
+        active = mi.Bool(active) & (wide == 0)
+        edge = cls(
+            vertex + wide,
+            ray,
+            throughput,
+            density,
+            wide == (0 if delta else 1),
+            dr.full(mi.UInt32, state, count),
+            active,
+        )
+        dr.make_opaque(edge)
+        return edge
+
+
+@dataclass
+class Found:
+    """What a path found: ``radiance``; ``drawn``: one of the contributions that it is the sum of, drawn by its share
+    and divided by the probability of that; ``length``: edges of the path that brought this one; ``valid``: whether a
+    surface was met that the film's alpha shows."""
+
+    radiance: object
+    drawn: object
+    length: object
+    valid: object
+
+
+@dataclass
+class GatherVertices:
+    """First vertices with a floor, one per lane: where virtual lights are gathered.
+
+    ``position``, ``normal`` (shading normal, on the side that is seen), ``flat`` (geometric normal); ``weight``: what
+    irradiance there contributes to the camera ray, throughput times floor, 0 where there is no such vertex; ``depth``:
+    edges from the camera; ``arrival``: the vertex after it, if it has a floor too, ``arrival_normal``: the
+    normal of the side that was met, ``arrival_weight``: what irradiance there would contribute if virtual lights
+    carried all of it (w = 1), and ``before``: the radiance that the path found before it; means over channels.
+    """
+
+    position: object
+    normal: object
+    flat: object
+    weight: object
+    depth: object
+    arrival: object
+    arrival_normal: object
+    arrival_weight: object
+    before: object
+
+    def select(self, index) -> GatherVertices:
+        """Those picked by an index array, evaluated."""
+        picked = GatherVertices(*(dr.gather(type(x), x, index) for x in vars(self).values()))
+        dr.eval(picked)
+        return picked
+
+
+@dr.syntax
+def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
+    """Follow paths to their ends: (:class:`Found`, :class:`GatherVertices`), evaluated.
+
+    ``emission``: how emitters are sampled, see :mod:`vpl.split.next_event`; ``numbers``: (number, pair, number, pair)
+    for the first vertex that scatters, which choose an emitter, a place on it, a lobe, and a direction; ``sampler``:
+    for all others.
+    """
+    # With lobes other than a diffuse reflection, the floor does not tell how much is left
+    other_lobes = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.DiffuseReflection)
+    context, count = mi.BSDFContext(), dr.width(first.throughput)
+    radiance, drawn = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UnpolarizedSpectrum, count)
+    length, level = mi.UInt32(0), mi.Float(0)
+    vertex, ray = mi.Point3f(first.vertex), mi.Ray3f(first.ray)
+    throughput, active = mi.UnpolarizedSpectrum(first.throughput), mi.Bool(first.active)
+    density, delta, state = mi.Float(first.density), mi.Bool(first.delta), mi.UInt32(first.state)
+    depth, eta, valid, spread = mi.UInt32(0), mi.Float(1), mi.Bool(False), state == SEEKING
+    # Of what x1 sends on, the part that virtual lights carry but for w and the floor of x2; and the cosine there
+    carried, cosine = dr.zeros(mi.UnpolarizedSpectrum, count), mi.Float(1)
+    position, normal, flat = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0)
+    weight, edges = dr.zeros(mi.UnpolarizedSpectrum, count), mi.UInt32(0)
+    arrival, arrival_normal = mi.Point3f(0), mi.Normal3f(0)
+    arrival_weight, before = mi.Float(0), mi.Float(0)
+
+    while dr.hint(active, exclude=[first, numbers, limits, emission, context, count, other_lobes]):
+        # ---------------------- Next vertex ----------------------
+        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 0, active=active)
+        bsdf = si.bsdf(ray)
+        hidden = mi.Bool(False)
+        if dr.hint(limits.hide_emitters, mode="scalar"):
+            hidden = active & (depth == 0) & (~si.is_valid() | si.shape.is_emitter())
+
+        # ---------------------- Emission, by BSDF sampling ----------------------
+        emitted, other = emission.met(vertex, ray, si, ~delta, active & ~hidden)
+        contribution = throughput * emitted * power_heuristic(density, other)
+        radiance += contribution
+        drawn, length, level = _draw(drawn, length, level, contribution, depth + 1, sampler)
+
+        # ---------------------- What virtual lights carry ----------------------
+        goes_on = active & si.is_valid() & (depth + 1 < limits.max_depth) & ~hidden
+        flags, side = bsdf.flags(), side_of(si)
+        smooth = goes_on & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+        floor = floor_of(si, bsdf, side, limits.perturbed, smooth & (state <= CONNECTING))
+        w = carried_share(limits.squared_c, cosine, dr.abs(dr.dot(si.n, ray.d)), dr.square(si.t))
+        # Lights at x2 shine to where its shading normal faces, too
+        connects = smooth & (state == CONNECTING) & agrees(si, side)
+        carried = dr.select(connects, carried * floor, 0)
+        met = si.n * dr.mulsign(mi.Float(1), -dr.dot(si.n, ray.d))
+        arrival, arrival_normal = dr.select(connects, si.p, arrival), dr.select(connects, met, arrival_normal)
+        arrival_weight = dr.select(connects, channel_mean(carried), arrival_weight)
+        before = dr.select(connects, channel_mean(radiance), before)
+        carried *= w
+
+        # ---------------------- The path ends at a Lambertian x2, unless something is left of it ----------------------
+        reflected = throughput * floor
+        left = dr.max(dr.abs(reflected - carried)) / dr.max(dr.abs(reflected))
+        left = dr.select(connects & ((flags & other_lobes) == 0), dr.clip(left, _LEAST_SURVIVAL, 1), 1)
+        left = dr.select(dr.isfinite(left), left, 1)
+        goes_on &= sampler.next_1d() < left
+        smooth &= goes_on
+        throughput /= left
+        carried /= left
+
+        # ---------------------- A vertex where lights are gathered ----------------------
+        gathers = smooth & (state == SEEKING) & agrees(si, side) & (dr.max(floor) > 0)
+        gathers &= depth + 2 < limits.max_depth
+        position, normal = dr.select(gathers, si.p, position), dr.select(gathers, si.sh_frame.n * side, normal)
+        flat, edges = dr.select(gathers, si.n, flat), dr.select(gathers, depth + 1, edges)
+        weight = dr.select(gathers, throughput * floor, weight)
+
+        # ---------------------- Emission, by next-event estimation ----------------------
+        first_numbers = spread & smooth
+        spread &= ~smooth
+        chosen = dr.select(first_numbers, numbers[0], sampler.next_1d())
+        place = dr.select(first_numbers, numbers[1], sampler.next_2d())
+        toward, incident, density_there, is_point = emission.sample(scene, si, chosen, place, smooth)
+        local = si.to_local(toward)
+        value, density_here = bsdf.eval_pdf(context, si, local, smooth)
+        value = throughput * mi.unpolarized_spectrum(value)
+        value -= dr.select(local.z * side > 0, carried * dr.abs(local.z), 0)
+        mis = dr.select(is_point, 1, power_heuristic(density_there, density_here))
+        contribution = dr.select(smooth & (density_there > 0), value * incident * mis, 0)
+        radiance += contribution
+        drawn, length, level = _draw(drawn, length, level, contribution, depth + 2, sampler)
+
+        # ---------------------- Next direction ----------------------
+        lobe = dr.select(first_numbers, numbers[2], sampler.next_1d())
+        turn = dr.select(first_numbers, numbers[3], sampler.next_2d())
+        bs, share = bsdf.sample(context, si, lobe, turn, active & ~hidden)
+        full = throughput * mi.unpolarized_spectrum(share)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        # As in `path`, by the direction that is drawn, even where the path ends
+        valid |= active & si.is_valid() & ~hidden & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        cosine, density, eta = dr.abs(bs.wo.z), bs.pdf, eta * bs.eta
+        # Lambertian reflection over the density of the direction
+        lambertian = dr.select(~delta & (bs.wo.z * side > 0) & (density > 0), cosine / density, 0)
+        throughput = full - carried * lambertian
+        kept = dr.max(dr.abs(throughput)) / dr.max(dr.abs(full))
+        kept = dr.select((dr.max(carried) > 0) & dr.isfinite(kept), dr.clip(kept, _LEAST_SURVIVAL, 1), 1)
+        carried = dr.select(gathers, weight * lambertian, 0)
+        onward = dr.select(gathers & ~delta, mi.UInt32(CONNECTING), mi.UInt32(PAST))
+        state = dr.select((state == SEEKING) & ~gathers, mi.UInt32(SEEKING), onward)
+        ray, vertex = si.spawn_ray(dr.select(hidden, ray.d, si.to_world(bs.wo))), mi.Point3f(si.p)
+        depth += dr.select(goes_on, 1, 0)
+
+        # ---------------------- Russian roulette: as in `path`, and by what is left ----------------------
+        survival = dr.minimum(dr.max(dr.abs(throughput)) * dr.square(eta), 0.95)
+        survival = kept * dr.select(depth >= limits.rr_depth, survival, 1)
+        active = goes_on & (dr.max(dr.abs(throughput)) > 0) & (sampler.next_1d() < survival)
+        throughput /= survival
+        carried /= survival
+        if dr.hint(limits.hide_emitters, mode="scalar"):
+            passes = hidden & si.is_valid()
+            active |= passes
+            throughput = dr.select(passes, first.throughput, throughput)
+            delta, eta = delta | passes, dr.select(passes, 1, eta)
+            state = dr.select(passes, mi.UInt32(SEEKING), state)
+
+    found, vertices = (
+        Found(radiance, drawn * dr.select(level > 0, level / dr.sum(dr.abs(drawn)), 0), length, valid),
+        GatherVertices(position, normal, flat, weight, edges, arrival, arrival_normal, arrival_weight, before),
+    )
+    dr.eval(found, vertices)
+    return found, vertices
+
+
+def _draw(drawn, length, level, contribution, edges, sampler):
+    """Keep one of all contributions so far, drawn by its share of their sum: (contribution, its length, sum)."""
+    more = dr.sum(dr.abs(contribution))
+    taken = sampler.next_1d() * (level + more) < more
+    return dr.select(taken, contribution, drawn), dr.select(taken, edges, length), level + more

@@ -1,0 +1,156 @@
+"""Virtual lights drawn on surfaces where paths from the camera arrive, each with what one path from it finds.
+
+Random lines through the cells in which camera paths arrive (:mod:`vpl.split.cells`) meet surfaces at points of known
+density.  Each becomes a light: irradiance there, found by next-event estimation and one path, times the floor of its
+BSDF.  No path from an emitter is followed, so that nothing needs adjoint BSDFs, corrections for shading normals or rays
+that leave emitters, and an environment that lights a room by its windows is met as ``path`` meets it.
+
+Cells are chosen by what a pilot's paths brought to the camera from there: light is wanted where it is seen and bright.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import download, ones, spectrum_to_rgb, upload
+from ..core.sampling import derived_seed, independent_sampler
+from ..direct.emitter_sampling import power_heuristic
+from ..lights.emission import bounding_box
+from ..lights.virtual_lights import VirtualLights
+from .cells import Cells, Lines
+from .floors import floor_of, side_of
+from .numbers import spread_numbers
+from .pilot import Arrivals
+from .remainder import PAST, FirstEdge, Limits, follow
+
+# Arrivals of average brightness that a cell is taken to have had, besides its own
+_PRIOR = 2.0
+# Surfaces that one line meets at most, so that an endless row of hits at one place comes to an end
+_MOST_LAYERS = 1024
+
+
+@dataclass
+class SurfaceLights:
+    """``lights``: of kind "surface"; ``spacing``: typical distance between them where camera paths arrive, world
+    units."""
+
+    lights: VirtualLights
+    spacing: float
+
+
+def surface_lights(scene, emission, arrivals: Arrivals, count: int, limits: Limits, seed: int) -> SurfaceLights:
+    """The lights that ``count`` lines meet.  ``limits``: of the paths that find their irradiance."""
+    generator = np.random.default_rng(seed)
+    box = bounding_box(scene)
+    low, extent = np.array(box.min, np.float64), np.array(box.extents(), np.float64)
+    # A little larger, so that no surface lies on its sides
+    size = 1.001 * max(float(extent.max()), np.finfo(np.float32).tiny)
+    cells = Cells(
+        arrivals.position, arrivals.normal, arrivals.weight, low + 0.5 * (extent - size), size, generator
+    )  # fmt: skip
+    cells.choose_by(_importance(cells, arrivals))
+    lights = _lights_along(scene, emission, cells.lines(count, generator), limits, derived_seed(seed, 1))
+    density = count * cells.density(lights.position, lights.direction)
+    lights.intensity = (lights.intensity / density[:, None]).astype(np.float32)
+    spacing = np.median(1 / np.sqrt(count * cells.density(arrivals.position, arrivals.normal)))
+    return SurfaceLights(lights, float(spacing))
+
+
+def _importance(cells: Cells, arrivals: Arrivals) -> np.ndarray:
+    """Share of lights that each leaf should have: by its arrivals and the root mean square of what they brought."""
+    leaf, size = cells.leaf_of_point, len(cells.leaf_weight)
+    number = np.bincount(leaf, minlength=size)
+    squared = np.bincount(leaf, arrivals.level**2, size)
+    typical = np.mean(arrivals.level**2)
+    if not typical > 0:
+        return cells.leaf_weight
+    return number * np.sqrt((squared + _PRIOR * typical) / (number + _PRIOR))
+
+
+def _lights_along(scene, emission, lines: Lines, limits: Limits, seed: int) -> VirtualLights:
+    """A light wherever a line meets a surface with a floor: their intensities are floor × irradiance, per hit."""
+    rays = _rays_to_surfaces(scene, lines)
+    if dr.width(rays.o) == 0:
+        return VirtualLights.of("surface", [], [], [])
+    lit, place, outward, facing, floor = _floors(scene, limits.perturbed, rays)
+    kept = dr.compress(lit)
+    if len(kept) == 0:
+        return VirtualLights.of("surface", [], [], [])
+    rays, place, outward, facing, floor = (dr.gather(type(x), x, kept) for x in (rays, place, outward, facing, floor))
+    irradiance, length = _irradiance(scene, emission, rays, limits, seed)
+    columns = (place, outward, spectrum_to_rgb(floor * irradiance), length)
+    lights = VirtualLights.of("surface", *(download(column) for column in columns))
+    lights.facing = download(facing)
+    return lights.without_bad()[0]
+
+
+def _rays_to_surfaces(scene, lines: Lines):
+    """Rays, one for every surface that a line meets, that begin shortly before it."""
+    origin, direction = (
+        mi.Point3f(*(upload(mi.Float, x[:, k]) for k in range(3))) for x in (lines.origin, lines.direction)
+    )
+    length, found = upload(mi.Float, lines.length), []
+    for _ in range(_MOST_LAYERS):
+        ray = mi.Ray3f(origin, mi.Vector3f(direction), length, 0.0, [])
+        dr.make_opaque(ray.time)
+        si = scene.ray_intersect(ray)
+        onward = si.spawn_ray(ray.d)
+        remaining = dr.select(si.is_valid(), ray.maxt - si.t, 0)
+        dr.eval(onward.o, remaining)
+        hit = dr.compress(remaining > 0)
+        if len(hit) == 0:
+            break
+        found.append([download(dr.gather(mi.Point3f, x, hit)) for x in (origin, direction)])
+        origin, direction, length = (dr.gather(type(x), x, hit) for x in (onward.o, direction, remaining))
+        dr.eval(origin, direction, length)
+    if not found:
+        return dr.zeros(mi.Ray3f, 0)
+    origin, direction = (np.concatenate(columns) for columns in zip(*found, strict=True))
+    ray = mi.Ray3f(*(mi.Point3f(*(upload(mi.Float, x[:, k]) for k in range(3))) for x in (origin, direction)))
+    return ray
+
+
+def _floors(scene, perturbed, rays):
+    """Surfaces that rays meet: (whether they have a floor, place, geometric and shading normals on the side that was
+    met, floor), evaluated."""
+    si = scene.ray_intersect(rays)
+    bsdf, side = si.bsdf(), side_of(si)
+    smooth = si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    floor = floor_of(si, bsdf, side, perturbed, smooth)
+    outward = si.n * dr.mulsign(mi.Float(1), -dr.dot(si.n, rays.d))
+    found = (smooth & (dr.max(floor) > 0), si.p, outward, si.sh_frame.n * side, floor)
+    dr.eval(found)
+    return found
+
+
+def _irradiance(scene, emission, rays, limits: Limits, seed: int):
+    """Irradiance, by one path each, where rays meet surfaces: (unpolarized spectrum, edges of a path that found it)."""
+    count = dr.width(rays.o)
+    sampler = independent_sampler(derived_seed(seed, 0), count)
+    si = scene.ray_intersect(rays)
+    facing = si.sh_frame.n * side_of(si)
+    # ---------------------- Next-event estimation ----------------------
+    toward, incident, density, is_point = emission.sample(
+        scene, si, sampler.next_1d(), sampler.next_2d(), si.is_valid()
+    )
+    cosine = dr.maximum(dr.dot(facing, toward), 0)
+    mis = dr.select(is_point, 1, power_heuristic(density, cosine * dr.inv_pi))
+    nearest = dr.select(density > 0, incident * cosine * mis, 0)
+    # ---------------------- A path that begins with a direction drawn by the cosine ----------------------
+    local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+    ray, density, draw = si.spawn_ray(mi.Frame3f(facing).to_world(local)), local.z * dr.inv_pi, sampler.next_1d()
+    dr.eval(si.p, nearest, ray, density, draw)
+    edge = FirstEdge.of(si.p, ray, ones(count) * dr.pi, density, False, PAST, True)
+    numbers = spread_numbers(dr.arange(mi.UInt32, count), 1, seed)
+    found, _ = follow(scene, emission, edge, numbers, independent_sampler(derived_seed(seed, 1), count), limits)
+    # Gather points further from the camera may use shorter paths only: a light stands for paths of one length, and has
+    # the colour of none but these
+    level, more = dr.sum(nearest), dr.sum(found.drawn)
+    is_nearest = draw * (level + more) < level
+    one = dr.select(is_nearest, nearest, found.drawn)
+    irradiance = dr.select(level + more > 0, one * (level + more) / dr.sum(one), 0)
+    return irradiance, dr.select(is_nearest, mi.UInt32(1), found.length)
