@@ -1,0 +1,225 @@
+"""`manylights` against `path`: variance × time, raw and denoised, first renders, memory, and how sets of lights differ.
+
+    python benchmarks/manylights.py                                      all parts, all scenes
+    python benchmarks/manylights.py --parts product --scenes kitchen     some
+
+Parts, each with both integrators in turn in one run, and with the better of the samplers `independent` and
+`multijitter` for each:
+
+- ``product``: variance between passes, relative to the squared reference (where there is none, the mean of all passes)
+  plus a hundredth of its squared mean, without the worst 0.1% of the pixels; times seconds it tells the time for an
+  error, however long one renders.  Bias: excess of the mean over that of `path`, with its standard error.  Sets: how
+  much the mean of the image differs from pass to pass, each with lights of its own.
+- ``denoised``: error of one pass through Open Image Denoise against the reference, its noise taken off; the time of
+  `path` for the same error, from passes of growing size.
+- ``cold``: seconds of the first render, 16 samples a pixel, with an empty kernel cache, and peak memory, whole process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+mi.set_variant("llvm_ad_rgb")
+
+import integrators  # noqa: E402, F401
+from benchmarks import scenes  # noqa: E402
+
+NAMES = (*scenes.NAMES, "classroom", "hall")
+KINDS, SAMPLERS = ("path", "manylights"), ("independent", "multijitter")
+DEPTH, TRIMMED, COLD_SPP = 6, 0.001, 16
+# Samples of one pass, at most: it bounds memory
+LARGEST_PASS = 1 << 22
+_COLD = """
+import resource, sys, time
+start = time.perf_counter()
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+import drjit as dr, integrators
+from benchmarks import scenes
+scene = scenes.load(sys.argv[2], int(sys.argv[3]))
+begin = time.perf_counter()
+plugin = mi.load_dict({"type": sys.argv[1], "max_depth": 6})
+image = mi.render(scene, integrator=plugin, spp=int(sys.argv[4]))
+dr.eval(image); dr.sync_thread()
+print(time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+"""
+
+
+def load(name: str, sampler: str, width: int):
+    """A scene with a sampler of its own kind in place of what its file says."""
+    file = scenes.scene_file(name)
+    mi.file_resolver().prepend(str(file.parent))
+    text = file.read_text().replace('<sampler type="independent"', f'<sampler type="{sampler}"')
+    return mi.load_string(text, resx=str(width), resy=str(scenes.height(name, width)))
+
+
+class Rival:
+    """One integrator with one sampler on one scene: its passes, of about the same time."""
+
+    def __init__(self, name: str, kind: str, sampler: str, width: int, seconds: float):
+        self.kind, self.sampler, self.images, self.seconds = kind, sampler, [], []
+        self.scene = load(name, sampler, width)
+        self.integrator = mi.load_dict({"type": kind, "max_depth": DEPTH})
+        # Squares, as `multijitter` has them; what a pass costs besides its samples is known from two sizes
+        most = int((LARGEST_PASS / (width * scenes.height(name, width))) ** 0.5)
+        side, times = min(8, most), []
+        for self.spp in (16, 16, side**2, side**2):
+            times.append(self.render(0)[1])
+        each = max(times[-1] - times[1], 0.1 * times[-1]) / max(side**2 - 16, 1)
+        wanted = side**2 + (seconds - times[-1]) / each
+        self.spp = min(max(round(max(wanted, 16) ** 0.5), 4), most) ** 2
+        self.render(0)
+
+    def render(self, seed: int):
+        """(An image, float64, and its seconds)."""
+        image, seconds = scenes.timed(
+            lambda: mi.render(self.scene, integrator=self.integrator, spp=self.spp, seed=seed)
+        )
+        return np.array(image, np.float64)[..., :3], seconds
+
+    def measure(self, seed: int) -> None:
+        """One more pass."""
+        image, seconds = self.render(seed)
+        self.images.append(image)
+        self.seconds.append(seconds)
+
+    def product(self, scale: np.ndarray) -> float:
+        """Variance × seconds of a pass."""
+        error = np.var(self.images, axis=0, ddof=1) / scale
+        error = np.sort(error.mean(-1).ravel())
+        return error[: int(len(error) * (1 - TRIMMED))].mean() * float(np.median(self.seconds))
+
+    def mean(self) -> tuple[float, float]:
+        """(Mean of the image, its standard error)."""
+        means = [image.mean() for image in self.images]
+        return float(np.mean(means)), float(np.std(means, ddof=1) / np.sqrt(len(means)))
+
+
+def reference_of(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """The reference of a scene, 256 pixels wide, and its standard error."""
+    bitmap = mi.Bitmap(str(scenes.reference_file(name)))
+    names, values = [field.name for field in bitmap.struct_()], np.array(bitmap, np.float64)
+    truth, noise = ([names.index(prefix + channel) for channel in "RGB"] for prefix in ("", "se."))
+    return values[..., truth], values[..., noise]
+
+
+def scale_of(name: str, images: list, width: int) -> np.ndarray:
+    """What squared errors are relative to."""
+    known = scenes.reference_file(name) and width == 256
+    truth = reference_of(name)[0] if known else np.mean(images, axis=0)
+    return truth**2 + 0.01 * truth.mean() ** 2
+
+
+def product(names, width: int, seconds: float, passes: int) -> None:
+    """Print variance × time of all, and the ratio."""
+    print(f"product, {width} wide, {passes} passes of about {seconds:g} s; variance × time, with samples of a pass")
+    print(f"{'scene':16s} {'path':>22s} {'manylights':>22s}   ratio   bias                sets")
+    ratios = []
+    for name in names:
+        rivals = [Rival(name, kind, sampler, width, seconds) for kind in KINDS for sampler in SAMPLERS]
+        for number in range(passes):
+            for rival in rivals:
+                rival.measure(100 + number)
+        scale = scale_of(name, [image for rival in rivals for image in rival.images], width)
+        best = {kind: min((r for r in rivals if r.kind == kind), key=lambda r: r.product(scale)) for kind in KINDS}
+        values = [best[kind].product(scale) for kind in KINDS]
+        ratios.append(values[0] / values[1])
+        (ours, error), (theirs, their_error) = best["manylights"].mean(), best["path"].mean()
+        sets = np.std([image.mean() for image in best["manylights"].images], ddof=1) / ours
+        columns = [
+            f"{value:.4g} ({best[kind].spp}, {best[kind].sampler[:5]})"
+            for value, kind in zip(values, KINDS, strict=True)
+        ]
+        excess, uncertain = ours / theirs - 1, np.hypot(error / ours, their_error / theirs)
+        print(
+            f"{name:16s} {columns[0]:>22s} {columns[1]:>22s} {ratios[-1]:7.2f}   {excess:+.2%} ± {uncertain:.2%}"
+            f"{sets:12.2%}   {best['manylights'].integrator.statistics.get('balance')}",
+            flush=True,
+        )
+    print(f"geometric mean {scenes.geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
+
+
+def denoised(names, width: int, seconds: float, passes: int) -> None:
+    """Print the error through the denoiser, and how long `path` takes for that of `manylights`."""
+    from comparison.denoising import Denoiser
+
+    print(f"denoised, {width} wide: error of a pass; what `path` would take for that of manylights over its time")
+    ratios = []
+    for name in names:
+        if scenes.reference_file(name) is None:
+            print(f"skipped {name}: it has no reference")
+            continue
+        rivals = [Rival(name, kind, "multijitter", width, seconds) for kind in KINDS]
+        for number in range(passes):
+            for rival in rivals:
+                rival.measure(100 + number)
+        truth, noise = reference_of(name)
+        scale = truth**2 + 0.01 * truth.mean() ** 2
+        points = {}
+        for rival in rivals:
+            denoiser = Denoiser(rival.scene)
+            clean = [denoiser.denoise(image, ["R", "G", "B"])[..., :3] for image in rival.images]
+            error = np.mean([((image - truth) ** 2 - noise**2) / scale for image in clean], axis=0).mean(-1)
+            error = np.sort(error.ravel())[int(TRIMMED * error.size) : int((1 - TRIMMED) * error.size)].mean()
+            points[rival.kind] = (error, float(np.median(rival.seconds)) + denoiser.filter_seconds)
+        (theirs, their_time), (ours, our_time) = (points[kind] for kind in KINDS)
+        # Denoised errors fall by 1.37 where samples double
+        ratio = their_time * (max(theirs, 1e-9) / max(ours, 1e-9)) ** (np.log(2) / np.log(1.37)) / our_time
+        ratios.append(ratio)
+        print(
+            f"{name:16s} path {theirs:.5f} ({their_time:.2f} s) manylights {ours:.5f} ({our_time:.2f} s) {ratio:7.2f}",
+            flush=True,
+        )
+    print(f"geometric mean {scenes.geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
+
+
+def cold(names, width: int) -> None:
+    """Print first renders with an empty kernel cache, and peak memory, each in a process of its own."""
+    print(f"cold, {width} wide, {COLD_SPP} samples: seconds of the first render, peak GiB")
+    for name in names:
+        found = []
+        for kind in KINDS:
+            with tempfile.TemporaryDirectory() as cache:
+                environment = os.environ | {"DRJIT_CACHE_DIR": cache, "PYTHONPATH": str(scenes.PROJECT)}
+                command = [sys.executable, "-c", _COLD, kind, name, str(width), str(COLD_SPP)]
+                output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+            found.append([float(value) for value in output.split()[-2:]])
+        (theirs, their_memory), (ours, our_memory) = found
+        within = "" if ours <= 2 * theirs + 1 else "  above 2 × path + 1 s"
+        print(
+            f"{name:16s} path {theirs:5.1f} s, {their_memory:.2f}; manylights {ours:5.1f} s, {our_memory:.2f}{within}",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Run the parts that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument(
+        "--parts", nargs="+", default=["product", "denoised", "cold"], choices=["product", "denoised", "cold"]
+    )
+    parser.add_argument("--scenes", nargs="+", default=list(NAMES), metavar="NAME")
+    parser.add_argument("--width", type=int, default=256, metavar="PIXELS")
+    parser.add_argument("--seconds", type=float, default=2.5, help="of one pass, about (default: 2.5)")
+    parser.add_argument("--passes", type=int, default=6, help="of each (default: 6)")
+    options = parser.parse_args()
+    names = scenes.available(options.scenes)
+    if "product" in options.parts:
+        product(names, options.width, options.seconds, options.passes)
+    if "denoised" in options.parts:
+        denoised(names, 256, options.seconds, options.passes)
+    if "cold" in options.parts:
+        cold(names, options.width)
+
+
+if __name__ == "__main__":
+    main()
