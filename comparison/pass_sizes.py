@@ -4,7 +4,7 @@ Sizes are powers of two, from 4 on if a pixel allows it: Mitsuba compiles one ke
 numbers between and, with some filters of the film, for fewer. The first pass is small, since nothing is known; each
 later one is as large as the one before, or larger by a factor that the time of that one allows. As the first pass of a
 kernel compiles it, time says at most what a pass costs, so that growing by it is safe; shrinking needs a second pass of
-the same size.
+the same size, and so does growing at the risk of twice the time, where passes cost much to start.
 """
 
 import math
@@ -60,6 +60,9 @@ class PassSizes:
             self._current = max(1, _power_of_two(self._current * PASS_SECONDS / seconds))
             return
         grown = _power_of_two(max(1, self._current * PASS_SECONDS / max(seconds, 1e-6)))
+        if repeated and seconds < PASS_SECONDS:
+            # Where starting a pass is most of it, its time would never let it grow
+            grown = max(grown, (4 if seconds < PASS_SECONDS / 2 else 2) * self._current)
         grown = min(grown, self._largest, _power_of_two(max(1, done / PARTS)) if self._many else self._largest)
         if grown > self._current and grown >= min(USUAL, self._largest):
             self._current = grown
