@@ -1,6 +1,6 @@
 """Compare integrators on scenes: same scene, same seeds, same reference, each run in a process of its own.
 
-    python compare.py scenes/hall.xml --integrators path,lightcuts --time 20 --reference path:4096
+    python compare.py scenes/hall.xml --integrators path,manylights --time 20 --reference path:4096
     python compare.py scenes/cornell.xml --integrators path,lightcuts,illuminationcut --reference path:auto --sweep
     python compare.py scenes/cornell.xml --integrators coarse=lightcuts,fine=lightcuts \\
         --param coarse.error=0.02 --param fine.error=0.005 --spp 4 --reference vpl
@@ -46,7 +46,7 @@ except ModuleNotFoundError as missing:
 ROOT = Path(__file__).resolve().parent
 SWEEP_SEEDS = 3  # the fewest that say something about their spread
 DEMO = [
-    str(ROOT / "scenes" / "hall.xml"), "--integrators", "path,lightcuts", "--time", "30",
+    str(ROOT / "scenes" / "hall.xml"), "--integrators", "path,manylights", "--time", "30",
     "--reference", str(ROOT / "scenes" / "hall_reference.exr"),
 ]  # fmt: skip
 
@@ -58,9 +58,9 @@ def parse(arguments):
     )
     add = parser.add_argument
     add("scenes", nargs="*", metavar="SCENE", help="scene files (XML)")
-    add("-i", "--integrators", default="path,lightcuts", metavar="NAME,...",
-        help="integrators, each NAME or LABEL=NAME to have one twice (default: path,lightcuts); the others are "
-             "compared with the first")  # fmt: skip
+    add("-i", "--integrators", default="path,manylights", metavar="NAME,...",
+        help="integrators, each NAME or LABEL=NAME to have one twice (default: path,manylights); the others "
+             "are compared with the first")  # fmt: skip
     add("-p", "--param", action="append", type=parameter, default=[], metavar="LABEL.KEY=VALUE",
         help="parameter of an integrator, such as lightcuts.error=0.02; repeat for more")  # fmt: skip
     _add_effort(parser)
@@ -140,7 +140,7 @@ def _add_output(parser):
         help="a results.json: fail if a speed-up at equal error has fallen since, and say which")  # fmt: skip
     add("--check-share", type=_share, default=0.2, metavar="FRACTION",
         help="by how much a speed-up may fall (default: 0.2)")  # fmt: skip
-    add("--demo", action="store_true", help="path and lightcuts on scenes/hall.xml, in less than three minutes")
+    add("--demo", action="store_true", help="path and manylights on scenes/hall.xml, in less than three minutes")
 
 
 def _names(text):
@@ -183,9 +183,10 @@ def chosen_integrators(options):
 
 def _ask_for(aov, chosen):
     """Add an AOV to the parameters of those chosen integrators that know it; raises UsageError if none does."""
-    own = [choice for choice in chosen.values() if choice[0] in command_line.own_integrators()]
+    able = command_line.integrators_with_aovs()
+    own = [choice for choice in chosen.values() if choice[0] in able]
     if not own:
-        raise UsageError(f"--aovs: only {', '.join(command_line.own_integrators())} have AOVs")
+        raise UsageError(f"--aovs: only {', '.join(able)} have AOVs")
     refusals = [command_line.aov_refusal(name, aov) for name, _ in own]
     if all(refusals):
         raise UsageError(f"--aovs {aov}: {'; '.join(dict.fromkeys(refusals))}")

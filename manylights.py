@@ -1,7 +1,12 @@
 """Render a scene with any integrator, Mitsuba's or this project's: what the `mitsuba` command cannot do, as it finds no
 plugins written in Python. Options that both have mean the same.
 
+    manylights scenes/hall.xml --time 60 -o hall.exr
     manylights scenes/hall.xml --integrator lightcuts --param error=0.02 --spp 16 -o hall.exr
+
+Unless one is chosen, the integrator is `manylights`, in place of the scene's where that estimates the same image as
+`path`; a scene that names another integrator, such as one of this project's, keeps it. So does one that contains a
+participating medium. `-i scene` keeps the scene's integrator in any case.
 
 An image ends by itself: with --spp samples per pixel, after --time seconds, or when the relative standard error of 95%
 of the pixels is below --error, whichever comes first. It is rendered in passes of about two seconds, whose average is
@@ -33,6 +38,8 @@ from comparison.scene_files import SceneFile
 
 __all__ = ["Took", "main", "render"]
 CHECKPOINT_SECONDS = 10.0
+DEFAULT, OWN = "manylights", "scene"  # the integrator to render with, and what stands for the scene's own
+SAME_IMAGE = ("path", "prb", "volpath", "volpathmis")  # without participating media, all of them estimate what it does
 
 
 def parse(arguments):
@@ -45,7 +52,9 @@ def parse(arguments):
     add("-o", "--output", type=Path, metavar="FILE", help=".exr or .png (default: the scene's name, with .exr)")
     add("--sensor", type=int, default=0, metavar="INDEX", help="sensor to render with (default: 0)")
     add("-i", "--integrator", metavar="NAME",
-        help="replace the scene's integrator, keeping its max_depth, rr_depth and hide_emitters")  # fmt: skip
+        help="integrator that replaces the scene's, keeping its max_depth, rr_depth and hide_emitters; 'scene' is the "
+             "scene's own (default: manylights where the scene has path, or one that estimates the same, or none; "
+             "else the scene's own)")  # fmt: skip
     add("-p", "--param", action="append", type=parameter, default=[], metavar="KEY=VALUE",
         help="parameter of the integrator, such as error=0.02; repeat for more")  # fmt: skip
     add("--spp", type=positive(int), metavar="N",
@@ -71,26 +80,41 @@ def parse(arguments):
 
 
 def load(options):
-    """Return the scene and the name and parameters of its integrator; raises UsageError for what does not exist."""
+    """Return the scene, and which integrator it is rendered with, for metadata: its name, its parameters, and the name
+    of the one of the scene that it replaces by default (None if it does not). Raises UsageError for what does not
+    exist."""
     command_line.check_scene(options.scene)
     folder = options.output.absolute().parent
     if not folder.is_dir():
         raise UsageError(f"no folder '{folder}' for the output")
     command_line.set_variant(options.mode)
     file = SceneFile(options.scene, dict(options.define))
-    name = options.integrator or file.integrator[0]
-    if name is None:
-        raise UsageError(f"{options.scene} has no integrator; choose one with --integrator")
+    own, name = file.integrator[0], chosen_integrator(options.integrator, file)
     command_line.check_integrator(name)
-    if options.integrator:
+    if name != own or options.integrator == name:
         file.set_integrator(name, dict(options.param))
     elif options.param:
         file.set_integrator(name, dict(options.param), keep=None)
-    parameters = file.integrator[1]
+    replaced = None if options.integrator or name == own else own
+    described = {"integrator": name, "parameters": file.integrator[1], "replaced": replaced}
     scene = file.load(options.threads)
     if not 0 <= options.sensor < len(scene.sensors()):
         raise UsageError(f"no sensor {options.sensor}: the scene has {len(scene.sensors())}")
-    return scene, name, parameters
+    return scene, described
+
+
+def chosen_integrator(asked, file):
+    """Return the name of the integrator to render a `SceneFile` with. `asked`: what `--integrator` says, None without.
+    Raises UsageError where there is none."""
+    own = file.integrator[0]
+    if asked not in (None, OWN):
+        return asked
+    replaceable = own is None or (own in SAME_IMAGE and not file.has_media)
+    if asked is None and replaceable and command_line.is_supported(mi.variant()):
+        return DEFAULT
+    if own is None:
+        raise UsageError(f"{file.path} has no integrator; choose one with --integrator")
+    return own
 
 
 class Output:
@@ -145,13 +169,16 @@ def run(options):
     begin = time.perf_counter()
     if options.denoise:
         import_oidn()
-    scene, name, parameters = load(options)
+    scene, integrator = load(options)
     if options.verbose:
         mi.set_log_level(mi.LogLevel.Info)
+    name = integrator["integrator"]
+    if integrator["replaced"]:
+        name += f" in place of {integrator['replaced']}"
+        mi.Log(mi.LogLevel.Info, f"The integrator is {name}; with -i {OWN} it would be the scene's.")
     output = Output(options, {
         "scene": str(options.scene),
-        "integrator": name,
-        "parameters": parameters,
+        **integrator,
         "variant": options.mode,
         "seed": options.seed,
         "load_seconds": time.perf_counter() - begin,

@@ -88,6 +88,13 @@ def own_integrators():
     return integrators.PLUGINS
 
 
+def is_supported(variant):
+    """Return whether this project's integrators exist for a variant."""
+    import integrators
+
+    return variant in integrators.VARIANTS
+
+
 def check_integrator(name):
     """Raise UsageError, naming what exists, if there is no integrator of that name."""
     try:
@@ -136,6 +143,11 @@ def make_folder(path):
             pass
     except OSError as error:
         raise UsageError(f"cannot write to the folder '{path}': {error.strerror}") from None
+
+
+def integrators_with_aovs():
+    """Return the names of those of this project's integrators that have AOVs."""
+    return tuple(name for name in own_integrators() if not aov_refusal(name, ""))
 
 
 def aov_refusal(integrator, aov):

@@ -121,11 +121,12 @@ def _shown(planes, channels):
 def total_statistics(passes):
     """Add up the integrators' counters over passes; return {} if there are none.
 
-    Numbers are summed, nested dicts (such as "seconds") likewise; "lights" describes a set, so the last pass's stays.
+    Numbers are summed, nested dicts (such as "seconds") likewise. What describes a pass, as text (such as "balance")
+    and "lights" do, is that of the pass with the most samples, the last of these if there are several.
     """
     total = {}
-    for statistics in (one.statistics for one in passes):
-        _add(total, statistics)
+    for one in sorted(passes, key=lambda one: one.spp):
+        _add(total, one.statistics)
     return total
 
 

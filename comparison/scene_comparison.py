@@ -153,8 +153,9 @@ class SceneComparison:
 
     def _job(self, setting, seed):
         options, name = self.options, self.result["name"]
-        # Mitsuba's own integrators have no VPLs to share.
-        with_vpl = options.reference.kind == "vpl" and setting.integrator in own_integrators()
+        # Mitsuba's own integrators have no VPLs to share, nor has `manylights`, whose lights are others.
+        shares = setting.integrator in own_integrators() and setting.integrator != "manylights"
+        with_vpl = options.reference.kind == "vpl" and shares
         of_seed = f".seed{seed}" if len(options.seeds) > 1 else ""
         denoised = options.out / f"{name}.{setting.file_name}.denoised{of_seed}.exr"
         return worker.Job(

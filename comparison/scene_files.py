@@ -54,6 +54,11 @@ class SceneFile:
         plain = {key: value for key, value in values.items() if isinstance(value, bool | int | float | str)}
         return properties.plugin_name(), plain
 
+    @property
+    def has_media(self):
+        """Whether it contains participating media."""
+        return bool(self._nodes(mi.ObjectType.Medium))
+
     def set_integrator(self, name, parameters=None, keep=KEPT_PARAMETERS):
         """Replace the scene's integrator. Of the old one's parameters it keeps those named by `keep` (None: all),
         unless given anew, or unknown to the new one; but if all are kept for one of the same name, unknown ones are

@@ -27,7 +27,7 @@ DEFAULTS = {
 }
 # ... and, where nobody said anything, samples per pixel: every other value with each of these.
 DEFAULT_SAMPLES = (1, 4, 16)
-DEFAULT = ("spp", (4, 16, 64, 256))  # of all others, such as Mitsuba's own
+DEFAULT = ("spp", (4, 16, 64, 256))  # of all others: Mitsuba's own, and `manylights`, which chooses by itself
 
 
 @dataclass

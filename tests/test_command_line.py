@@ -50,17 +50,24 @@ def test_exr_file_says_how_it_was_made(tmp_path, capsys):
     assert run(CORNELL, *TINY, "-o", output, "--spp", 5, "--pass-spp", 2, "--seed", 3, "-p", "rr_depth=4") == 0
     image, _, metadata = images.read_exr(output)
     assert image.shape == (16, 16, 3) and image.mean() > 0
-    expected = {"integrator": "path", "seed": 3, "spp": 5, "passes": 3, "variant": "llvm_ad_rgb"}
+    expected = {
+        "integrator": "manylights",
+        "replaced": "path",
+        "seed": 3,
+        "spp": 5,
+        "passes": 3,
+        "variant": "llvm_ad_rgb",
+    }
     assert {key: metadata[key] for key in expected} == expected
     assert json.loads(metadata["parameters"]) == {"max_depth": 6, "rr_depth": 4}
     assert metadata["mitsuba"] == mi.__version__ and metadata["render_seconds"] > 0
     written = capsys.readouterr()
-    assert str(output) in written.out
+    assert str(output) in written.out and "manylights in place of path, 5 samples per pixel" in written.out
     assert written.err == ""  # no progress bar where nobody watches
 
 
 def test_one_pass_is_what_mitsuba_renders(tmp_path):
-    assert run(CORNELL, *TINY, "-o", tmp_path / "a.exr", "--spp", 4, "--seed", 9) == 0
+    assert run(CORNELL, *TINY, "-o", tmp_path / "a.exr", "--spp", 4, "--seed", 9, "-i", "scene") == 0
     expected = mi.render(mi.load_file(CORNELL, resx=16, resy=16), spp=4, seed=9).numpy()
     image = images.colour(*images.read_exr(tmp_path / "a.exr")[:2])
     np.testing.assert_allclose(image, expected, rtol=1e-5)
@@ -91,6 +98,78 @@ def test_integrator_is_replaced_and_its_channels_are_kept(tmp_path):
     assert json.loads(metadata["parameters"])["max_depth"] == 3
 
 
+def scene_with(tmp_path, integrator, more=""):
+    """A scene file of a lit sphere with that integrator (XML)."""
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>'
+        '<integer name="height" value="8"/></film></sensor><emitter type="constant"/><shape type="sphere">'
+        f'<transform name="to_world"><translate z="9"/></transform>{more}</shape>{integrator}</scene>'
+    )
+    return path
+
+
+DEEP = '<integer name="max_depth" value="7"/><integer name="rr_depth" value="3"/>'
+HIDDEN = '<boolean name="hide_emitters" value="true"/>'
+
+
+@pytest.mark.parametrize(
+    ("integrator", "arguments", "name", "parameters", "replaced"),
+    [
+        (f'<integrator type="path">{DEEP}{HIDDEN}</integrator>', [], "manylights",
+         {"max_depth": 7, "rr_depth": 3, "hide_emitters": True}, "path"),
+        (f'<integrator type="volpath">{DEEP}</integrator>', [], "manylights", {"max_depth": 7, "rr_depth": 3},
+         "volpath"),
+        ("", [], "manylights", {}, None),
+        ("", ["-p", "virtual_lights=false"], "manylights", {"virtual_lights": False}, None),
+        # Another image is wanted, or one of ours
+        ('<integrator type="direct"/>', [], "direct", {}, None),
+        ('<integrator type="vpl"><integer name="vpl_count" value="50"/></integrator>', [], "vpl", {"vpl_count": 50},
+         None),
+        # It was asked for
+        (f'<integrator type="path">{DEEP}</integrator>', ["-i", "scene", "-p", "max_depth=4"], "path",
+         {"max_depth": 4, "rr_depth": 3}, None),
+        (f'<integrator type="volpath">{DEEP}</integrator>', ["-i", "path"], "path", {"max_depth": 7, "rr_depth": 3},
+         None),
+        (f'<integrator type="direct">{HIDDEN}</integrator>', ["-i", "manylights"], "manylights",
+         {"hide_emitters": True}, None),
+    ],
+)  # fmt: skip
+def test_manylights_renders_what_path_would(tmp_path, capsys, integrator, arguments, name, parameters, replaced):
+    output = tmp_path / "a.exr"
+    assert run(scene_with(tmp_path, integrator), *arguments, "-o", output, "--spp", 1) == 0
+    metadata = images.read_exr(output)[2]
+    assert (metadata["integrator"], json.loads(metadata["parameters"])) == (name, parameters)
+    assert metadata["replaced"] == (replaced or "null")
+    assert ("in place of" in capsys.readouterr().out) == (replaced is not None)
+
+
+def test_media_and_variants_that_manylights_does_not_have_keep_the_scenes_integrator(tmp_path):
+    path = '<integrator type="volpath"/>'
+    fog = '<bsdf type="null"/><medium name="interior" type="homogeneous"/>'
+    assert run(scene_with(tmp_path, path, fog), "-o", tmp_path / "a.exr", "--spp", 1) == 0
+    assert images.read_exr(tmp_path / "a.exr")[2]["integrator"] == "volpath"
+    with process(scene_with(tmp_path, path), "-o", tmp_path / "b.exr", "--spp", 1, "-m", "scalar_rgb") as scalar:
+        assert scalar.wait(60) == 0, scalar.stderr.read()
+    assert images.read_exr(tmp_path / "b.exr")[2]["integrator"] == "volpath"
+
+
+def test_log_says_what_replaced_what(tmp_path):
+    with process(CORNELL, *TINY, "-o", tmp_path / "a.exr", "--spp", 1, "-v") as verbose:
+        said = "".join(verbose.communicate(timeout=60))
+    assert verbose.returncode == 0
+    assert "The integrator is manylights in place of path; with -i scene it would be the scene's." in said
+
+
+def test_exr_file_says_what_was_chosen(tmp_path):
+    """Samples are enough for virtual lights to pay."""
+    output = tmp_path / "a.exr"
+    assert run(CORNELL, "-D", "resx=64", "-D", "resy=64", "-o", output, "--spp", 128, "--pass-spp", 128) == 0
+    found = json.loads(images.read_exr(output)[2]["statistics"])
+    assert "of the noise is that of indirect light" in found["balance"]
+    assert found["light_paths"] > 0 and found["shadow_rays"] > 0 and found["seconds"]["cuts"] > 0
+
+
 def test_mono_variant(tmp_path):
     with process(CORNELL, *TINY, "-o", tmp_path / "a.exr", "--spp", 1, "-m", "llvm_ad_mono") as mono:
         assert mono.wait(60) == 0, mono.stderr.read()
@@ -110,8 +189,9 @@ def test_single_thread_does_not_hang(tmp_path):
         ([CORNELL, "-m", "bogus"], 2, "unknown variant 'bogus'; there are"),
         ([CORNELL, "-D", "bogus"], 2, "'bogus' is not of the form key=value"),
         ([CORNELL, "-D", "bogus=1"], 1, "$bogus=1"),
-        ([CORNELL, "-i", "nosuch"], 2, "unknown integrator 'nosuch'; there are vpl"),
+        ([CORNELL, "-i", "nosuch"], 2, "unknown integrator 'nosuch'; there are manylights, vpl"),
         ([CORNELL, "-i", "path", "-p", "bogus=1"], 1, '"bogus"'),
+        ([CORNELL, "-p", "bogus=1"], 1, 'manylights: unknown property "bogus"'),
         ([CORNELL, "-o", "nosuch/a.exr"], 2, "for the output"),
         ([CORNELL, "-o", "a.jpg"], 2, "must be an .exr or a .png"),
         ([CORNELL, "--sensor", "1"], 2, "no sensor 1: the scene has 1"),
@@ -121,7 +201,7 @@ def test_single_thread_does_not_hang(tmp_path):
         ([CORNELL, "--spp", "0"], 2, "'0' is not a positive whole number"),
         ([CORNELL, "--seed", "-1"], 2, "'-1' is not a whole number"),
         (["SENSORLESS"], 1, "no sensor"),
-        (["NO_INTEGRATOR"], 2, "has no integrator"),
+        (["NO_INTEGRATOR", "-i", "scene"], 2, "has no integrator"),
         (["BROKEN"], 1, "Parsing of XML file"),
     ],
 )

@@ -154,6 +154,16 @@ def test_statistics_add_up():
     assert statistics[0]["seconds"] == {"trace": 1.0}
 
 
+def test_what_describes_a_pass_is_that_of_the_largest():
+    statistics = [
+        {"balance": "too few samples", "share": 0.5},
+        {"balance": "glossy", "share": 0.25, "lights": {"surface": 7}},
+        {"balance": "too few samples"},
+    ]
+    passes = [rendering.Pass(0, spp, 1.0, one) for spp, one in zip((1, 8, 2), statistics, strict=True)]
+    assert rendering.total_statistics(passes) == {"balance": "glossy", "share": 0.75, "lights": {"surface": 7}}
+
+
 # --- Workers ---
 
 
@@ -297,6 +307,38 @@ def test_reference_by_vpl_shares_the_lights(tmp_path, capsys):
     assert 1e-3 < cuts["errors"]["relative_l1"] < 0.2
 
 
+def test_comparison_is_of_path_and_manylights_unless_others_are_named(tmp_path, capsys):
+    """And says what that chose; samples are enough for virtual lights to pay."""
+    status = compare.main([
+        CORNELL, "--spp", "128", "--width", "64", "--reference", "path:1024", "--cache", str(tmp_path / "cache"), "-o",
+        str(tmp_path),
+    ])  # fmt: skip
+    assert status == 0, capsys.readouterr().out
+    path, ours = json.loads((tmp_path / "results.json").read_text())["scenes"][0]["renders"]
+    assert (path["label"], ours["label"]) == ("path", "manylights")
+    assert (path["parameters"], ours["parameters"]) == ({"max_depth": 6}, {"max_depth": 6})
+    found = ours["statistics"]
+    assert "of the noise is that of indirect light" in found["balance"]
+    assert found["light_paths"] > 0 and found["shadow_rays"] > 0 and sum(found["lights"].values()) > 0
+    assert ours["rays_per_sample"] > 0 and ours["errors"]["relmse"] < path["errors"]["relmse"]
+    assert found["balance"] in html.unescape((tmp_path / "report.html").read_text())
+
+
+def test_manylights_shares_no_lights_with_vpl(tmp_path, capsys):
+    status = compare.main([
+        CORNELL, "-i", "manylights,vpl", "-p", "vpl.vpl_count=100", "--spp", "1", "--width", "16", "--reference", "vpl",
+        "-o", str(tmp_path),
+    ])  # fmt: skip
+    assert status == 0, capsys.readouterr().out
+    ours, vpl = json.loads((tmp_path / "results.json").read_text())["scenes"][0]["renders"]
+    assert "errors" not in ours and vpl["errors"]["relative_l1"] < 1e-4
+
+
+def test_demo_compares_path_and_manylights():
+    options = compare.parse(["--demo"])
+    assert (options.scenes, options.integrators) == ([HALL], "path,manylights")
+
+
 def test_aovs_are_asked_for_and_shown_on_one_scale(tmp_path, capsys):
     status = compare.main([
         CORNELL, "-i", "path,few=vpl,many=vpl", "-p", "few.vpl_count=100", "-p", "many.vpl_count=900", "--spp",
@@ -336,18 +378,28 @@ def test_aovs_that_not_all_know_are_asked_of_those_that_do(monkeypatch):
         ([CORNELL, CORNELL], "would have files of the same name, 'cornell'"),
         ([CORNELL, "-i", "nosuch"], "unknown integrator 'nosuch'; there are"),
         ([CORNELL, "-i", "path,path"], "'path' is no name of its own"),
-        ([CORNELL, "-p", "vpl.error=1"], "LABEL is path or lightcuts"),
-        ([CORNELL, "--aovs", "shadow_rays,bogus"], 'a comma-separated list out of "shadow_rays", "upper_bounds"'),
-        ([CORNELL, "-i", "path", "--aovs", "cut_size"], "have AOVs"),
+        ([CORNELL, "-p", "vpl.error=1"], "LABEL is path or manylights"),
+        (
+            [CORNELL, "-i", "path,lightcuts", "--aovs", "shadow_rays,bogus"],
+            'a comma-separated list out of "shadow_rays", "upper_bounds"',
+        ),
+        ([CORNELL, "--aovs", "cut_size"], "only vpl, lightcuts, "),
         ([CORNELL, "-i", ""], "'' is no name of its own"),
         ([CORNELL, "-i", "path,reference=vpl"], "'reference=vpl' is no name of its own"),
         ([CORNELL, HALL, "-r", HALL_REFERENCE], "is of one scene; for several give a folder"),
-        ([CORNELL, "-p", "lightcuts.bogus=1"], 'lightcuts: unknown property "bogus"; there are "error", "dark_floor"'),
-        ([CORNELL, "-p", "lightcuts.error=-1"], 'property "error" must be a number of at least 0, got -1'),
+        (
+            [CORNELL, "-i", "lightcuts", "-p", "lightcuts.bogus=1"],
+            'lightcuts: unknown property "bogus"; there are "error", "dark_floor"',
+        ),
+        ([CORNELL, "-p", "manylights.bogus=1"], 'manylights: unknown property "bogus"; there are "virtual_lights"'),
+        (
+            [CORNELL, "-i", "lightcuts", "-p", "lightcuts.error=-1"],
+            'property "error" must be a number of at least 0, got -1',
+        ),
         ([CORNELL, "-r", "path:many"], "not of the form path:SPP"),
         ([CORNELL, "-r", "path:auto:2"], "'2' is not a fraction"),
         ([CORNELL, "--sweep", "lightcuts:error"], "not of the form LABEL:KEY=VALUE"),
-        ([CORNELL, "--sweep", "vpl:error=1"], "no such label; there are path, lightcuts"),
+        ([CORNELL, "--sweep", "vpl:error=1"], "no such label; there are path, manylights"),
         ([CORNELL, "--sweep", "path:spp=0"], "spp: '0' is not a positive whole number"),
         ([CORNELL, "--sweep", "path:bogus=1,2"], "path bogus=1: the integrator 'path' has no parameter 'bogus'"),
         ([CORNELL, "--sweep", "-o", "/dev/null/a"], "cannot write to the folder '/dev/null/a': Not a directory"),

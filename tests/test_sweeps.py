@@ -86,7 +86,8 @@ def test_default_sweeps_are_over_samples_too():
 
 
 def test_default_sweeps_are_of_parameters_that_exist():
-    assert set(sweeps.DEFAULTS) == set(command_line.own_integrators())
+    assert {*sweeps.DEFAULTS, "manylights"} == set(command_line.own_integrators())
+    assert sweeps.default_grid("manylights", True) == sweeps.default_grid("path", True)
     for name, (key, values) in sweeps.DEFAULTS.items():
         for value in values:
             command_line.check_parameters(name, name, {key: value})
