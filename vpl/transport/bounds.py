@@ -77,7 +77,7 @@ def contribution_bound(kind: str, receiver: Receiver, node: Node, smallest_dista
     reflected = channel_mean(_material_bound(proxy, cosine, mirror) * node.intensity)
     if kind == "surface":
         # G / (1 + c² G) grows with the geometry term G
-        factor = dr.rcp(1 + dr.rcp(factor * cosine) / dr.square(smallest_distance)) / dr.square(smallest_distance)
+        factor = dr.rcp(dr.rcp(factor * cosine) + dr.square(smallest_distance))
         reflected = channel_mean(proxy.base * node.intensity) & (cosine > 0)
     # A point inside a flat box has an infinite factor and no cosine: that is nothing, not NaN
     return dr.select(reflected > 0, factor * reflected, 0)
