@@ -179,7 +179,8 @@ def denoised(names, width: int, seconds: float, passes: int) -> None:
             f"{name:16s} path {theirs:.5f} ({their_time:.2f} s) manylights {ours:.5f} ({our_time:.2f} s) {ratio:7.2f}",
             flush=True,
         )
-    print(f"geometric mean {scenes.geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
+    if ratios:
+        print(f"geometric mean {scenes.geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
 
 
 def cold(names, width: int) -> None:

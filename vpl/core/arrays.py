@@ -38,6 +38,11 @@ def upload(array_type, values):
     return array_type(result)
 
 
+def upload_vectors(vector_type, rows):
+    """Copy rows (n, k) of NumPy to vectors of k entries, such as ``mi.Point3f``, as :func:`upload` does."""
+    return vector_type(*(upload(mi.Float, column) for column in rows.T))
+
+
 def download(values):
     """Copy a Dr.Jit array to NumPy: ``(n,)`` for flat types, ``(n, k)`` for vectors of k entries."""
     dr.eval(values)

@@ -110,7 +110,7 @@ def _leaf_ranges(tree: LightTree) -> np.ndarray:
     return np.stack([leaves_before[node], leaves_before[tree.escape]], axis=1)
 
 
-def _largest_below(tree: LightTree, values: np.ndarray) -> np.ndarray:
+def largest_below(tree: LightTree, values: np.ndarray) -> np.ndarray:
     """For every node, the largest of a value over its lights: (2n - 1,) from (n,) in the lights' own order."""
     in_order = np.append(values[tree.leaf_order], -np.inf)
     return np.maximum.reduceat(in_order, _leaf_ranges(tree).reshape(-1))[::2]
@@ -136,7 +136,7 @@ def light_tree(lights: VirtualLights, seed: int) -> DeviceTree:
     tree = build_light_tree(lights.position, direction, lights.intensity, generator)
     if lights.kind == "spot":
         half_angle = np.arccos(np.clip(tree.records[:, CONE_COS].astype(np.float64), -1, 1))
-        half_angle += _largest_below(tree, lights.cone[:, 0])
+        half_angle += largest_below(tree, lights.cone[:, 0])
         tree.records[:, CONE_COS] = np.maximum(np.cos(np.minimum(half_angle, np.pi)) - COSINE_ROUNDING, -1)
     second = _second_representatives(tree, lights.intensity.mean(1), generator)
     return DeviceTree(lights.kind, tree, second)

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import upload
+from ..lights.light_set import largest_below
 from ..lights.light_tree import BOX_MAX, BOX_MIN, INTENSITY, build_light_tree
 
 _RECORD = 8
@@ -28,13 +29,8 @@ class EmitterTree:
         records = np.zeros((len(tree.records), _RECORD), np.float32)
         records[:, 0:3] = 0.5 * (low + high)
         # Emitters reach beyond their places: no distance is below half the size of what a node holds
-        of_leaf = np.zeros(len(tree.records))
+        records[:, 3] = (0.5 * np.linalg.norm(high - low, axis=1) + largest_below(tree, radius)) ** 2
         leaf = tree.escape == np.arange(len(tree.records)) + 1
-        of_leaf[leaf] = radius[tree.representative[leaf]]
-        largest = np.maximum.reduceat(
-            np.append(of_leaf, 0), np.stack([np.arange(len(leaf)), tree.escape], 1).reshape(-1)
-        )
-        records[:, 3] = (0.5 * np.linalg.norm(high - low, axis=1) + largest[::2]) ** 2
         records[:, 4] = tree.records[:, INTENSITY]
         records[:, 5] = tree.escape.astype(np.uint32).view(np.float32)
         records[:, 6] = tree.representative.astype(np.uint32).view(np.float32)

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import add_at, channel_mean, download, upload
+from ..core.arrays import add_at, channel_mean, download, upload, upload_vectors
 from ..core.sampling import derived_seed, find_interval, independent_sampler, running_sums
 from ..cuts.light_cuts import collect_cuts, limited_cuts, upload_thresholds
 from ..points.bsdf_proxies import MaterialProxy
@@ -37,7 +37,7 @@ class Receivers:
         white, no = mi.Color3f(*(dr.opaque(mi.Float, 1.0, count) for _ in range(3))), mi.Bool(False)
         proxy = MaterialProxy(white, None, None, None, no, no, False, False)
         center, extent, axis = (
-            _upload_columns(kind, x) for kind, x in ((mi.Point3f, center), (mi.Vector3f, extent), (mi.Vector3f, axis))
+            upload_vectors(kind, x) for kind, x in ((mi.Point3f, center), (mi.Vector3f, extent), (mi.Vector3f, axis))
         )
         return cls(Receiver(center, axis, proxy, extent, upload(mi.Float, cosine)))
 
@@ -57,10 +57,6 @@ class Receivers:
         return Receivers(
             Receiver(position, normal, MaterialProxy(base, None, None, None, no, no, False, False), extent, cosine)
         )
-
-
-def _upload_columns(kind, columns):
-    return kind(*(upload(mi.Float, columns[:, k]) for k in range(3)))
 
 
 class PixelClusters:

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import download, ones, spectrum_to_rgb, upload
+from ..core.arrays import download, ones, spectrum_to_rgb, upload, upload_vectors
 from ..core.sampling import derived_seed, independent_sampler
 from ..direct.emitter_sampling import power_heuristic
 from ..lights.emission import bounding_box
@@ -90,9 +90,7 @@ def _lights_along(scene, emission, lines: Lines, limits: Limits, seed: int) -> V
 
 def _rays_to_surfaces(scene, lines: Lines):
     """Rays, one for every surface that a line meets, that begin shortly before it."""
-    origin, direction = (
-        mi.Point3f(*(upload(mi.Float, x[:, k]) for k in range(3))) for x in (lines.origin, lines.direction)
-    )
+    origin, direction = (upload_vectors(mi.Point3f, x) for x in (lines.origin, lines.direction))
     length, found = upload(mi.Float, lines.length), []
     for _ in range(_MOST_LAYERS):
         ray = mi.Ray3f(origin, mi.Vector3f(direction), length, 0.0, [])
@@ -110,8 +108,7 @@ def _rays_to_surfaces(scene, lines: Lines):
     if not found:
         return dr.zeros(mi.Ray3f, 0)
     origin, direction = (np.concatenate(columns) for columns in zip(*found, strict=True))
-    ray = mi.Ray3f(*(mi.Point3f(*(upload(mi.Float, x[:, k]) for k in range(3))) for x in (origin, direction)))
-    return ray
+    return mi.Ray3f(upload_vectors(mi.Point3f, origin), upload_vectors(mi.Vector3f, direction))
 
 
 def _floors(scene, perturbed, rays):
