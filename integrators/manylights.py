@@ -12,9 +12,9 @@ from vpl.core.arrays import channel_mean, download, upload
 from vpl.core.sampling import derived_seed, independent_sampler
 from vpl.core.stages import Stage
 from vpl.lights.light_set import LightSet, ScatteredGroup
+from vpl.lights.perturbed import Perturbed
 from vpl.points.camera_paths import SceneTraits, refuse_media
 from vpl.split.balance import Balance, balance, without_lights
-from vpl.split.floors import Perturbed
 from vpl.split.next_event import emitters_of
 from vpl.split.numbers import spread_numbers
 from vpl.split.pilot import Pilot

@@ -12,11 +12,12 @@ from scipy import stats
 
 from vpl.core.arrays import upload
 from vpl.lights.light_set import ScatteredGroup
+from vpl.lights.perturbed import Perturbed
 from vpl.lights.virtual_lights import DeviceLights, VirtualLights
 from vpl.points.surfaces import LambertianSurface
 from vpl.split.balance import balance
 from vpl.split.cells import Cells
-from vpl.split.floors import Perturbed, agrees, carried_share, floor_of, side_of
+from vpl.split.floors import agrees, carried_share, floor_of, side_of
 from vpl.split.numbers import spread_numbers
 from vpl.split.pixel_clusters import PixelClusters, Receivers
 from vpl.split.remainder import GatherVertices, power_heuristic

@@ -91,9 +91,12 @@ def ones(count: int):
 
 
 def select_record(mask, chosen, otherwise):
-    """``dr.select`` for the fields of a dataclass."""
+    """``dr.select`` for the fields of a dataclass; those that are None stay so."""
     return type(otherwise)(
-        **{name: dr.select(mask, getattr(chosen, name), value) for name, value in vars(otherwise).items()}
+        **{
+            name: None if value is None else dr.select(mask, getattr(chosen, name), value)
+            for name, value in vars(otherwise).items()
+        }
     )
 
 

@@ -7,6 +7,7 @@ How data flows, which is also the order to read in::
 
 - ``emitters``: a scene's emitters as rows of arrays (``Emitters``), so that no kernel calls emitter objects
 - ``emission``: rays that leave them, group by group
+- ``perturbed``: surfaces with bump or normal maps, and how they scatter light paths
 - ``tracing``: light paths; a virtual light at every diffuse bounce (instant radiosity)
 - ``virtual_lights``: ``VirtualLights`` as NumPy arrays, ``DeviceLights`` as kernels fetch them, and ``geometry``: how
   their light arrives at a place

@@ -67,6 +67,9 @@ def bounding_sphere(scene):
 class OmniEmission:
     """Rays from point and spot emitters."""
 
+    # Whether no ray that is scattered by chance ever meets these emitters, so that only next-event estimation does
+    delta = True
+
     def __init__(self, points: VirtualLights, spots: VirtualLights):
         lights = VirtualLights.concatenate([points, spots])
         solid_angle = 2 * np.pi * (1 - np.cos(lights.cone[:, 0].astype(np.float64)))
@@ -94,6 +97,8 @@ class OmniEmission:
 class AreaEmission:
     """Rays from area emitters: a point by area, a direction by the cosine."""
 
+    delta = False
+
     def __init__(self, area):
         self._area = area
         self.power = area.power
@@ -120,6 +125,8 @@ def _ray_through_sphere(sphere, direction, sample):
 class DirectionalEmission:
     """Parallel rays through the scene's bounding sphere."""
 
+    delta = True
+
     def __init__(self, suns: VirtualLights, sphere):
         self._sphere = sphere
         self.power = suns.intensity.mean(1, dtype=np.float64) * np.pi * float(sphere.radius) ** 2
@@ -143,6 +150,8 @@ class EnvironmentEmission:
     the scene shows to them, and several times too much light enters by windows.
     """
 
+    delta = False
+
     def __init__(self, environment, sphere):
         self._environment, self._sphere = environment, sphere
         self.power = np.array([other_power(environment, sphere)])
@@ -161,6 +170,7 @@ class OtherEmission:
 
     def __init__(self, emitter, sphere):
         self._emitter = emitter
+        self.delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
         self.power = np.array([other_power(emitter, sphere)])
 
     def sample(self, stratified, position_sample, direction_sample):

@@ -17,10 +17,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import download, even_chunks, ones, spectrum_to_rgb
+from ..core.arrays import download, even_chunks, ones, select_record, spectrum_to_rgb
 from ..core.sampling import derived_seed, independent_sampler, stratified
 from .emission import emission_groups
 from .emitters import Emitters
+from .perturbed import Perturbed, Scattered, scatter_perturbed
 from .virtual_lights import VirtualLights
 
 _PILOT_PATHS = 4096
@@ -51,13 +52,17 @@ class TracedLights:
     dropped: int
 
 
-def _bounce(scene, sampler, ray, throughput, power, depth, limits: PathLimits):
-    """One edge of all paths, in one kernel that is the same at every depth.
+@dataclass(frozen=True)
+class _Walk:
+    """What all light paths of a render have in common; ``perturbed``: the shapes with bump or normal maps."""
 
-    ``throughput`` starts at 1 and ``power`` stays what the emitter gave: Russian roulette sees relative values only.
-    Returns (stored mask, position, normal, flux / pi), (alive mask, origin, direction, throughput), all evaluated.
-    """
-    si = scene.ray_intersect(ray)
+    scene: object
+    perturbed: Perturbed
+    limits: PathLimits
+
+
+def _scatter(si, sampler, throughput, limits: PathLimits) -> Scattered:
+    """Scatter light paths by the sampling of the BSDF; surfaces with bump or normal maps are not meant here."""
     context = mi.BSDFContext(mi.TransportMode.Importance)
     sample, weight = si.bsdf().sample(context, si, sampler.next_1d(), sampler.next_2d(), si.is_valid())
     direction = si.to_world(sample.wo)
@@ -68,29 +73,55 @@ def _bounce(scene, sampler, ray, throughput, power, depth, limits: PathLimits):
     valid = si.is_valid() & (in_geometric * in_shading > 0) & (out_geometric * out_shading > 0)
     leaving = throughput * mi.unpolarized_spectrum(weight) * dr.abs(in_shading / in_geometric)
     valid &= dr.any(leaving > 0)
-    bad = valid & ~dr.all(dr.isfinite(leaving))
-    valid &= ~bad
 
     # ---- A light where the sampled lobe was diffuse, on the side to which it scatters
     broad = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Glossy) & (sample.pdf <= limits.lobe_limit)
     stored = valid & (mi.has_flag(sample.sampled_type, mi.BSDFFlags.Diffuse) | broad)
     normal = si.n * dr.sign(out_geometric)
+    following = leaving * dr.abs(out_geometric / out_shading)
+    delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    return Scattered(stored, leaving, normal, normal, valid, direction, following, delta)
+
+
+def _bounce(walk: _Walk, sampler, ray, throughput, power, depth, refuses_delta):
+    """One edge of all paths, in one kernel that is the same at every depth.
+
+    ``throughput`` starts at 1 and ``power`` stays what the emitter gave: Russian roulette sees relative values only.
+    ``refuses_delta``: whether paths end where they are scattered by a lobe without an extent.  Returns (stored mask,
+    position, normal, flux / pi, facing), (alive mask, origin, direction, throughput), all evaluated.
+    """
+    limits = walk.limits
+    si = walk.scene.ray_intersect(ray)
+    scattered = _scatter(si, sampler, throughput, limits)
+    if walk.perturbed.exist:
+        here = si.is_valid() & walk.perturbed.at(si, si.is_valid())
+        turned = scatter_perturbed(si, sampler, throughput, limits.lobe_limit, here)
+        scattered = select_record(here, turned, scattered)
+    leaving, following = scattered.leaving, scattered.following
+    bad = scattered.stored & ~dr.all(dr.isfinite(leaving)) | scattered.goes_on & ~dr.all(dr.isfinite(following))
+    stored = scattered.stored & ~bad
     intensity = spectrum_to_rgb(leaving * power) * dr.inv_pi
 
     # ---- Russian roulette, as in ``path``
-    following = leaving * dr.abs(out_geometric / out_shading)
     survival = dr.minimum(dr.max(following), 0.95)
-    alive = valid & ((depth < limits.rr_depth) | (sampler.next_1d() < survival))
+    alive = scattered.goes_on & ~bad & ~(scattered.delta & refuses_delta)
+    alive &= (depth < limits.rr_depth) | (sampler.next_1d() < survival)
     following = dr.select(depth < limits.rr_depth, following, following / survival)
 
-    next_ray = si.spawn_ray(direction)
+    next_ray = si.spawn_ray(scattered.direction)
+    light = (stored, si.p, scattered.normal, intensity, scattered.facing)
+    onward = (alive, next_ray.o, next_ray.d, following)
     # One kernel for everything; a count before would be a kernel of its own that does all the work twice
-    dr.eval(stored, si.p, normal, intensity, alive, next_ray.o, next_ray.d, following, bad)
-    return (stored, si.p, normal, intensity), (alive, next_ray.o, next_ray.d, following), int(dr.count(bad)[0])
+    dr.eval(light, onward, bad)
+    return light, onward, int(dr.count(bad)[0])
 
 
-def _paths_of_group(scene, group, first: int, count: int, total: int, seed: int, limits: PathLimits):
-    """Trace the paths first .. first + count - 1 of the ``total`` that a group of emitters gets."""
+def _paths_of_group(walk: _Walk, group, first: int, count: int, total: int, seed: int):
+    """Trace the paths first .. first + count - 1 of the ``total`` that a group of emitters gets.
+
+    Mirrors, glass and masks end paths that come straight from a point or from one direction: no path that Mitsuba's
+    ``path`` counts passes there.
+    """
     sampler = independent_sampler(derived_seed(seed, 0), count)
     chosen = stratified(sampler, count, first, total)
     ray, power = group.sample(chosen, sampler.next_2d(), sampler.next_2d())
@@ -98,16 +129,19 @@ def _paths_of_group(scene, group, first: int, count: int, total: int, seed: int,
     origin, direction, throughput = ray.o, ray.d, ones(count)
 
     parts, dropped, depth = [], 0, 1
-    while count > 0 and depth <= limits.deepest:
+    while count > 0 and depth <= walk.limits.deepest:
         sampler.seed(derived_seed(seed, depth), count)
         dr.make_opaque(origin, direction, throughput, power)  # or each depth would have a kernel of its own
         ray = mi.Ray3f(origin, direction)
-        stored, alive, bad = _bounce(scene, sampler, ray, throughput, power, dr.opaque(mi.UInt32, depth), limits)
+        refuses_delta = dr.opaque(mi.Bool, group.delta and depth == 1)
+        edges = dr.opaque(mi.UInt32, depth)
+        stored, alive, bad = _bounce(walk, sampler, ray, throughput, power, edges, refuses_delta)
         dropped += bad
         kept = dr.compress(stored[0])
         if len(kept):
-            columns = [download(dr.gather(type(column), column, kept)) for column in stored[1:]]
-            parts.append(VirtualLights.of("oriented", *columns, depth))
+            *columns, facing = (download(dr.gather(type(column), column, kept)) for column in stored[1:])
+            facing = facing if walk.perturbed.exist else None
+            parts.append(VirtualLights.of("oriented", *columns, depth, facing=facing))
         going = dr.compress(alive[0])
         count, depth = len(going), depth + 1
         origin, direction, throughput = (dr.gather(type(column), column, going) for column in alive[1:])
@@ -115,18 +149,18 @@ def _paths_of_group(scene, group, first: int, count: int, total: int, seed: int,
     return parts, dropped
 
 
-def _trace_group(scene, group, number: int, paths: int, seed: int, limits: PathLimits):
+def _trace_group(walk: _Walk, group, number: int, paths: int, seed: int):
     """Trace all ``paths`` of a group in bounded wavefronts."""
     parts, dropped = [VirtualLights.of("oriented", [], [], [])], 0
     for first, last in even_chunks(paths, most=_LARGEST_WAVEFRONT):
         stream = derived_seed(seed, number, first)
-        new_parts, bad = _paths_of_group(scene, group, first, last - first, paths, stream, limits)
+        new_parts, bad = _paths_of_group(walk, group, first, last - first, paths, stream)
         parts += new_parts
         dropped += bad
     return VirtualLights.concatenate(parts), dropped
 
 
-def _shares(scene, groups, count: int, seed: int, limits: PathLimits) -> list[int]:
+def _shares(walk: _Walk, groups, count: int, seed: int) -> list[int]:
     """Numbers of paths that each group gets, from a pilot whose lights are thrown away.
 
     Lights are wanted where flux arrives: an environment emitter around a closed building has nearly all the power
@@ -135,7 +169,7 @@ def _shares(scene, groups, count: int, seed: int, limits: PathLimits) -> list[in
     """
     flux, lights_per_path = np.zeros(len(groups)), np.zeros(len(groups))
     for number, group in enumerate(groups):
-        lights, _ = _trace_group(scene, group, number, _PILOT_PATHS, derived_seed(seed, 1), limits)
+        lights, _ = _trace_group(walk, group, number, _PILOT_PATHS, derived_seed(seed, 1))
         lights, _ = lights.without_bad()
         flux[number] = lights.intensity.sum(dtype=np.float64)
         lights_per_path[number] = lights.count / _PILOT_PATHS
@@ -157,10 +191,11 @@ def trace_lights(scene, emitters: Emitters, count: int, seed: int, limits: PathL
     traced = TracedLights(VirtualLights.of("oriented", [], [], []), 0, 0)
     if not groups or limits.deepest < 1:
         return traced
-    shares = _shares(scene, groups, count, seed, limits)
+    walk = _Walk(scene, Perturbed(scene), limits)
+    shares = _shares(walk, groups, count, seed)
     parts = [traced.lights]
     for number, (group, paths) in enumerate(zip(groups, shares, strict=True)):
-        lights, dropped = _trace_group(scene, group, number, paths, derived_seed(seed, 2), limits)
+        lights, dropped = _trace_group(walk, group, number, paths, derived_seed(seed, 2))
         parts.append(lights)
         traced.dropped += dropped
         traced.paths += paths

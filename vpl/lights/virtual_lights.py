@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -32,7 +32,8 @@ class VirtualLights:
     radiance times area), irradiance of lights at infinity;
     ``depth`` (n,) uint32: edges of the light path that ends in the light, 0 for lights that stand for an emitter;
     ``cone`` (n, 2) float32: cut-off angle and beam angle of spots in radians, (pi, pi) elsewhere;
-    ``facing`` (n, 3) float32: of surface lights, the shading normal, to whose side they shine (None elsewhere).
+    ``facing`` (n, 3) float32: of lights on surfaces, the vector to whose side alone they shine, such as a shading
+    normal (None: they shine wherever ``direction`` lets them).
     """
 
     kind: str
@@ -48,7 +49,7 @@ class VirtualLights:
         return len(self.intensity)
 
     @classmethod
-    def of(cls, kind, position, direction, intensity, depth=0, cone=None) -> VirtualLights:
+    def of(cls, kind, position, direction, intensity, depth=0, cone=None, facing=None) -> VirtualLights:
         """Convert any sequences to the documented shapes and types."""
         intensity = np.asarray(intensity, np.float32).reshape(-1, 3)
         count = len(intensity)
@@ -59,6 +60,7 @@ class VirtualLights:
             intensity,
             np.broadcast_to(np.asarray(depth, np.uint32), (count,)).copy(),
             np.full((count, 2), np.pi, np.float32) if cone is None else np.asarray(cone, np.float32).reshape(-1, 2),
+            None if facing is None else np.asarray(facing, np.float32).reshape(-1, 3),
         )
 
     def select(self, keep) -> VirtualLights:
@@ -69,6 +71,8 @@ class VirtualLights:
     @staticmethod
     def concatenate(parts: list[VirtualLights]) -> VirtualLights:
         """Join lights of the same kind."""
+        if any(part.facing is not None for part in parts):
+            parts = [part if part.facing is not None else replace(part, facing=part.direction) for part in parts]
         joined = [
             None if getattr(parts[0], c) is None else np.concatenate([getattr(p, c) for p in parts]) for c in _COLUMNS
         ]
@@ -110,6 +114,7 @@ class DeviceLights:
         if lights.facing is not None:
             records[:, 12:15] = lights.facing
         self.kind = lights.kind
+        self._facing = lights.facing is not None
         self.count = lights.count
         self.scalar_intensity = lights.intensity.mean(1, dtype=np.float64)
         self._records = upload(mi.Float, records)
@@ -120,9 +125,9 @@ class DeviceLights:
         second = dr.gather(mi.Vector4f, self._records, index * 4 + 1, active)
         third = dr.gather(mi.Vector4f, self._records, index * 4 + 2, active)
         cone, facing = mi.Vector2f(0), None
-        if self.kind in ("spot", "surface"):
+        if self.kind == "spot" or self._facing:
             fourth = dr.gather(mi.Vector4f, self._records, index * 4 + 3, active)
-            cone, facing = mi.Vector2f(fourth.x, fourth.y), fourth.xyz
+            cone, facing = mi.Vector2f(fourth.x, fourth.y), fourth.xyz if self._facing else None
         depth = dr.reinterpret_array(mi.UInt32, first.w)
         return Light(first.xyz, second.xyz, mi.Color3f(third.x, third.y, third.z), depth, cone, facing)
 
@@ -142,8 +147,8 @@ def geometry(kind: str, position, light: Light, smallest_distance):
 
     Returns (unit vector from ``position`` to the light, factor).  The factor is 1/d² for points, times the falloff for
     spots, cos/d² with d not smaller than ``smallest_distance`` for oriented lights ([IC] section 5: clamping), cos/d²
-    for surface lights, and 1 for lights at infinity.  A light exactly at ``position`` has no direction: its factor is
-    0.
+    for surface lights, and 1 for lights at infinity.  It is 0 where a light does not face ``position``, and for one
+    exactly there, which has no direction.
     """
     if kind in AT_INFINITY:
         return -light.direction, mi.Float(1)
@@ -156,9 +161,10 @@ def geometry(kind: str, position, light: Light, smallest_distance):
         factor = cosine / dr.maximum(distance2, dr.square(smallest_distance))
     elif kind == "surface":
         cosine = dr.maximum(-dr.dot(light.direction, to_light), 0)
-        factor = dr.select(dr.dot(light.facing, to_light) < 0, cosine / distance2, 0)
+        factor = cosine / distance2
     else:
         factor = dr.rcp(distance2)
         if kind == "spot":
             factor *= spot_falloff(-dr.dot(light.direction, to_light), light.cone)
-    return to_light, dr.select(apart, factor, 0)
+    arrives = apart if light.facing is None else apart & (dr.dot(light.facing, to_light) < 0)
+    return to_light, dr.select(arrives, factor, 0)

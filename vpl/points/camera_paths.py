@@ -17,6 +17,7 @@ from ..core.arrays import channel_mean, download, finite_or_zero, ones, upload, 
 from ..core.morton import morton_order
 from ..core.sampling import derived_seed, independent_sampler
 from ..lights.emitters import Emitters, registered_shapes
+from ..lights.perturbed import perturbed_shapes
 
 # Neither side of a choice between a delta and a smooth lobe gets less than this unless it carries nothing.
 _LEAST_PROBABILITY = 0.05
@@ -91,11 +92,9 @@ class CameraPaths:
 
 def scene_traits(scene) -> SceneTraits:
     """Union of the flags of all BSDFs; scenes with instances are taken to have all of them."""
-    flags, perturbed, open_shapes, instances = 0, [], {}, False
+    flags, open_shapes, instances = 0, {}, False
     for index, shape in registered_shapes(scene):
         bsdf = shape.bsdf()
-        if any(name in str(bsdf) for name in ("BumpMap[", "NormalMap[")):
-            perturbed.append(index)
         if bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null):
             open_shapes[index] = shape
         flags |= int(bsdf.flags()) if bsdf is not None else ~0
@@ -109,9 +108,9 @@ def scene_traits(scene) -> SceneTraits:
     transmissive = have(int(kinds.DiffuseTransmission) | int(kinds.GlossyTransmission))
     lobes = (have(kind) for kind in (kinds.Delta, kinds.Null, kinds.Smooth, kinds.Glossy))
     if instances or not open_shapes:
-        return SceneTraits(*lobes, transmissive, tuple(perturbed), None if instances else (), None)
+        return SceneTraits(*lobes, transmissive, perturbed_shapes(scene), None if instances else (), None)
     open_scene = mi.load_dict({"type": "scene", **{f"open_{index}": shape for index, shape in open_shapes.items()}})
-    return SceneTraits(*lobes, transmissive, tuple(perturbed), tuple(open_shapes), open_scene)
+    return SceneTraits(*lobes, transmissive, perturbed_shapes(scene), tuple(open_shapes), open_scene)
 
 
 def refuse_media(scene) -> None:

@@ -16,8 +16,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import finite_or_zero, upload
-from ..lights.emitters import registered_shapes
+from ..core.arrays import finite_or_zero
+from ..lights.perturbed import Perturbed
 
 # The pairs of directions at which a BSDF is looked at: unit vectors well away from the horizon, of which no pair is
 # near a mirror direction.  The last looks back along itself at 60 degrees: where a texture leaves but the rough metal
@@ -26,8 +26,6 @@ _DIRECTIONS = [
     np.array(d) / np.linalg.norm(d) for d in ((0, 0, 1), (0.6, 0, 0.8), (-0.35, 0.75, 0.5612), (-0.55, 0.67, 0.5))
 ]
 _PAIRS = ((0, 1), (1, 2), (2, 3))
-# Materials that turn the shading normal, as Mitsuba prints them
-_MAPS = ("BumpMap[", "NormalMap[")
 
 
 def side_of(si):
@@ -41,39 +39,13 @@ def agrees(si, side):
     return si.wi.z * side > 0
 
 
-class Perturbed:
-    """Shapes whose material shades with a normal of its own (bump and normal maps), which have no floor.
-
-    Light from directions above the surface but below that normal would be carried, and never taken off: no sample of
-    the BSDF goes there.  ``everywhere``: whether there are some that cannot be told from others, in shape groups.
-    """
-
-    def __init__(self, scene):
-        shapes = [
-            (index, any(name in str(shape.bsdf()) for name in _MAPS)) for index, shape in registered_shapes(scene)
-        ]
-        groups = (shape for shape in scene.shapes() if shape.class_name() in ("Instance", "ShapeGroup"))
-        self.everywhere = any(name in str(shape) for shape in groups for name in _MAPS)
-        self._table = None
-        if any(perturbed for _, perturbed in shapes):
-            table = np.zeros(max(index for index, _ in shapes) + 1, np.uint32)
-            table[[index for index, perturbed in shapes if perturbed]] = 1
-            self._table = upload(mi.UInt32, table)
-
-    def at(self, si, active):
-        """Whether ``si`` lies on one of them."""
-        if self._table is None:
-            return mi.Bool(False)
-        index = dr.reinterpret_array(mi.UInt32, si.shape)
-        known = active & (index < dr.width(self._table))
-        return dr.gather(mi.UInt32, self._table, index, known) == 1
-
-
 def floor_of(si, bsdf, side, perturbed: Perturbed, active):
     """The floor F of a BSDF: its least value over three fixed pairs of directions on one side, an unpolarized spectrum.
 
-    ``side``: see :func:`side_of`.  0 where not ``active``, on ``perturbed`` shapes, and for BSDFs without a diffuse
-    lobe: samples of others hardly ever go where these are as low as their floor, and would take it off in fireflies.
+    ``side``: see :func:`side_of`.  0 where not ``active``; on ``perturbed`` shapes, because light from directions above
+    the surface but below their normal would be carried, and never taken off: no sample of the BSDF goes there; and for
+    BSDFs without a diffuse lobe: samples of others hardly ever go where these are as low as their floor, and would take
+    it off in fireflies.
     """
     active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & ~perturbed.at(si, active)
     context, least = mi.BSDFContext(), None

@@ -18,7 +18,8 @@ import mitsuba as mi
 
 from ..core.arrays import channel_mean, ones
 from ..direct.emitter_sampling import power_heuristic
-from .floors import Perturbed, agrees, carried_share, floor_of, side_of
+from ..lights.perturbed import Perturbed
+from .floors import agrees, carried_share, floor_of, side_of
 
 # Where a path is: before its first vertex with a floor; on its way from that to the next vertex; and past it
 SEEKING, CONNECTING, PAST = range(3)
