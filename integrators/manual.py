@@ -12,13 +12,15 @@ _TEXTS = {
     "what is estimated": """\
 What is estimated: emission + direct + indirect light, over the paths that ``path`` counts for the same ``max_depth``.
 Camera rays go on through mirrors, glass and masks. Left out are caustics and light that sharp lobes send on from the
-second surface (they would need another kind of light), and what ``clamping`` cuts off.
+second surface (they would need another kind of light), and what ``clamping`` cuts off. What glossy lobes under bump and
+normal maps send on is spread evenly.
 
 - Surfaces only: a scene with a participating medium is refused.
 - ``*_rgb`` and ``*_mono`` variants only. Not differentiable.
 - Emitters: point, spot, directional, area on any shape, envmap, constant, sunsky; projectors and textured spot
   emitters with ``direct="nee"``.
-- Shadow rays pass surfaces that do not scatter (masks, thin glass) with their transmission.
+- Shadow rays pass surfaces that do not scatter (masks, thin glass) with their transmission; each is an edge of the
+  path, as in ``path``. Light straight from a point, spot or directional emitter is blocked by them.
 - Values that are negative, not a number or above 1e30 count as nothing, and are counted where a whole light or sample
   is lost; a scene of no finite size, and an environment map that holds such values, are refused.
 """,

@@ -18,6 +18,7 @@ from .conftest import (
     sensor,
     wall,
 )  # fmt: skip
+from .test_masks_in_between import veiled_room
 
 # What the quick run tests
 QUICK_EMITTERS = ("point", "spot", "directional", "rectangle", "envmap", "constant")
@@ -134,6 +135,13 @@ def test_colours_seen_in_a_mirror_at_a_small_depth():
         box[name]["bsdf"] = {"type": "diffuse", "reflectance": rgb(*colour)}
     box["back"]["bsdf"] = {"type": "conductor"}
     assert_image_of_path(box, 64, 32, max_depth=4)
+
+
+@pytest.mark.parametrize("max_depth", [5, 6, 8])
+def test_light_through_four_masks(max_depth):
+    """Each of them is an edge of the path."""
+    lights = max_depth > 5
+    assert_image_of_path(veiled_room(), 64, reference="prb", lights=lights, max_depth=max_depth)
 
 
 # ---------------------- Shapes and scenes ----------------------

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, download, finite_or_zero, spectrum_to_rgb, upload
+from ..core.arrays import NO_LIMIT, channel_mean, download, finite_or_zero, spectrum_to_rgb, upload
 from ..core.cones import COSINE_ROUNDING
 from ..core.sampling import Choice, derived_seed, find_interval, independent_sampler, running_sums, stratified
 from ..core.stages import Stage
@@ -101,6 +101,12 @@ class LightSet:
         if math.isinf(self.max_depth):
             return mi.Bool(True)
         return point_depth + light_depth + 1 <= mi.UInt32(self.max_depth)
+
+    def edges_left(self, point_depth, light_depth):
+        """How many edges more an allowed path through a gather point and a light may have, UInt32."""
+        if math.isinf(self.max_depth):
+            return mi.UInt32(NO_LIMIT)
+        return mi.UInt32(self.max_depth) - (point_depth + light_depth + 1)
 
 
 def _leaf_ranges(tree: LightTree) -> np.ndarray:

@@ -3,7 +3,7 @@
 Opaque surfaces block.  Surfaces that let light pass unscattered (masks, thin glass) dim it by their transmission, but
 only for lights that a camera path could also reach by passing through them; towards point lights, spots and directional
 emitters they block, because no path that Mitsuba's ``path`` counts passes there, and towards surface lights because
-what passes there is traced.
+what passes there is traced.  Each of them that a shadow ray passes is an edge more of its path, as in ``path``.
 
 Points on emitters that are no virtual lights are sampled in :mod:`vpl.direct`, by ``emitter_sampling`` and
 ``cluster_sampling``, which trace their own shadow rays: as in ``path`` every surface blocks these, and what shines
@@ -42,36 +42,37 @@ def shadow_ray(kind: str, interaction, light):
     return interaction.spawn_ray_to(light.position)
 
 
-def transmittance(scene, traits, kind: str, ray, active):
+def transmittance(scene, traits, kind: str, ray, most, active):
     """Fraction of light that reaches the ray's origin: 0 or 1, or a spectrum where surfaces are partly transparent.
 
-    Lanes that are not ``active`` give 0.
+    ``most``: surfaces that it may pass, UInt32.  Lanes that are not ``active`` give 0.
     """
     passed = mi.Float(1) & active & ~scene.ray_test(ray, active)
     if not traits.null or kind in ("point", "spot", "surface", "directional"):
         return passed
-    through = active & (passed == 0)
+    through = active & (passed == 0) & (most > 0)
     if traits.open_scene is not None:
         # Few blocked rays meet an open surface at all, and a scene of only those is tested quickly
         through &= traits.open_scene.ray_test(ray, through)
-    return passed + _through_null_surfaces(scene, traits, ray, through)
+    return passed + _through_null_surfaces(scene, traits, ray, most, through)
 
 
 @dr.syntax
-def _through_null_surfaces(scene, traits, ray, active):
-    """Walk from surface to surface while they let light pass unscattered."""
-    ray = mi.Ray3f(ray)
+def _through_null_surfaces(scene, traits, ray, most, active):
+    """Walk from surface to surface while they let light pass unscattered, past ``most`` of them."""
+    ray, left = mi.Ray3f(ray), mi.UInt32(most)
     active = mi.Bool(active)
     passed = dr.select(active, mi.UnpolarizedSpectrum(1), 0)
     while dr.hint(active, exclude=[traits]):
         hit = scene.ray_intersect_preliminary(ray, active=active)
         # Most surfaces are opaque: only those that are not are worth a full intersection record
-        crossed = active & hit.is_valid() & traits.is_null(hit.shape)
+        crossed = active & hit.is_valid() & (left > 0) & traits.is_null(hit.shape)
         passed = dr.select(active & hit.is_valid() & ~crossed, 0, passed)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, crossed)
         share = finite_or_zero(mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, crossed)))
         passed = dr.select(crossed, passed * share, passed)
         active = crossed & dr.any(passed > 0)
+        left -= 1
         onward = si.spawn_ray(ray.d)
         onward.maxt = ray.maxt - si.t
         ray = dr.select(active, onward, ray)

@@ -105,7 +105,8 @@ def unoccluded(lights: LightSet, group: LightGroup, surface: Surface, light):
 
 def _visibility(transport: Transport, group: LightGroup, surface: Surface, light, active):
     ray = shadow_ray(group.kind, surface.interaction, light)
-    return transmittance(transport.scene, transport.traits, group.kind, ray, active)
+    most = transport.lights.edges_left(surface.depth, light.depth)
+    return transmittance(transport.scene, transport.traits, group.kind, ray, most, active)
 
 
 @dr.syntax
