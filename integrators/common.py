@@ -23,6 +23,8 @@ from vpl.transport.evaluation import Transport, mean_radiance
 from .gathering import CameraPass, GatheringIntegrator, whole_sum
 from .knobs import Choice, Integer, Number, Words
 
+# Gather points by which is judged where the camera looks
+_PLACES = 1024
 AOVS = ("shadow_rays", "upper_bounds", "cut_size")
 AOVS_TEXT = "Comma-separated channels to return, per camera ray and from the same pass: {allowed}."
 # Of the methods that compare bounds with the radiance around them
@@ -125,10 +127,10 @@ class ManyLightIntegrator(GatheringIntegrator):
             minimum=1,
         ),
         Number(
-            "clamping", 0.01,
-            "Smallest distance to a virtual light that stands for a surface, as a fraction of the radius of the "
-            "scene's bounding sphere; light from nearer is dimmed instead of becoming a bright spot. 0 turns it off; "
-            "papers that use fewer lights clamp at 0.05.",
+            "clamping", 2.0,
+            "Smallest distance to a virtual light that stands for a surface, as a multiple of the typical distance "
+            "between such lights where the camera looks; light from nearer is dimmed instead of becoming a bright "
+            "spot. With more lights, less is cut off. 0 turns it off.",
             minimum=0,
         ),
         Number(
@@ -160,7 +162,7 @@ class ManyLightIntegrator(GatheringIntegrator):
         prepared = Prepared(**vars(camera), direct=dr.zeros(mi.UnpolarizedSpectrum, points.count))
         if camera.dark or self.max_depth < 2:
             return prepared
-        lights = prepare_lights(scene, emitters, self.light_options(), camera.seed)
+        lights = prepare_lights(scene, emitters, self.light_options(), points.places(_PLACES), camera.seed)
         clock.split(lights.seconds)
         grid = self.pixel_grid(scene, sampler)
         if self.direct in ("nee", "adaptive"):

@@ -6,6 +6,7 @@ How data flows, which is also the order to read in::
                                                                   (clustering)
 
 - ``emitters``: a scene's emitters as rows of arrays (``Emitters``), so that no kernel calls emitter objects
+- ``focus``: where the camera looks, and how far apart lights are there
 - ``emission``: rays that leave them, group by group
 - ``perturbed``: surfaces with bump or normal maps, and how they scatter light paths
 - ``tracing``: light paths; a virtual light at every diffuse bounce (instant radiosity)

@@ -14,6 +14,7 @@ from ..core.arrays import download, finite_or_zero, rgb_to_spectrum, upload
 from ..core.parameters import parameters_of
 from ..core.sampling import Choice, independent_sampler
 from .emitters import Emitters
+from .focus import Focus
 from .virtual_lights import VirtualLights, spot_falloff
 
 
@@ -53,7 +54,7 @@ def bounding_box(scene):
 
 
 def bounding_sphere(scene):
-    """Sphere around the scene's box: the same one that clamping distances are measured by.
+    """Sphere around the scene's box.
 
     Raises a ValueError for a scene whose size is not a finite number.
     """
@@ -115,21 +116,47 @@ class AreaEmission:
         return si.spawn_ray(direction), radiance * dr.pi / (ps.pdf * self._choice.probability(row))
 
 
-def _ray_through_sphere(sphere, direction, sample):
-    """A ray in a direction through a uniform point of the disk that the bounding sphere shows to it."""
-    disk = mi.warp.square_to_uniform_disk_concentric(sample)
-    offset = mi.Frame3f(direction).to_world(mi.Vector3f(disk.x, disk.y, -1))
-    return mi.Ray3f(mi.Point3f(sphere.center) + offset * mi.Float(sphere.radius), direction)
+class ParallelRays:
+    """Rays in given directions through a scene: through its bounding sphere, evenly, or around the focus.
+
+    Half of those around a focus go through it, evenly; the other half pass by, as many of them in every octave of
+    distances from its middle, because what light from there brings falls with the squared distance.
+    """
+
+    def __init__(self, sphere, focus: Focus | None):
+        self._sphere, self._focus = sphere, focus
+
+    def through(self, direction, sample):
+        """(Ray in a direction, area that it stands for across the direction), by two uniform numbers."""
+        frame = mi.Frame3f(direction)
+        if self._focus is None:
+            disk = mi.warp.square_to_uniform_disk_concentric(sample)
+            offset = frame.to_world(mi.Vector3f(disk.x, disk.y, -1)) * mi.Float(self._sphere.radius)
+            return mi.Ray3f(mi.Point3f(self._sphere.center) + offset, direction), self.area
+        radius, reach = self._focus.radius, self._focus.reach
+        octaves = float(np.log(reach / radius))
+        inside = sample.x < 0.5
+        number = dr.select(inside, 2 * sample.x, 2 * sample.x - 1)
+        away = radius * dr.select(inside, dr.sqrt(number), dr.exp(number * octaves))
+        sine, cosine = dr.sincos(dr.two_pi * sample.y)
+        offset = frame.to_world(mi.Vector3f(away * cosine, away * sine, -reach))
+        area = dr.select(inside, 2 * np.pi * radius**2, 4 * np.pi * octaves * dr.square(away))
+        return mi.Ray3f(mi.Point3f(*self._focus.center.tolist()) + offset, direction), area
+
+    @property
+    def area(self) -> float:
+        """Area of the disk that the bounding sphere shows to all directions."""
+        return np.pi * float(self._sphere.radius) ** 2
 
 
 class DirectionalEmission:
-    """Parallel rays through the scene's bounding sphere."""
+    """Parallel rays from directional emitters."""
 
     delta = True
 
-    def __init__(self, suns: VirtualLights, sphere):
-        self._sphere = sphere
-        self.power = suns.intensity.mean(1, dtype=np.float64) * np.pi * float(sphere.radius) ** 2
+    def __init__(self, suns: VirtualLights, rays: ParallelRays):
+        self._rays = rays
+        self.power = suns.intensity.mean(1, dtype=np.float64) * rays.area
         self._choice = Choice(self.power)
         self._direction = upload(mi.Float, suns.direction)
         self._irradiance = upload(mi.Float, suns.intensity)
@@ -139,8 +166,8 @@ class DirectionalEmission:
         row = self._choice.row(stratified)
         direction = dr.gather(mi.Vector3f, self._direction, row)
         irradiance = rgb_to_spectrum(dr.gather(mi.Color3f, self._irradiance, row))
-        weight = irradiance * (np.pi * float(self._sphere.radius) ** 2) / self._choice.probability(row)
-        return _ray_through_sphere(self._sphere, direction, position_sample), weight
+        ray, area = self._rays.through(direction, position_sample)
+        return ray, irradiance * area / self._choice.probability(row)
 
 
 class EnvironmentEmission:
@@ -152,8 +179,8 @@ class EnvironmentEmission:
 
     delta = False
 
-    def __init__(self, environment, sphere):
-        self._environment, self._sphere = environment, sphere
+    def __init__(self, environment, sphere, rays: ParallelRays):
+        self._environment, self._sphere, self._rays = environment, sphere, rays
         self.power = np.array([other_power(environment, sphere)])
 
     def sample(self, stratified, position_sample, direction_sample):
@@ -161,8 +188,8 @@ class EnvironmentEmission:
         center = dr.zeros(mi.Interaction3f, dr.width(stratified))
         center.p = mi.Point3f(self._sphere.center)
         ds, weight = self._environment.sample_direction(center, direction_sample)
-        weight = finite_or_zero(mi.unpolarized_spectrum(weight)) * (np.pi * float(self._sphere.radius) ** 2)
-        return _ray_through_sphere(self._sphere, -ds.d, position_sample), weight
+        ray, area = self._rays.through(-ds.d, position_sample)
+        return ray, finite_or_zero(mi.unpolarized_spectrum(weight)) * area
 
 
 class OtherEmission:
@@ -179,17 +206,18 @@ class OtherEmission:
         return mi.Ray3f(ray.o, ray.d), weight
 
 
-def emission_groups(scene, emitters: Emitters) -> list:
-    """The groups of emitters that radiate at all."""
+def emission_groups(scene, emitters: Emitters, focus: Focus | None = None) -> list:
+    """The groups of emitters that radiate at all; what comes from infinity is aimed at the ``focus``, if any."""
     sphere = bounding_sphere(scene)
+    rays = ParallelRays(sphere, focus)
     groups = []
     if emitters.points.count + emitters.spots.count:
         groups.append(OmniEmission(emitters.points, emitters.spots))
     if emitters.area.power.sum() > 0:
         groups.append(AreaEmission(emitters.area))
     if emitters.directional.count:
-        groups.append(DirectionalEmission(emitters.directional, sphere))
+        groups.append(DirectionalEmission(emitters.directional, rays))
     groups += [OtherEmission(emitter, sphere) for _, emitter in emitters.others]
     if emitters.environment is not None:
-        groups.append(EnvironmentEmission(emitters.environment, sphere))
+        groups.append(EnvironmentEmission(emitters.environment, sphere, rays))
     return [group for group in groups if group.power.sum() > 0]

@@ -19,8 +19,9 @@ from ..core.sampling import Choice, derived_seed, find_interval, independent_sam
 from ..core.stages import Stage
 from .emission import bounding_sphere
 from .emitters import Emitters
+from .focus import Focus, spacing
 from .light_tree import CONE_COS, DeviceTree, LightTree, build_light_tree
-from .tracing import PathLimits, trace_lights
+from .tracing import PathLimits, TracedLights, trace_lights
 from .virtual_lights import KINDS, DeviceLights, VirtualLights
 
 
@@ -180,10 +181,11 @@ class ScatteredGroup(LightGroup):
         return self.standing_for(index, self.tree.summed_intensity(nodes))
 
 
-def prepare_lights(scene, emitters: Emitters, options: LightOptions, seed: int) -> LightSet:
+def prepare_lights(scene, emitters: Emitters, options: LightOptions, places: np.ndarray, seed: int) -> LightSet:
     """Make the lights of one render: emitters that are points, extended emitters if asked, traced lights, trees.
 
-    Nothing is traced for ``max_depth`` up to 2, where light cannot bounce.
+    Nothing is traced for ``max_depth`` up to 2, where light cannot bounce.  ``places``: some that the camera sees,
+    (n, 3) world units.
     """
     start = perf_counter()
     found, traced = [], None
@@ -193,7 +195,8 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, seed: int) 
             found += lights_of_emitters(scene, emitters, options.direct_count, derived_seed(seed, 20))
     if options.max_depth > 2:
         limits = PathLimits(options.max_depth - 2, options.rr_depth, options.lobe_limit)
-        traced = trace_lights(scene, emitters, options.vpl_count, derived_seed(seed, 21), limits)
+        focus = Focus.of(places, bounding_sphere(scene))
+        traced = trace_lights(scene, emitters, options.vpl_count, derived_seed(seed, 21), limits, focus)
         found.append(traced.lights)
     seconds = {Stage.TRACE: perf_counter() - start}
 
@@ -209,9 +212,18 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, seed: int) 
             tree = light_tree(lights, derived_seed(seed, 22, number)) if options.trees else None
             groups.append(LightGroup(kind, DeviceLights(lights), tree))
     seconds[Stage.TREE] = perf_counter() - start
-    clamp = options.clamping * float(bounding_sphere(scene).radius)
+    clamp = options.clamping * _spacing(found, traced, places)
     paths = traced.paths if traced else 0
     return LightSet(groups, clamp, options.max_depth, paths, dropped + (traced.dropped if traced else 0), seconds)
+
+
+def _spacing(found: list[VirtualLights], traced: TracedLights | None, places: np.ndarray) -> float:
+    """Typical distance between lights that stand for surfaces: of traced ones where the camera looks, or else of those
+    on area emitters."""
+    if traced and traced.lights.count:
+        return spacing(traced.lights.position, places)
+    on_emitters = [lights.position for lights in found if lights.kind == "oriented" and lights.count]
+    return spacing(on_emitters[0], on_emitters[0]) if on_emitters else 0.0
 
 
 def area_lights(emitters: Emitters, count: int, seed: int) -> VirtualLights:

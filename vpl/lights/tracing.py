@@ -21,6 +21,7 @@ from ..core.arrays import download, even_chunks, ones, select_record, spectrum_t
 from ..core.sampling import derived_seed, independent_sampler, stratified
 from .emission import emission_groups
 from .emitters import Emitters
+from .focus import Focus
 from .perturbed import Perturbed, Scattered, scatter_perturbed
 from .virtual_lights import VirtualLights
 
@@ -29,6 +30,8 @@ _LARGEST_WAVEFRONT = 1 << 20
 # A scene that stores a light on one path in a thousand gets an honest but bounded number of paths.
 _MOST_PATHS_PER_LIGHT = 16
 _DEFENSIVE_SHARE = 0.05
+# Share of lights that have to matter, or there is a warning
+_LEAST_THAT_MATTER = 0.02
 
 
 @dataclass(frozen=True)
@@ -54,10 +57,12 @@ class TracedLights:
 
 @dataclass(frozen=True)
 class _Walk:
-    """What all light paths of a render have in common; ``perturbed``: the shapes with bump or normal maps."""
+    """What all light paths of a render have in common; ``perturbed``: the shapes with bump or normal maps;
+    ``focus``: where the camera looks, if that is a small part of the scene."""
 
     scene: object
     perturbed: Perturbed
+    focus: Focus | None
     limits: PathLimits
 
 
@@ -165,13 +170,13 @@ def _shares(walk: _Walk, groups, count: int, seed: int) -> list[int]:
 
     Lights are wanted where flux arrives: an environment emitter around a closed building has nearly all the power
     and leaves hardly a light.  So each group should leave lights in proportion to the flux that its pilot stored; a
-    small part is kept for groups whose pilot was unlucky.
+    small part is kept for groups whose pilot was unlucky.  What is far from a focus counts less.
     """
     flux, lights_per_path = np.zeros(len(groups)), np.zeros(len(groups))
     for number, group in enumerate(groups):
         lights, _ = _trace_group(walk, group, number, _PILOT_PATHS, derived_seed(seed, 1))
         lights, _ = lights.without_bad()
-        flux[number] = lights.intensity.sum(dtype=np.float64)
+        flux[number] = _importance(walk, lights).sum()
         lights_per_path[number] = lights.count / _PILOT_PATHS
     wanted = np.full(len(groups), count / len(groups))
     if flux.sum() > 0:
@@ -180,18 +185,43 @@ def _shares(walk: _Walk, groups, count: int, seed: int) -> list[int]:
     return [max(round(share), 1) for share in paths]
 
 
-def trace_lights(scene, emitters: Emitters, count: int, seed: int, limits: PathLimits) -> TracedLights:
+def _importance(walk: _Walk, lights: VirtualLights) -> np.ndarray:
+    """How much each light counts where the camera looks, (n,)."""
+    intensity = lights.intensity.sum(1, dtype=np.float64)
+    return intensity if walk.focus is None else intensity * walk.focus.importance(lights.position)
+
+
+def _warn_of_few(walk: _Walk, lights: VirtualLights) -> None:
+    """Log a warning where hardly any of the lights matter for what the camera sees."""
+    importance, focus = _importance(walk, lights), walk.focus
+    if focus is None or not importance.any():
+        return
+    # As many lights of the same importance would make as much noise [Kish 1965, effective sample size]
+    matter = importance.sum() ** 2 / (importance**2).sum()
+    if matter < _LEAST_THAT_MATTER * lights.count:
+        place = ", ".join(f"{x:.3g}" for x in focus.center)
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"Only about {matter:.0f} of {lights.count} virtual lights matter where the camera looks, within "
+            f"{focus.radius:.3g} of ({place}), while the scene reaches as far as {focus.reach:.3g}: indirect light "
+            "will be noisy. Leave out what is far away, or raise vpl_count.",
+        )
+
+
+def trace_lights(
+    scene, emitters: Emitters, count: int, seed: int, limits: PathLimits, focus: Focus | None = None
+) -> TracedLights:
     """Trace light paths from all emitters until about ``count`` virtual point lights are stored.
 
     The number of paths is fixed before the first of them is traced, and intensities are divided by emitted paths, not
     by stored lights, so that the estimate is unbiased.  Depth of a light: edges of its path (1 for the first surface).
-    Returns "oriented" lights.
+    ``focus``: where the camera looks, if that is a small part of the scene.  Returns "oriented" lights.
     """
-    groups = emission_groups(scene, emitters)
+    groups = emission_groups(scene, emitters, focus)
     traced = TracedLights(VirtualLights.of("oriented", [], [], []), 0, 0)
     if not groups or limits.deepest < 1:
         return traced
-    walk = _Walk(scene, Perturbed(scene), limits)
+    walk = _Walk(scene, Perturbed(scene), focus, limits)
     shares = _shares(walk, groups, count, seed)
     parts = [traced.lights]
     for number, (group, paths) in enumerate(zip(groups, shares, strict=True)):
@@ -203,4 +233,5 @@ def trace_lights(scene, emitters: Emitters, count: int, seed: int, limits: PathL
     traced.dropped += bad
     if traced.dropped:
         mi.Log(mi.LogLevel.Warn, f"{traced.dropped} virtual light(s) with values that are not finite were dropped.")
+    _warn_of_few(walk, traced.lights)
     return traced

@@ -73,6 +73,12 @@ class GatherPoints:
     def count(self) -> int:
         return dr.width(self.ray)
 
+    def places(self, most: int) -> np.ndarray:
+        """Positions of at most so many of them, evenly from first to last, (n, 3) float32."""
+        count = min(self.count, most)
+        index = upload(mi.UInt32, np.arange(count, dtype=np.int64) * self.count // max(count, 1))
+        return download(dr.gather(mi.Point3f, self.si.p, index))
+
     def select(self, index) -> GatherPoints:
         """The points picked by an index array, as lazy gathers."""
         return GatherPoints(*(dr.gather(type(x), x, index) for x in (self.si, self.ray, self.weight, self.depth)))
