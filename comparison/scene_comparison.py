@@ -176,7 +176,8 @@ class SceneComparison:
             spp=setting.spp,
             pass_spp=options.pass_spp,
             threads=options.threads,
-            kernel_cache=str(self._store.kernels / f"{name}.{setting.label}"),
+            kernel_cache=None if options.cold else str(self._store.kernels / f"{name}.{setting.label}"),
+            cold=options.cold,
         )
 
     def _finished(self):

@@ -29,8 +29,8 @@ from .scene_files import SceneFile
 
 ROOT = Path(__file__).resolve().parent.parent
 TICK = 0.5  # seconds
-LONG_PASS = 60.0  # seconds; with given samples, a first pass longer than this is no longer rendered twice
-WARM_SPP = 4  # Mitsuba compiles other kernels for passes of fewer samples per pixel
+LONG_PASS = 60.0  # seconds; with given samples, only small passes compile for passes longer than this
+WARM_SPP = 4  # Mitsuba compiles other kernels for passes of fewer samples per pixel, and for no power of two
 PASSES_IN_BUDGET = 3  # or about so many; fewer, where starting that many would take more of it than
 START_SHARE = 0.3
 UNUSED_PASSES = 2**31  # passes that are not in the image are numbered from here, so that they share no lights with it
@@ -41,7 +41,8 @@ class Job:
     """Render to make: either for `budget` seconds or with `spp` samples per pixel, in passes of `pass_spp` (None
     chooses). `output` is the EXR file to write, which `run` is noted in. `vpl_folder`, if given, is where to keep the
     same passes rendered by `vpl`, with the same VPLs: once for all jobs that share them. `kernel_cache` is the folder
-    of compiled kernels, a fresh one if None. `denoised_output`, if given, is the EXR file for the denoised image."""
+    of compiled kernels, a fresh one if None. `cold` asks for times that include compilation. `denoised_output`, if
+    given, is the EXR file for the denoised image."""
 
     label: str
     integrator: str
@@ -60,6 +61,7 @@ class Job:
     vpl_folder: str | None = None
     denoised_output: str | None = None
     kernel_cache: str | None = None
+    cold: bool = False
     run: str | None = None
 
 
@@ -68,12 +70,12 @@ def run(job, tick=lambda: None):
 
     `width`, `height`; `load_seconds`; `load_average` (before the run, see machine.load); `cold_seconds` (the first
     pass, compilation included; None if the kernel cache was not empty); `warm_seconds` (mean of the later passes that
-    are in the image, None if there are none); `seconds`, `spp`, `passes` (of the image); `pass_spp`;
-    `cold_pass_kept`; `peak_memory_bytes`; `statistics` (the integrator's counters, added up, {} if it has none);
-    `rays_per_sample`, `bounds_per_sample`, `cut_size_per_sample` (per pixel sample, None if not counted); `vpl_output`
-    (the EXR file with what `vpl` made of the same passes, None if not asked for); `denoise_seconds` and
-    `cold_denoise_seconds` (what denoising takes beyond that, the second time and, compilation included, the first; None
-    if not asked for).
+    are in the image, None if there are none); `seconds`, `spp`, `passes` (of the image); `pass_spp`; `cold_pass_kept`
+    (whether the first pass is in the image, as `cold` asks for); `peak_memory_bytes`; `statistics` (the integrator's
+    counters, added up, {} if it has none); `rays_per_sample`, `bounds_per_sample`, `cut_size_per_sample` (per pixel
+    sample, None if not counted); `vpl_output` (the EXR file with what `vpl` made of the same passes, None if not asked
+    for); `denoise_seconds` and `cold_denoise_seconds` (what denoising takes beyond that, the second time and,
+    compilation included, the first; None if not asked for).
 
     After a failure it holds `error` (one line) and `traceback` instead. `tick` is called every half second. The process
     ends with this one, even if this one is killed.
@@ -125,9 +127,9 @@ def render(job):
     load_seconds = time.perf_counter() - begin
 
     progressive = Progressive(scene, job.seed)
-    cold, kept = _measure(progressive, job)
+    cold = _measure(progressive, job)
     passes, spp, pixels = progressive.passes, progressive.spp, progressive.pixels
-    warm = [one.seconds for one in passes[1 if kept else 0 :]]
+    warm = [one.seconds for one in passes[1 if job.cold else 0 :]]
     statistics = total_statistics(passes)
     result = {
         "parameters": parameters,
@@ -140,7 +142,7 @@ def render(job):
         "spp": spp,
         "passes": len(passes),
         "pass_spp": max(one.spp for one in passes),
-        "cold_pass_kept": kept,
+        "cold_pass_kept": job.cold,
         "peak_memory_bytes": _peak_memory(),
         "statistics": statistics,
     }
@@ -180,30 +182,65 @@ def _parse(job):
 
 
 def _measure(progressive, job):
-    """Render the passes of a job. Return the seconds of the first, cold pass, and whether it is in the image.
+    """Render the passes of a job; return the seconds of the first of all.
 
-    It is not, so that times are warm, unless it alone took more than the budget (or `LONG_PASS`). Nor are those that
-    compile the kernels of a smaller last pass.
+    With `job.cold` all are in the image, as for a person who waits for it. Otherwise those that compile kernels are
+    not, whatever they take, so that times are warm.
     """
+    if job.cold:
+        _render_cold(progressive, job)
+        return progressive.passes[0].seconds
     unused = (pass_seed(job.seed, index) for index in count(UNUSED_PASSES))
-    sizes = pass_sizes(job.spp, progressive.pixels, job.pass_spp) if job.spp else [job.pass_spp or 1]
-    cold = progressive.render(sizes[0], next(unused)).seconds
-    kept = cold > (job.budget or LONG_PASS)
-    if not kept:
-        for spp in {*sizes} - {sizes[0]}:
-            progressive.render(spp, next(unused))
-        progressive.restart()
     if job.spp:
-        for spp in sizes[len(progressive.passes) :]:
-            progressive.render(spp)
-    elif not kept:
-        spp, start = (job.pass_spp, 0.0) if job.pass_spp else _samples_of_a_pass(progressive, job.budget, unused)
+        sizes = pass_sizes(job.spp, progressive.pixels, job.pass_spp)
+        cold = _compile(progressive, sizes, unused)
         progressive.restart()
-        following = spp
-        while following:
-            progressive.render(following)
-            following = _samples_that_fit(progressive, spp, job.budget, start)
-    return cold, kept
+        for spp in sizes:
+            progressive.render(spp)
+        return cold
+    if job.pass_spp:
+        smaller = [WARM_SPP, WARM_SPP + 1] if job.pass_spp > WARM_SPP else []  # which the last pass may be
+        cold, (spp, start) = _compile(progressive, [job.pass_spp, *smaller], unused), (job.pass_spp, 0.0)
+    else:
+        cold = _compile(progressive, [1], unused)
+        spp, start = _samples_of_a_pass(progressive, job.budget, unused)
+    progressive.restart()
+    following = spp
+    while following:
+        progressive.render(following)
+        following = _samples_that_fit(progressive, spp, job.budget, start)
+    return cold
+
+
+def _render_cold(progressive, job):
+    """Render the passes of a job from the first on; in a budget their sizes double as long as it has room for more."""
+    if job.spp:
+        for spp in pass_sizes(job.spp, progressive.pixels, job.pass_spp):
+            progressive.render(spp)
+        return
+    spp, largest = job.pass_spp or 1, job.pass_spp or largest_pass(progressive.pixels)
+    progressive.render(spp)  # mostly compiles, so that its time says nothing of others
+    expected = 0.0
+    while (left := job.budget - progressive.seconds) > expected / 2:
+        seconds = progressive.render(spp).seconds
+        if seconds < left / 4 and 2 * spp <= largest:
+            spp, seconds = 2 * spp, 2 * seconds
+        elif seconds > left / 2 and not job.pass_spp:
+            spp, seconds = max(1, spp // 2), seconds / min(spp, 2)
+        expected = seconds
+
+
+def _compile(progressive, sizes, seeds):
+    """Render passes that are in no image, so that those of `sizes` (samples per pixel) find their kernels compiled;
+    return the seconds of the first. They are small; where passes take no longer than `LONG_PASS`, those of their own
+    size follow, as integrators may do other things for more samples."""
+    small = {spp: min(spp, WARM_SPP + (spp & (spp - 1) != 0)) for spp in sizes}  # both powers of two, or neither
+    cold, *_ = [progressive.render(spp, next(seeds)).seconds for spp in dict.fromkeys(small.values())]
+    for spp in sorted({*sizes} - {*small.values()}):
+        seconds = progressive.render(small[spp], next(seeds)).seconds
+        if seconds * spp / small[spp] <= LONG_PASS:
+            progressive.render(spp, next(seeds))
+    return cold
 
 
 def _samples_that_fit(progressive, spp, budget, start):
@@ -234,7 +271,8 @@ def _samples_of_a_pass(progressive, budget, seeds):
     first = progressive.render(1, next(seeds)).seconds
     if first > budget / 2:
         return 1, 0.0
-    progressive.render(WARM_SPP, next(seeds))  # compiles
+    for spp in (WARM_SPP, WARM_SPP + 1):
+        progressive.render(spp, next(seeds))  # compiles
     more = progressive.render(WARM_SPP, next(seeds)).seconds - first
     each = max(more, 0.01 * first) / (WARM_SPP - 1)
     start = max(first - each, 0)
@@ -243,6 +281,8 @@ def _samples_of_a_pass(progressive, budget, seeds):
     spp = int(np.clip((seconds - start) / each, 1, largest))
     for _ in range(3):
         taken = progressive.render(spp, next(seeds)).seconds
+        if taken > 1.1 * seconds:  # it may have compiled, as integrators do other things for more samples
+            taken = progressive.render(spp, next(seeds)).seconds
         if taken <= 1.1 * seconds:
             break
         spp = max(int(spp * seconds / taken), 1)

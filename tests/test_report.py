@@ -175,17 +175,37 @@ def test_readings_say_what_is_not_known():
     assert tables.equal_costs({}, "seconds") == []
 
 
-def test_times_that_include_compilation_are_named():
-    renders = [
-        {"label": "a", "setting": "spp=4", "load_average": 0.0, "cold_pass_kept": kept, "cold_seconds": cold}
-        for kept, cold in ((True, 70.0), (True, None), (False, 2.0))
+def of_budget(label, *seconds, budget=10.0):
+    """Runs of an integrator with some seeds."""
+    return [
+        {"label": label, "setting": "", "seed": seed, "load_average": 0.0, "budget": budget, "seconds": one}
+        for seed, one in enumerate(seconds)
     ]
-    assert tables.warnings({"renders": renders[1:]}, cores=2) == []
-    assert "The time of a spp=4 includes compilation" in tables.warnings({"renders": renders}, cores=2)[0]
+
+
+def test_times_that_are_not_equal_are_named():
+    failed = [{"label": "c", "setting": "", "load_average": 0.0, "budget": 10.0, "error": "no memory"}]
+    renders = of_budget("a", 9.0, 11.0) + of_budget("b", 10.9) + failed
+    assert tables.warnings({"renders": renders}, cores=2) == []
+    renders += of_budget("long", 14.0) + of_budget("other", 20.0, budget=20.0)
+    (warning,) = tables.warnings({"renders": renders}, cores=2)
+    assert warning == "Not at equal time: of 10 s, a took 10 s and long 14 s."
+    given_samples = of_budget("a", 1.0, budget=None) + of_budget("b", 9.0, budget=None)
+    assert tables.warnings({"renders": given_samples}, cores=2) == []
+
+
+def test_errors_that_the_noise_hides_are_named():
+    points = [
+        {"label": label, "setting": "spp=4", "cost": cost, "below_noise": label != "b"}
+        for cost in analysis.COSTS for label in "abc"
+    ]  # fmt: skip
+    (warning,) = tables.warnings({"renders": [], "points": points}, cores=2)
+    assert "hides the error of a spp=4, c spp=4:" in warning
 
 
 def test_a_busy_machine_is_named():
-    scene = {"renders": [{"load_average": 1.0}, {"load_average": 3.5}]}
+    scene = {"renders": of_budget("a", 1.0) + of_budget("b", 1.0)}
+    scene["renders"][1]["load_average"] = 3.5
     assert tables.warnings(scene, cores=4) == []
     assert "load 3.5 on 2 cores" in tables.warnings(scene, cores=2)[0]
 
