@@ -149,13 +149,20 @@ def _reading(reading):
 
 def warnings(scene, cores):
     """Return sentences about what makes a scene's numbers doubtful; [] if there is nothing."""
-    found = []
-    load = max((render["load_average"] for render in scene["renders"]), default=0)
-    if load > BUSY * cores:
-        found.append(
-            f"The machine was busy with other things (load {load:.1f} on {cores} cores): do not trust the times."
-        )
-    return found + _unequal_times(scene) + _hidden(scene)
+    return busy(scene["renders"], cores) + doubts(scene)
+
+
+def busy(renders, cores):
+    """Return a sentence if the machine had other things to do, in a list."""
+    load = max((render["load_average"] for render in renders), default=0)
+    if load <= BUSY * cores:
+        return []
+    return [f"The machine was busy with other things (load {load:.1f} on {cores} cores): do not trust the times."]
+
+
+def doubts(scene):
+    """Return the sentences of `warnings` that are of the scene, not of the machine."""
+    return _unequal_times(scene) + _hidden(scene)
 
 
 def _unequal_times(scene):

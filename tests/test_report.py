@@ -1,6 +1,8 @@
 """Files that a sweep writes, strips of pictures, and --check."""
 
+import html
 import json
+import re
 from pathlib import Path
 
 import jsonschema
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 
 import compare
-from comparison import analysis, baseline, images, metrics, references, report, strip, tables
+from comparison import analysis, baseline, images, metrics, plots, references, report, strip, tables
 from comparison.command_line import UsageError
 
 from .conftest import CORNELL, SWEEP
@@ -208,6 +210,36 @@ def test_a_busy_machine_is_named():
     scene["renders"][1]["load_average"] = 3.5
     assert tables.warnings(scene, cores=4) == []
     assert "load 3.5 on 2 cores" in tables.warnings(scene, cores=2)[0]
+
+
+def test_errors_at_one_setting_each_are_bars():
+    renders = [
+        run | {"rays_per_sample": None, "errors": {"relmse": error, "noise": {"relmse": noise}}}
+        for run, error, noise in (
+            (of_budget("a", 3.0)[0], 0.1, 0.0), (of_budget("b", 4.0)[0], 0.02, 0.05), (of_budget("c", 5.0)[0], 0.0, 0.0)
+        )
+    ]  # fmt: skip
+    ((_, of), _) = analysis.points(renders, "relmse")
+    svg = plots.error_bars(of, ["a", "b", "c"], "relmse")
+    texts = re.findall(r"<text[^>]*>([^<]*)</text>", svg)
+    assert {"a", "b", "c", "0.1, 3 s", "&lt; 0.05, 4 s"} <= set(texts)
+    assert "currentColor" in svg and "#010203" not in svg
+
+
+def test_page_begins_with_the_verdict(swept):
+    """The sentence, warnings, and a table of scenes and integrators."""
+    results, page = results_of(swept), (swept / "report.html").read_text()
+    page = html.unescape(page)
+    (first, *_) = results["summary"]["sentences"]
+    places = [page.index(text) for text in (f'<p class="headline">{first}', '<table class="summary">', "<h2>cornell")]
+    assert places == sorted(places)
+    for scene in results["scenes"]:
+        for warning in tables.doubts(scene):
+            assert page.index(warning) < places[1]
+    assert results["summary"]["base"] == "path" and list(results["summary"]["scenes"]["cornell"]) == [
+        "path", "lightcuts", "vpl",
+    ]  # fmt: skip
+    assert "error ÷ path’s" in page
 
 
 # --- Strips ---
