@@ -26,6 +26,9 @@ def summarise(scenes, metric):
     }
     order = sorted(means, key=lambda label: (means[label]["time"] or means[label]["error"] or {}).get("value", np.inf))
     sentences = [text for label in order if (text := _sentence(label, labels[0], rows))]
+    if means and not sentences:
+        verb = "compares" if len(order) == 1 else "compare"
+        sentences = [f"How {_listed(order)} {verb} with {labels[0]} cannot be told from these runs."]
     return {"base": labels[0] if labels else None, "scenes": rows, "means": means, "sentences": sentences}
 
 
@@ -37,7 +40,7 @@ def _row(scene, labels, metric):
         points = [point for point in of if point.label == label]
         if not points:
             continue
-        best = max(points, key=lambda point: np.mean(list(point.cost.values())))
+        best = min(points, key=lambda point: np.mean(list(point.error.values())))
         errors = [
             render["errors"] for render in scene["renders"]
             if "errors" in render and (render["label"], render["setting"]) == (label, best.name)
@@ -93,7 +96,11 @@ def _read_off(entries, base, label):
             ends = [1 / _mean(one[f"speed_up_{end}"] for one in exact) for end in ("high", "low")]
         return _ratio(1 / _mean(one["speed_up"] for one in exact), None, *ends)
     least = [one["speed_up_at_least"] for one in readings if one["speed_up_at_least"]]
-    return _ratio(1 / _mean(least), "at_most") if least else None
+    if least:
+        return _ratio(1 / _mean(least), "at_most")
+    pairs = [(entry[label]["value"], entry[base]["at_most"]) for entry in entries if label in entry and base in entry]
+    over = [value / most for value, most in pairs if value and most]
+    return _ratio(_mean(over), "at_least") if over else None
 
 
 def _of_points(first, other, value):

@@ -65,7 +65,9 @@ def test_what_the_noise_hides_is_a_bound():
     assert outcome(hidden)["error"]["bound"] == "at_least" and outcome(hidden)["error"]["value"] == pytest.approx(5)
     both = scene("box", run("path", "", 10.0, 0.01, noise=0.02), run("ours", "", 10.0, 0.01, noise=0.02))
     assert outcome(both)["error"] is None
-    assert verdict.summarise([both], "relmse")["sentences"] == []
+    assert verdict.summarise([both], "relmse")["sentences"] == [
+        "How ours compares with path cannot be told from these runs."
+    ]
 
 
 def test_curves_are_read_off():
@@ -73,6 +75,16 @@ def test_curves_are_read_off():
     assert found["time"]["value"] == pytest.approx(0.2) and not found["time"]["extrapolated"]
     assert found["time"]["low"] <= 0.2 <= found["time"]["high"] and found["setting"] == "spp=16"
     assert found["error"]["value"] == pytest.approx(0.2, rel=0.02)
+
+
+def test_curves_that_share_no_error_are_bounds():
+    slow = scene("box", *(
+        run(label, f"spp={spp}", seconds, error) for label, spp, seconds, error in (
+            ("path", 1, 1.0, 0.4), ("path", 2, 2.0, 0.2), ("ours", 1, 50.0, 0.8), ("ours", 2, 100.0, 0.6),
+        )
+    ))  # fmt: skip
+    found = outcome(slow)
+    assert found["time"]["bound"] == "at_least" and found["time"]["value"] == pytest.approx(100)
 
 
 def test_sentences_count_scenes_and_name_the_others():
