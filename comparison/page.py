@@ -62,7 +62,7 @@ def _scene(scene, pictures, results):
             if rows := table(scene, cost):
                 shown["comparisons"].append((cost, title, rows))
     shown["paper_tables"] = paper_tables.shown(scene)
-    shown["warnings"] = tables.warnings(scene, results["machine"]["cores"])
+    shown["warnings"] = tables.doubts(scene)
     counted = {render["label"] for render in scene["renders"] if render.get("rays_per_sample") is not None}
     shown["uncounted"] = [label for label in labels if label not in counted]
     return shown

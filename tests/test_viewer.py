@@ -234,6 +234,9 @@ def test_all_pictures_are_in_step(page):
 def test_a_viewer_fills_the_screen(page):
     page.click("button.full")
     page.wait("document.querySelector('.viewer').getBoundingClientRect().height === window.innerHeight")
+    page.press("a")
+    bottom = "document.querySelector('.tiles').getBoundingClientRect().bottom"
+    page.wait(f"document.querySelector('.tiles').dataset.drawn && {bottom} < window.innerHeight")
     page.press("ArrowRight")
     assert page.value("document.querySelector('.viewer.full').dataset.scene") == "garden"
     page.press("f")

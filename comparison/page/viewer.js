@@ -63,7 +63,8 @@ class Viewer {
     });
     drag(this.find(".handle"), ({ x }) => this.moveSplit((x - this.stage.getBoundingClientRect().left) / this.stage.clientWidth - this.split));
     drag(this.stage, (step) => (this.picking ? this.pick(step) : this.move(step.dx, step.dy)), () => this.picked());
-    new ResizeObserver(() => this.place()).observe(this.root);
+    const sizes = new ResizeObserver(() => this.place());
+    for (const element of [this.root, this.find(".tiles")]) sizes.observe(element);
   }
 
   // --- What is shown ---
@@ -179,8 +180,9 @@ class Viewer {
 
   // CSS pixels of the stage that a pixel of the picture takes when it fits.
   get fit() {
-    const { width, height } = this.views[0].image, controls = this.find(".controls").offsetHeight;
-    const highest = this.root.classList.contains("full") ? window.innerHeight - controls - 110 : HIGHEST;
+    const { width, height } = this.views[0].image, isFull = this.root.classList.contains("full");
+    const others = this.find(".controls").offsetHeight + this.find(".tiles").offsetHeight + 80;
+    const highest = isFull ? window.innerHeight - others : HIGHEST;
     const bar = this.find(".bar"), beside = bar.hidden ? 0 : bar.offsetWidth + 8;
     return Math.min((this.find(".screen").clientWidth - beside) / width, Math.max(200, highest) / height);
   }
