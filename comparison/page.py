@@ -13,7 +13,7 @@ from .curves import pareto
 from .pictures import DISTANCE_FACTOR
 
 PARTS = Path(__file__).parent / "page"
-SCRIPTS = ("pixels.js", "tiles.js", "viewer.js", "keys.js")
+SCRIPTS = ("pixels.js", "pointer.js", "tiles.js", "viewer.js", "keys.js")
 KINDS = {"relative": "relative error", "signed": "signed error", "distance": "distance × 16", "flip": "FLIP"}
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import compare
-from comparison import images, rendering, worker
+from comparison import images, measuring, rendering, worker
 from comparison.scene_files import SceneFile
 
 from .conftest import CORNELL, cornell
@@ -201,24 +201,24 @@ class Recorded(rendering.Progressive):
 def test_kernels_of_every_size_of_pass_are_compiled_before_the_clock_runs():
     job = worker.Job("p", "path", "s.xml", "a.exr", spp=19)
     progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 9, 2.0)
-    assert worker._measure(progressive, job) == 2.0
+    assert measuring.measure(progressive, job) == 2.0
     assert progressive.asked == [(5, True), (1, True), (5, True), (9, True), (9, False), (9, False), (1, False)]
     assert sum(one.spp for one in progressive.passes) == 19
 
 
 def test_only_small_passes_compile_where_passes_are_long():
     job = worker.Job("p", "path", "s.xml", "a.exr", spp=16)
-    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 16, worker.LONG_PASS + 1, worker.LONG_PASS / 2)
-    worker._measure(progressive, job)
+    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 16, measuring.LONG_PASS + 1, measuring.LONG_PASS / 2)
+    measuring.measure(progressive, job)
     assert progressive.asked == [(4, True), (4, True), (16, False)]
 
 
 def test_what_compiles_for_longer_than_the_budget_is_measured_warm():
     progressive = Recorded(100, 60.0)
-    cold = worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=30))
+    cold = measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=30))
     assert cold == 60 and progressive.seconds == 30 == progressive.spp
     progressive = Recorded(100, 60.0, start=40.0)
-    worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=30))
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=30))
     assert progressive.seconds == 41 and progressive.spp == 1
 
 
@@ -233,7 +233,7 @@ def test_what_compiles_for_longer_than_the_budget_is_measured_warm():
 )
 def test_cold_images_hold_every_pass(effort, passes):
     progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 16, 6.0)
-    assert worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", cold=True, **effort)) == 6
+    assert measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", cold=True, **effort)) == 6
     assert progressive.asked == [(spp, False) for spp in passes]
     assert [one.spp for one in progressive.passes] == passes
 
@@ -253,9 +253,9 @@ def test_cold_images_hold_every_pass(effort, passes):
 )
 def test_the_last_pass_fills_the_budget(budget, pass_spp, passes):
     progressive = Recorded(100)
-    worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget, pass_spp=pass_spp))
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget, pass_spp=pass_spp))
     assert [one.spp for one in progressive.passes] == passes
-    assert abs(progressive.seconds - budget) <= min(pass_spp, worker.WARM_SPP) / 2
+    assert abs(progressive.seconds - budget) <= min(pass_spp, measuring.WARM_SPP) / 2
 
 
 @pytest.mark.parametrize(
@@ -269,16 +269,16 @@ def test_the_last_pass_fills_the_budget(budget, pass_spp, passes):
 )
 def test_passes_are_as_large_as_the_cost_of_starting_one_asks_for(budget, start, passes):
     progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 2048, start=float(start))
-    worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget))
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget))
     assert [one.spp for one in progressive.passes] == passes and abs(progressive.seconds - budget) <= 2
 
 
 def test_passes_may_turn_out_to_be_slower_or_faster():
-    assert worker._samples_of_a_pass(Recorded(100, 1.0, 4.0, 5.0, 4.0, 50.0, 50.0), 30, iter(range(100)))[0] == 2
+    assert measuring._samples_of_a_pass(Recorded(100, 1.0, 4.0, 5.0, 4.0, 50.0, 50.0), 30, iter(range(100)))[0] == 2
     # Of two passes of one size, the first may have compiled
-    assert worker._samples_of_a_pass(Recorded(100, 1.0, 4.0, 5.0, 4.0, 50.0, 10.0), 30, iter(range(100)))[0] == 10
+    assert measuring._samples_of_a_pass(Recorded(100, 1.0, 4.0, 5.0, 4.0, 50.0, 10.0), 30, iter(range(100)))[0] == 10
     progressive = Recorded(100, 13.0, 13.0, 16.0, 17.0, 16.0, 30.0, 25.5, start=12.0)
-    worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=30))
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=30))
     assert progressive.seconds == 25.5  # four more samples would take 15 seconds
 
 
