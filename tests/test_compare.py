@@ -450,3 +450,15 @@ def test_usage_errors(arguments, message, capsys):
         status = error.code
     assert status == 2
     assert message in capsys.readouterr().err
+
+
+def test_cold_images_begin_with_empty_kernel_caches(tmp_path, capsys):
+    status = compare.main([
+        CORNELL, "-i", "path", "--cold", "--spp", "2", "--seeds", "2", "--width", "16", "-r", "path:64", "--cache",
+        str(tmp_path / "cache"), "-o", str(tmp_path),
+    ])  # fmt: skip
+    assert status == 0, capsys.readouterr().out
+    renders = json.loads((tmp_path / "results.json").read_text())["scenes"][0]["renders"]
+    assert len(renders) == 2
+    for render in renders:
+        assert render["cold"] and render["cold_pass_kept"] and render["seconds"] == render["cold_seconds"]
