@@ -4,6 +4,7 @@ from itertools import count
 
 import numpy as np
 
+from .pass_sizes import FIRST_SAMPLES
 from .rendering import largest_pass, pass_seed, pass_sizes
 
 LONG_PASS = 60.0  # seconds; with given samples, only small passes compile for passes longer than this
@@ -50,16 +51,21 @@ def _render_cold(progressive, job):
         for spp in pass_sizes(job.spp, progressive.pixels, job.pass_spp):
             progressive.render(spp)
         return
-    spp, largest = job.pass_spp or 1, job.pass_spp or largest_pass(progressive.pixels)
-    progressive.render(spp)  # mostly compiles, so that its time says nothing of others
-    expected = 0.0
+    first = WARM_SPP if WARM_SPP * progressive.pixels <= FIRST_SAMPLES else 1
+    spp, largest = job.pass_spp or first, job.pass_spp or largest_pass(progressive.pixels)
+    least, expected = {}, 0.0  # seconds, by size and of the next pass
     while (left := job.budget - progressive.seconds) > expected / 2:
-        seconds = progressive.render(spp).seconds
+        seconds, is_first = progressive.render(spp).seconds, spp not in least
+        least[spp] = min(seconds, least.get(spp, seconds))
+        if is_first:  # it may have compiled, and is repeated
+            expected = min(least[spp], 2 * least.get(spp // 2, 0.0))
+            continue
+        each = seconds / spp
         if seconds < left / 4 and 2 * spp <= largest:
-            spp, seconds = 2 * spp, 2 * seconds
+            spp *= 2
         elif seconds > left / 2 and not job.pass_spp:
-            spp, seconds = max(1, spp // 2), seconds / min(spp, 2)
-        expected = seconds
+            spp = max(1, spp // 2)
+        expected = least.get(spp, spp * each)
 
 
 def _compile(progressive, sizes, seeds):

@@ -227,8 +227,8 @@ def test_what_compiles_for_longer_than_the_budget_is_measured_warm():
     [
         ({"spp": 20}, [16, 4]),
         ({"budget": 8.0, "pass_spp": 2}, [2, 2]),
-        ({"budget": 20.0}, [1, 1, 2, 4, 4, 2, 1]),
-        ({"budget": 5.0}, [1]),
+        ({"budget": 20.0}, [4, 4, 4, 4, 2]),
+        ({"budget": 5.0}, [4]),
     ],
 )
 def test_cold_images_hold_every_pass(effort, passes):
@@ -450,6 +450,12 @@ def test_usage_errors(arguments, message, capsys):
         status = error.code
     assert status == 2
     assert message in capsys.readouterr().err
+
+
+def test_cold_images_go_on_after_a_size_that_compiled():
+    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 64, 2.0, 0.04, 2.0, 0.08, 0.16, 0.16)
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", cold=True, budget=8.0))
+    assert [spp for spp, _ in progressive.asked][:7] == [4, 4, 8, 8, 16, 16, 32]
 
 
 def test_cold_images_begin_with_empty_kernel_caches(tmp_path, capsys):
