@@ -13,9 +13,9 @@ and `.png`), its error (`SCENE.SETTING.error.png`) and with `--aovs` its other c
 With --sweep every integrator is rendered with several values of its quality parameter, and with several seeds: the
 report then has curves of error against time and against shadow rays, and what the same error costs.
 
-Times are wall-clock seconds of rendering alone. The first pass of each process is in no image, unless it alone takes
-longer than the budget, or a minute where samples are given. The first of all of an integrator begins with an empty
-kernel cache: it is the cold one, and reported apart. Runs of integrators take turns.
+Times are wall-clock seconds of rendering alone. Passes that compile kernels are in no image, small ones first. The
+first of all of an integrator begins with an empty kernel cache: it is the cold one, and reported apart. With --cold all
+begin with an empty one, and their times include compilation. Runs of integrators take turns.
 comparison/metrics.py defines the errors.
 
 Ctrl-C leaves a report of what was finished; --resume goes on from there, also after a crash.
@@ -93,6 +93,8 @@ def _add_effort(parser):
     add = parser.add_argument
     add("--pass-spp", type=positive(int), metavar="N",
         help="samples per pixel of one pass, which has VPLs of its own (default: chosen)")  # fmt: skip
+    add("--cold", action="store_true",
+        help="begin every image with an empty kernel cache, and count compilation as part of its time")  # fmt: skip
     add("--sweep", action="append", type=sweeps.sweep, nargs="?", const=("all", None, ()), default=[],
         metavar="LABEL:KEY=VALUE,...",
         help="render with each of several values of a parameter, or of spp or time, such as "
@@ -236,6 +238,7 @@ def run(options, command):
     with locked(options.out / ".lock", f"another comparison is writing to '{options.out}'"):
         results = _compare(options, settings, command)
     print(tables.EXPLANATION, end="\n\n")
+    print(*results["summary"]["sentences"], sep="\n", end="\n\n")
     print(f"report: {options.out / 'report.html'}")
     worse = baseline.check(results, earlier, options.check_share) if earlier else []
     for line in worse:

@@ -73,8 +73,17 @@ def least(name, noise):
 
 def relative_error(image, reference):
     """Return |x - r| / (r + 1% of the mean r), (height, width), averaged over the channels: what error images show."""
-    floor = EPSILON * reference.mean()
-    return (np.abs(image - reference) / (np.abs(reference) + floor)).mean(axis=-1)
+    return (np.abs(image - reference) / _floored(reference)).mean(axis=-1)
+
+
+def signed_error(image, reference):
+    """Return (x - r) / (r + 1% of the mean r), (height, width), averaged over the channels: where images are too bright
+    or too dark, whereas noise has both signs."""
+    return ((image - reference) / _floored(reference)).mean(axis=-1)
+
+
+def _floored(reference):
+    return np.abs(reference) + EPSILON * reference.mean()
 
 
 def distance(image, reference):

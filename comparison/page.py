@@ -8,11 +8,13 @@ import jinja2
 import numpy as np
 from matplotlib import colormaps
 
-from . import analysis, images, paper_tables, plots, tables
+from . import analysis, images, page_images, paper_tables, plots, tables, verdict
 from .curves import pareto
+from .pictures import DISTANCE_FACTOR
 
 PARTS = Path(__file__).parent / "page"
-KINDS = {"relative": "relative error", "distance": "distance × 16", "flip": "FLIP"}
+SCRIPTS = ("pixels.js", "pointer.js", "tiles.js", "viewer.js", "keys.js")
+KINDS = {"relative": "relative error", "signed": "signed error", "distance": "distance × 16", "flip": "FLIP"}
 
 
 def render(results, pictures, reference_text):
@@ -22,6 +24,8 @@ def render(results, pictures, reference_text):
     )
     return environment.get_template("report.html.jinja").render(
         results=results,
+        summary=_summary(results),
+        warnings=_warnings(results),
         scenes=[_scene(*pair, results) for pair in zip(results["scenes"], pictures, strict=True)],
         columns=tables.COLUMNS,
         explanation=tables.EXPLANATION,
@@ -32,7 +36,7 @@ def render(results, pictures, reference_text):
         error_range=[f"{value:.0%}" for value in images.ERROR_RANGE],
         false_colours=", ".join(f"rgb{tuple(map(int, stop))}" for stop in images.FALSE_COLOURS),
         palettes=_palettes(),
-        script=(PARTS / "viewer.js").read_text(),
+        script="\n".join((PARTS / name).read_text() for name in SCRIPTS),
         style=(PARTS / "report.css").read_text(),
     )
 
@@ -41,32 +45,89 @@ def _scene(scene, pictures, results):
     """Return what the template shows of a scene."""
     metric = results["metrics"]["compared"]
     labels = list(dict.fromkeys(render["label"] for render in scene["renders"]))
-    views = pictures.views if pictures else []
     shown = {"result": scene, "name": scene["name"], "error": scene.get("error"), "rows": tables.rows(scene)}
-    # "</" would end the script element that holds it.
-    shown["views"] = json.dumps(views).replace("</", "<\\/") if views else None
-    shown["has_maps"] = any(view["maps"] for view in views)
-    shown |= {"block": pictures.block if pictures else 1, "plots": [], "comparisons": []}
+    shown |= {"views": None, "bars": None, "plots": [], "comparisons": [], "block": pictures.block if pictures else 1}
+    if pictures and pictures.views:
+        data = {"views": pictures.views, "exposure": pictures.exposure, "metric": plots.ERRORS[metric]}
+        shown["views"] = json.dumps(data).replace("</", "<\\/")  # "</" would end the script element that holds it
+        shown["has_maps"] = any(view["maps"] for view in pictures.views)
+        shown["stills"] = pictures.stills
     for cost, of in analysis.points(scene["renders"], metric):
-        if len(of) > 1:
+        are_curves = len({point.label for point in of}) < len(of)
+        if cost == "seconds" and not are_curves and len(of) > 1:
+            shown["bars"] = plots.error_bars(of, labels, metric)
+        if are_curves:
             shown["plots"].append(plots.error_against(cost, of, pareto(of), labels, metric))
         for title, table in (("equal error", tables.equal_errors), ("equal cost", tables.equal_costs)):
             if rows := table(scene, cost):
                 shown["comparisons"].append((cost, title, rows))
     shown["paper_tables"] = paper_tables.shown(scene)
-    shown["warnings"] = tables.warnings(scene, results["machine"]["cores"])
+    shown["warnings"] = tables.doubts(scene)
     counted = {render["label"] for render in scene["renders"] if render.get("rays_per_sample") is not None}
     shown["uncounted"] = [label for label in labels if label not in counted]
     return shown
 
 
+def _warnings(results):
+    """Return (name of a scene or None, sentence) of all scenes; what is said of the machine is said once."""
+    renders = [render for scene in results["scenes"] for render in scene["renders"]]
+    found = [(None, sentence) for sentence in tables.busy(renders, results["machine"]["cores"])]
+    return found + [(scene["name"], sentence) for scene in results["scenes"] for sentence in tables.doubts(scene)]
+
+
+def _summary(results):
+    """Return the table of scenes and integrators: a list of labels, rows of (scene, cells), and the cells of the means;
+    a cell is a list of (text, verdict) of error, time and bias."""
+    summary = results["summary"]
+    labels = list(dict.fromkeys(label for row in summary["scenes"].values() for label in row))
+    rows = [
+        (name, [_outcome(row.get(label), label == summary["base"]) for label in labels])
+        for name, row in summary["scenes"].items()
+    ]
+    means = [summary["means"].get(label) for label in labels]
+    empty = ("", None)
+    cells = [
+        [_mean_cell(mean[kind], len(rows)) if mean else empty for kind in verdict.KINDS] + [empty] for mean in means
+    ]
+    return {**summary, "labels": labels, "rows": rows, "mean_cells": cells}
+
+
+def _outcome(outcome, is_base):
+    if outcome is None:
+        return [("n/a", None)] * 3
+    bias = (f"{outcome['bias']:+.2%}", None)
+    if is_base:
+        error, seconds = (tables.number(outcome[key]) for key in ("measured", "seconds"))
+        return [(("< noise" if outcome["hidden"] else error), None), (f"{seconds} s", None), bias]
+    return [*(_ratio_cell(outcome[kind]) for kind in verdict.KINDS), bias]
+
+
+def _mean_cell(ratio, scenes):
+    text, found = _ratio_cell(ratio)
+    return (text if ratio is None or ratio["scenes"] == scenes else f"{text} (of {ratio['scenes']})", found)
+
+
+def _ratio_cell(ratio):
+    if ratio is None:
+        return ("–", None)
+    text = ("≈ " if ratio["extrapolated"] and not ratio["bound"] else "") + verdict.number(ratio)
+    if ratio["low"]:
+        text += f" ({tables.number(ratio['low'])} to {tables.number(ratio['high'])})"
+    return (text, verdict.verdict_of(ratio))
+
+
 def _palettes():
-    """Return colours (256 times 3 bytes, a list) of each kind of map."""
+    """Return colours (256 times 3 bytes, a list) of each kind of map, and the scales of the kinds."""
     steps = np.linspace(0, 1, 256)
-    magma = (colormaps["magma"](steps)[:, :3] * 255 + 0.5).astype(int)
-    grey = images.tone_map(np.repeat(steps[:, None], 3, axis=1), 1.0)
-    found = {"relative": images.palette(steps), "distance": grey, "flip": magma}
-    return json.dumps({kind: colours.ravel().tolist() for kind, colours in found.items()})
+    found = {name: _bytes(colormaps[of](steps)) for name, of in (("flip", "magma"), ("signed", "RdBu_r"))}
+    found["distance"] = images.tone_map(np.repeat(steps[:, None], 3, axis=1), 1.0)
+    found["relative"] = images.palette(steps)
+    scales = {"range": images.ERROR_RANGE, "stored": page_images.RELATIVE_ENDS, "whitest": 1 / DISTANCE_FACTOR}
+    return json.dumps({"scales": scales} | {kind: colours.ravel().tolist() for kind, colours in found.items()})
+
+
+def _bytes(colours):
+    return (colours[:, :3] * 255 + 0.5).astype(int)
 
 
 def embedded(file):

@@ -2,15 +2,20 @@
 
 A colour becomes a half-precision number without its sign and with `BITS_LEFT_OUT` fewer bits: 12 bits, 14 stops below
 the white of the pictures to 16 above it, in steps of 0.8%, which no eye sees. Neighbours are subtracted, planes of high
-and of low bytes follow each other, and zlib does the rest; viewer.js undoes it. Maps of errors have 8 bits.
+and of low bytes follow each other, and zlib does the rest; pixels.js undoes it. Most maps of errors have 8 bits, on
+scales wide enough for the exposure to act on them.
 """
 
 import base64
 import zlib
 
+import mitsuba as mi
 import numpy as np
 
+from . import images
+
 BITS_LEFT_OUT = 3
+RELATIVE_ENDS = (1e-4, 10.0)  # of the logarithmic scale of relative errors
 LARGEST = 2**20  # pixels; larger images are shown by the means of blocks
 
 
@@ -32,8 +37,8 @@ def reduce(image):
 
 
 def colours(rgb, scale):
-    """Encode linear colours, (height, width, 3), that a picture shows multiplied by `scale`; return a dict for
-    viewer.js. What is not finite or negative is black, what is too bright as bright as can be told."""
+    """Encode linear colours, (height, width, channels), that a picture shows multiplied by `scale`; return a dict for
+    pixels.js. What is not finite or negative is black, what is too bright as bright as can be told."""
     limit = float(np.finfo(np.float16).max)
     scaled = np.clip(reduce(np.nan_to_num(rgb, posinf=0, neginf=0)) * scale, 0, limit)
     half = scaled.astype(np.float16).view(np.uint16)
@@ -41,10 +46,36 @@ def colours(rgb, scale):
     return _pack(rounded >> BITS_LEFT_OUT, 2)
 
 
+def relative(errors):
+    """Encode relative errors, (height, width), on a logarithmic scale."""
+    return _plane(images.logarithmic_position(_reduced(errors), RELATIVE_ENDS))
+
+
+def signed(errors):
+    """Encode errors of both signs, (height, width), up to 100%: by their roots, so that small ones are told apart."""
+    errors = np.clip(_reduced(errors), -1, 1)
+    return _plane(0.5 + 0.5 * np.sign(errors) * np.sqrt(np.abs(errors)))
+
+
 def plane(values):
-    """Encode values from 0 to 1, (height, width), in 8 bits; what is not a number counts as 1."""
-    values = reduce(np.nan_to_num(values, nan=1)[..., None])
-    return _pack((np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint16), 1)
+    """Encode values from 0 to 1, (height, width)."""
+    return _plane(_reduced(values))
+
+
+def jpeg(pixels):
+    """Return an image, (height, width, 3) uint8 sRGB, as a data URL."""
+    stream = mi.MemoryStream()
+    mi.Bitmap(np.ascontiguousarray(reduce(pixels).astype(np.uint8))).write(stream, mi.Bitmap.FileFormat.JPEG, 85)
+    return "data:image/jpeg;base64," + base64.b64encode(stream.raw_buffer()).decode()
+
+
+def _reduced(values):
+    return reduce(np.nan_to_num(values, nan=1, posinf=1e30, neginf=-1e30)[..., None])[..., 0]
+
+
+def _plane(values):
+    """Encode values from 0 to 1 in 8 bits."""
+    return _pack((np.clip(values, 0, 1)[..., None] * 255 + 0.5).astype(np.uint16), 1)
 
 
 def _pack(codes, depth):

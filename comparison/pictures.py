@@ -9,30 +9,35 @@ DISTANCE_FACTOR = 16  # of the images of Euclidean distance, as in the paper on 
 class Pictures:
     """Pictures of a scene called `name`, written to `folder`.
 
-    `views` is a list for the page: a dict an image with "title", "label", "image", and, if it has a reference, "maps":
-    from the kind ("relative", "distance", "flip") to a plane (see page_images.py). The first image that is shown
-    chooses the exposure of all, `exposure`.
+    `views` is a list for the page: a dict an image with "title", "label", "image", "error" (text, "" without one),
+    "exr" (name of a file beside the page), and, if it has a reference, "maps": from the kind ("relative", "signed",
+    "distance", "flip") to what page_images.py makes of it. `stills` are (title, error, data URL), for where no scripts
+    run. The first image that is shown chooses the exposure of all, `exposure`.
     """
 
     def __init__(self, folder, name):
         self.folder, self.name = folder, name
-        self.exposure, self.views, self.block = None, [], 1
+        self.exposure, self.views, self.stills, self.block = None, [], [], 1
         self._aovs = {}  # channel -> title -> values, (height, width)
 
-    def show(self, title, label, file_name, image, reference=None, flip=None):
-        """Show an image, (height, width, 3) linear, of an integrator's label (None: the reference); if it has a
-        reference also its errors, `flip` being the map of metrics.flip."""
+    def show(self, title, label, file_name, exr, image, reference=None, flip=None, error=""):
+        """Show an image, (height, width, 3) linear, of an integrator's label (None: the reference), which is in the
+        file `exr`; if it has a reference also its errors, `flip` being the map of metrics.flip."""
         self.exposure = self.exposure or images.automatic_exposure(image)
         self.block = page_images.block_size(*image.shape[:2])
-        images.write_png(self.path(file_name, ".png"), images.tone_map(image, self.exposure))
-        view = {"title": title, "label": label, "image": page_images.colours(image, self.exposure), "maps": {}}
+        pixels = images.tone_map(image, self.exposure)
+        images.write_png(self.path(file_name, ".png"), pixels)
+        self.stills.append((title, error, page_images.jpeg(pixels)))
+        view = {"title": title, "label": label, "error": error, "exr": exr, "maps": {}}
+        view["image"] = page_images.colours(image, self.exposure)
         if reference is not None:
             relative = metrics.relative_error(image, reference)
             images.write_png(self.path(file_name, ".error.png"), images.false_colours(relative))
-            distance = DISTANCE_FACTOR * self.exposure * metrics.distance(image, reference)
+            distance = DISTANCE_FACTOR * metrics.distance(image, reference)[..., None]
             view["maps"] = {
-                "relative": page_images.plane(images.logarithmic_position(relative, images.ERROR_RANGE)),
-                "distance": page_images.plane(distance),
+                "relative": page_images.relative(relative),
+                "signed": page_images.signed(metrics.signed_error(image, reference)),
+                "distance": page_images.colours(distance, self.exposure),
                 "flip": page_images.plane(flip),
             }
         self.views.append(view)

@@ -23,8 +23,11 @@ STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.edgecolor": "#888",
-    "grid.color": "#e4e4e4",
+    **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), "#010203"),
+    "grid.color": "#040506",
 }
+# Colours of the page, light or dark, in place of the ones above
+PAGE_COLOURS = {"#010203": "currentColor", "#040506": "var(--line)", "#ffffff": "var(--page)"}
 
 
 def colour(index):
@@ -54,6 +57,32 @@ def error_against(cost, of, best, labels, metric):
         if best:
             axes.plot([], [], "o", markersize=11, markerfacecolor="none", markeredgecolor="#777", label="Pareto front")
         axes.legend(frameon=False, fontsize=9)
+        return _svg(figure)
+
+
+def error_bars(of, labels, metric):
+    """Return SVG text: the errors of `curves.Point`s, at most one a label, as bars with their intervals and seconds.
+    Those that the reference's noise hides are hollow, and as long as that."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 0.9 + 0.42 * len(of)), layout="constrained")
+        FigureCanvasSVG(figure)
+        axes = figure.add_subplot(xlabel=ERRORS[metric])
+        axes.grid(True, axis="x")
+        axes.set_axisbelow(True)
+        for row, point in enumerate(of):
+            seconds, error = analysis.spread_of(point)
+            own, bound = colour(labels.index(point.label)), point.bound()
+            length, face = (bound[1], "white") if bound else (error["mean"], own)
+            axes.barh(row, length, height=0.62, facecolor=face, edgecolor=own, xerr=None if bound else _bars(error),
+                      error_kw={"elinewidth": 0.9, "capsize": 2, "ecolor": "#010203"})  # fmt: skip
+            text = f"{'< ' if bound else ''}{tables.number(length)}, {tables.number(seconds['mean'])} s"
+            end = length if bound or error["high"] is None else error["high"]
+            axes.annotate(text, (end, row), xytext=(5, 0), textcoords="offset points", va="center", fontsize=9)
+        axes.set_yticks(range(len(of)), [f"{point.label} {point.name}".strip() for point in of])
+        axes.tick_params(axis="y", length=0)
+        axes.invert_yaxis()
+        axes.margins(x=0.28)
+        axes.set_xlim(left=0)
         return _svg(figure)
 
 
@@ -115,4 +144,6 @@ def _svg(figure):
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     content = buffer.getvalue()
+    for drawn, of_page in PAGE_COLOURS.items():
+        content = content.replace(drawn, of_page)
     return content[content.index("<svg") :]

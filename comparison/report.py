@@ -4,7 +4,7 @@ import json
 from datetime import UTC, datetime
 from pathlib import Path
 
-from . import images, machine, metrics, page, paper_tables, tables
+from . import images, machine, metrics, page, paper_tables, tables, verdict
 
 FORMAT = 2  # of results.json; rises with changes that old readers would not understand
 
@@ -22,6 +22,7 @@ def describe(command, options, scenes, complete):
         "versions": machine.versions(),
         "machine": machine.describe(),
         "metrics": {"epsilon": metrics.EPSILON, "trimmed": metrics.TRIMMED, "compared": options.metric},
+        "summary": verdict.summarise(scenes, options.metric),
         "scenes": scenes,
     }
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import analysis, images, metrics, paper_tables, references, worker
+from . import analysis, images, metrics, paper_tables, references, tables, worker
 from .command_line import explain, own_integrators
 from .pictures import REFERENCE, Pictures
 from .scene_files import SceneFile, short_name
@@ -61,7 +61,9 @@ class SceneComparison:
         self.pictures = Pictures(self.options.out, self.result["name"])
         if self._reference:
             self._describe_reference()
-            self.pictures.show(REFERENCE, None, REFERENCE, self._reference.image)
+            exr = self.pictures.path(REFERENCE, ".exr")
+            images.write_exr(exr, self._reference.image, "RGB", self._reference.description)
+            self.pictures.show(REFERENCE, None, REFERENCE, exr.name, self._reference.image)
         labels = [label for raw in self.settings for label in (raw, denoised_label(raw))]
         for result in sorted(self._finished(), key=lambda result: labels.index(result["label"])):
             try:
@@ -176,7 +178,8 @@ class SceneComparison:
             spp=setting.spp,
             pass_spp=options.pass_spp,
             threads=options.threads,
-            kernel_cache=str(self._store.kernels / f"{name}.{setting.label}"),
+            kernel_cache=None if options.cold else str(self._store.kernels / f"{name}.{setting.label}"),
+            cold=options.cold,
         )
 
     def _finished(self):
@@ -189,15 +192,19 @@ class SceneComparison:
         planes, channels, _ = images.read_exr(result["output"])
         image = images.colour(planes, channels).astype(np.float64)
         reference = references.read(result["vpl_output"]) if result["vpl_output"] else self._reference
-        flip = None
+        flip, error = None, ""
         if reference:
             result["errors"] = self._errors(image, reference)
             flip, result["errors"]["flip"], result["errors"]["flip_settings"] = metrics.flip(image, reference.image)
+            error = tables.error([result["errors"]], self.options.metric, ".3g")
         if result["seed"] == self.options.seeds[0]:
             title = f"{result['label']} {result['setting']}".strip()
             file_name = Path(result["output"]).name[len(self.result["name"]) + 1 : -len(".exr")]
             file_name = file_name.removesuffix(f".seed{result['seed']}")
-            self.pictures.show(title, result["label"], file_name, image, reference.image if reference else None, flip)
+            self.pictures.show(
+                title, result["label"], file_name, Path(result["output"]).name, image,
+                reference.image if reference else None, flip, error,
+            )  # fmt: skip
             if not result["denoised"]:
                 self.pictures.add_aovs(self.options.aovs, title, planes, channels)
 

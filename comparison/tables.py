@@ -9,8 +9,9 @@ COLUMNS = (
     "rays", "bounds", "memory", "load",
 )  # fmt: skip
 EXPLANATION = (
-    "Means over seeds. time: of the passes in the image, with kernels that are compiled already; cold: the first pass "
-    "of all with an empty kernel cache, compilation included. rel. L1: sum |x - r| / sum r; "
+    "Means over seeds. time: of the passes in the image, with kernels that are compiled already (with --cold from an "
+    "empty kernel cache on); cold: the first pass of all with an empty kernel cache, compilation included. rel. L1: "
+    "sum |x - r| / sum r; "
     f"relMSE: mean (x - r)² / (r² + {metrics.EPSILON:g} mean(r)²); trimmed: the same without the worst "
     f"{metrics.TRIMMED:.1%} of the pixels; 95%: interval of the mean of the error that curves show (--metric); FLIP: "
     "mean of HDR-FLIP at 67 pixels per degree; bias: of the mean. The reference's own noise is taken off RMSE and "
@@ -19,6 +20,7 @@ EXPLANATION = (
     "before the runs, the largest."
 )
 BUSY = 1.5  # load a core; what is measured makes up to one itself
+UNEQUAL = 0.1  # by which times of one budget may differ
 HEADS = {"seconds": "time [s]", "rays": "rays per pixel"}
 
 
@@ -147,13 +149,47 @@ def _reading(reading):
 
 def warnings(scene, cores):
     """Return sentences about what makes a scene's numbers doubtful; [] if there is nothing."""
+    return busy(scene["renders"], cores) + doubts(scene)
+
+
+def busy(renders, cores):
+    """Return a sentence if the machine had other things to do, in a list."""
+    load = max((render["load_average"] for render in renders), default=0)
+    if load <= BUSY * cores:
+        return []
+    return [f"The machine was busy with other things (load {load:.1f} on {cores} cores): do not trust the times."]
+
+
+def doubts(scene):
+    """Return the sentences of `warnings` that are of the scene, not of the machine."""
+    return _unequal_times(scene) + _hidden(scene)
+
+
+def _unequal_times(scene):
+    """Return a sentence for each time budget that was not used alike."""
+    budgets = {}
+    for title, renders in settings(scene).items():
+        seconds = [render["seconds"] for render in renders if "error" not in render and render["budget"]]
+        if seconds:
+            budgets.setdefault(renders[0]["budget"], {})[title] = _mean(seconds)
     found = []
-    load = max((render["load_average"] for render in scene["renders"]), default=0)
-    if load > BUSY * cores:
-        found.append(
-            f"The machine was busy with other things (load {load:.1f} on {cores} cores): do not trust the times."
-        )
-    compiled = [render for render in scene["renders"] if render.get("cold_pass_kept") and render["cold_seconds"]]
-    for title in dict.fromkeys(f"{render['label']} {render['setting']}".strip() for render in compiled):
-        found.append(f"The time of {title} includes compilation: its first pass was too long to be rendered twice.")
+    for budget, seconds in budgets.items():
+        shortest, longest = (choose(seconds, key=seconds.get) for choose in (min, max))
+        if seconds[longest] > (1 + UNEQUAL) * seconds[shortest]:
+            found.append(
+                f"Not at equal time: of {number(budget)} s, {shortest} took {number(seconds[shortest])} s and "
+                f"{longest} {number(seconds[longest])} s."
+            )
     return found
+
+
+def _hidden(scene):
+    """Return a sentence about errors that the reference's noise hides."""
+    hidden = [
+        f"{point['label']} {point['setting']}".strip()
+        for point in scene.get("points", [])
+        if point["below_noise"] and point["cost"] == "seconds"
+    ]
+    if not hidden:
+        return []
+    return [f"The reference's noise hides the error of {', '.join(hidden)}: a reference of more samples is needed."]

@@ -16,24 +16,17 @@ import threading
 import time
 import traceback
 from dataclasses import asdict, dataclass, field
-from itertools import count
 from pathlib import Path
-
-import numpy as np
 
 from . import images, machine
 from .command_line import explain, set_variant, versions
 from .denoising import Denoiser
-from .rendering import Progressive, largest_pass, pass_seed, pass_sizes, total_statistics
+from .measuring import measure
+from .rendering import Progressive, total_statistics
 from .scene_files import SceneFile
 
 ROOT = Path(__file__).resolve().parent.parent
 TICK = 0.5  # seconds
-LONG_PASS = 60.0  # seconds; with given samples, a first pass longer than this is no longer rendered twice
-WARM_SPP = 4  # Mitsuba compiles other kernels for passes of fewer samples per pixel
-PASSES_IN_BUDGET = 3  # or about so many; fewer, where starting that many would take more of it than
-START_SHARE = 0.3
-UNUSED_PASSES = 2**31  # passes that are not in the image are numbered from here, so that they share no lights with it
 
 
 @dataclass
@@ -41,7 +34,8 @@ class Job:
     """Render to make: either for `budget` seconds or with `spp` samples per pixel, in passes of `pass_spp` (None
     chooses). `output` is the EXR file to write, which `run` is noted in. `vpl_folder`, if given, is where to keep the
     same passes rendered by `vpl`, with the same VPLs: once for all jobs that share them. `kernel_cache` is the folder
-    of compiled kernels, a fresh one if None. `denoised_output`, if given, is the EXR file for the denoised image."""
+    of compiled kernels, a fresh one if None. `cold` asks for times that include compilation. `denoised_output`, if
+    given, is the EXR file for the denoised image."""
 
     label: str
     integrator: str
@@ -60,6 +54,7 @@ class Job:
     vpl_folder: str | None = None
     denoised_output: str | None = None
     kernel_cache: str | None = None
+    cold: bool = False
     run: str | None = None
 
 
@@ -68,12 +63,12 @@ def run(job, tick=lambda: None):
 
     `width`, `height`; `load_seconds`; `load_average` (before the run, see machine.load); `cold_seconds` (the first
     pass, compilation included; None if the kernel cache was not empty); `warm_seconds` (mean of the later passes that
-    are in the image, None if there are none); `seconds`, `spp`, `passes` (of the image); `pass_spp`;
-    `cold_pass_kept`; `peak_memory_bytes`; `statistics` (the integrator's counters, added up, {} if it has none);
-    `rays_per_sample`, `bounds_per_sample`, `cut_size_per_sample` (per pixel sample, None if not counted); `vpl_output`
-    (the EXR file with what `vpl` made of the same passes, None if not asked for); `denoise_seconds` and
-    `cold_denoise_seconds` (what denoising takes beyond that, the second time and, compilation included, the first; None
-    if not asked for).
+    are in the image, None if there are none); `seconds`, `spp`, `passes` (of the image); `pass_spp`; `cold_pass_kept`
+    (whether the first pass is in the image, as `cold` asks for); `peak_memory_bytes`; `statistics` (the integrator's
+    counters, added up, {} if it has none); `rays_per_sample`, `bounds_per_sample`, `cut_size_per_sample` (per pixel
+    sample, None if not counted); `vpl_output` (the EXR file with what `vpl` made of the same passes, None if not asked
+    for); `denoise_seconds` and `cold_denoise_seconds` (what denoising takes beyond that, the second time and,
+    compilation included, the first; None if not asked for).
 
     After a failure it holds `error` (one line) and `traceback` instead. `tick` is called every half second. The process
     ends with this one, even if this one is killed.
@@ -125,9 +120,9 @@ def render(job):
     load_seconds = time.perf_counter() - begin
 
     progressive = Progressive(scene, job.seed)
-    cold, kept = _measure(progressive, job)
+    cold = measure(progressive, job)
     passes, spp, pixels = progressive.passes, progressive.spp, progressive.pixels
-    warm = [one.seconds for one in passes[1 if kept else 0 :]]
+    warm = [one.seconds for one in passes[1 if job.cold else 0 :]]
     statistics = total_statistics(passes)
     result = {
         "parameters": parameters,
@@ -140,7 +135,7 @@ def render(job):
         "spp": spp,
         "passes": len(passes),
         "pass_spp": max(one.spp for one in passes),
-        "cold_pass_kept": kept,
+        "cold_pass_kept": job.cold,
         "peak_memory_bytes": _peak_memory(),
         "statistics": statistics,
     }
@@ -177,76 +172,6 @@ def _parse(job):
         file.set_max_depth(job.max_depth)
     file.set_integrator(job.integrator, job.parameters)
     return file
-
-
-def _measure(progressive, job):
-    """Render the passes of a job. Return the seconds of the first, cold pass, and whether it is in the image.
-
-    It is not, so that times are warm, unless it alone took more than the budget (or `LONG_PASS`). Nor are those that
-    compile the kernels of a smaller last pass.
-    """
-    unused = (pass_seed(job.seed, index) for index in count(UNUSED_PASSES))
-    sizes = pass_sizes(job.spp, progressive.pixels, job.pass_spp) if job.spp else [job.pass_spp or 1]
-    cold = progressive.render(sizes[0], next(unused)).seconds
-    kept = cold > (job.budget or LONG_PASS)
-    if not kept:
-        for spp in {*sizes} - {sizes[0]}:
-            progressive.render(spp, next(unused))
-        progressive.restart()
-    if job.spp:
-        for spp in sizes[len(progressive.passes) :]:
-            progressive.render(spp)
-    elif not kept:
-        spp, start = (job.pass_spp, 0.0) if job.pass_spp else _samples_of_a_pass(progressive, job.budget, unused)
-        progressive.restart()
-        following = spp
-        while following:
-            progressive.render(following)
-            following = _samples_that_fit(progressive, spp, job.budget, start)
-    return cold, kept
-
-
-def _samples_that_fit(progressive, spp, budget, start):
-    """Return the samples per pixel of the next pass, 0 if the budget is used up: `spp`, or in the last pass as many as
-    there is time for, when it has been started in `start` seconds. Fewer than `WARM_SPP` are not worth one, unless
-    `spp` is; whether that many are still rendered is decided by what is nearer to the budget."""
-    if progressive.passes[-1].spp < spp:
-        return 0
-    sampling = progressive.seconds - len(progressive.passes) * start
-    each, least = max(sampling, 0.1 * progressive.seconds) / progressive.spp, min(spp, WARM_SPP)
-    left = budget - progressive.seconds
-    if left - start >= least * each:
-        return min(spp, int((left - start) / each))
-    return least if left > (start + least * each) / 2 else 0
-
-
-def _samples_of_a_pass(progressive, budget, seeds):
-    """Return the samples per pixel of the passes that a budget is divided into, found by rendering some, and the
-    seconds that starting one takes.
-
-    Of about `PASSES_IN_BUDGET` passes, or of fewer where starting them (every pass has VPLs of its own, and
-    trees) would take more than `START_SHARE` of the time; one sample, and no time to start that is known, if even that
-    takes half of the budget.
-    """
-    largest = largest_pass(progressive.pixels)
-    if largest < WARM_SPP:
-        return 1, 0.0
-    first = progressive.render(1, next(seeds)).seconds
-    if first > budget / 2:
-        return 1, 0.0
-    progressive.render(WARM_SPP, next(seeds))  # compiles
-    more = progressive.render(WARM_SPP, next(seeds)).seconds - first
-    each = max(more, 0.01 * first) / (WARM_SPP - 1)
-    start = max(first - each, 0)
-    affordable = START_SHARE * budget / start if start > 0 else PASSES_IN_BUDGET
-    seconds = budget / np.clip(int(affordable), 1, PASSES_IN_BUDGET)  # of one pass
-    spp = int(np.clip((seconds - start) / each, 1, largest))
-    for _ in range(3):
-        taken = progressive.render(spp, next(seeds)).seconds
-        if taken <= 1.1 * seconds:
-            break
-        spp = max(int(spp * seconds / taken), 1)
-    return spp, start
 
 
 def _render_vpl(job, passes, described):

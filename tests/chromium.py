@@ -88,12 +88,28 @@ class Chromium:
             self._mouse("mouseMoved", x + step * (to_x - x), y + step * (to_y - y), 1)
         self._mouse("mouseReleased", to_x, to_y, 0)
 
-    def wheel(self, x, y, by):
-        self._call("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=by)
+    def wheel(self, x, y, by, control=False):
+        turned = {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": by, "modifiers": 2 * control}
+        self._call("Input.dispatchMouseEvent", **turned)
 
-    def press(self, key):
+    def move(self, x, y):
+        self._mouse("mouseMoved", x, y, 0)
+
+    def press(self, key, shift=False):
+        code = f"Digit{key}" if key.isdecimal() else ""
         for kind in ("keyDown", "keyUp"):
-            self._call("Input.dispatchKeyEvent", type=kind, key=key)
+            self._call("Input.dispatchKeyEvent", type=kind, key=key, code=code, modifiers=8 * shift)
+
+    def look(self, width, height, dark=False):
+        """Give the window a size, in CSS pixels, and a preference for dark pages or light ones."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self._call("Emulation.setDeviceMetricsOverride", **size)
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self._call("Emulation.setEmulatedMedia", features=[scheme])
+
+    def run_scripts(self, allowed):
+        """Say whether pages that are loaded from now on may run scripts."""
+        self._call("Emulation.setScriptExecutionDisabled", value=not allowed)
 
     def screenshot(self, path):
         """Write what the window shows to a PNG file."""

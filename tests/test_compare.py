@@ -181,76 +181,6 @@ def test_worker_measures_within_a_time_budget(tmp_path):
     assert image.shape == (16, 16, 3) and metadata["integrator"] == "path"
 
 
-class Recorded(rendering.Progressive):
-    """A render that takes as long as it is told, by default a second a sample after ``start``, and remembers what it
-    was asked for."""
-
-    def __init__(self, pixels, *seconds, start=0.0):
-        self._pixels, self._seconds, self._start, self.asked = pixels, list(seconds), start, []
-        self.restart()
-
-    pixels = property(lambda self: self._pixels)
-
-    def render(self, spp, seed=None):
-        self.asked.append((spp, seed is not None))
-        seconds = self._seconds.pop(0) if self._seconds else self._start + spp
-        self.passes.append(rendering.Pass(seed or 0, spp, seconds))
-        return self.passes[-1]
-
-
-def test_kernels_of_every_size_of_pass_are_compiled_before_the_clock_runs():
-    job = worker.Job("p", "path", "s.xml", "a.exr", spp=19)
-    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 9, 2.0)
-    assert worker._measure(progressive, job) == (2.0, False)
-    assert progressive.asked == [(9, True), (1, True), (9, False), (9, False), (1, False)]
-    assert sum(one.spp for one in progressive.passes) == 19
-    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 9, worker.LONG_PASS + 1)
-    assert worker._measure(progressive, job) == (worker.LONG_PASS + 1, True)  # too long to be rendered twice
-    assert progressive.asked == [(9, True), (9, False), (1, False)]
-
-
-@pytest.mark.parametrize(
-    ("budget", "pass_spp", "passes"),
-    [
-        (35, 10, [10, 10, 10, 5]),
-        (30, 10, [10, 10, 10]),
-        (33, 10, [10, 10, 10, 4]),  # 4 are nearer to 3 than none
-        (31, 10, [10, 10, 10]),
-        (4.9, 2, [2, 2]),
-        (5.6, 2, [2, 2, 2]),
-        (3.4, 1, [1, 1, 1]),
-        (12, 10, [10]),
-    ],
-)
-def test_the_last_pass_fills_the_budget(budget, pass_spp, passes):
-    progressive = Recorded(100)
-    worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget, pass_spp=pass_spp))
-    assert [one.spp for one in progressive.passes] == passes
-    assert abs(progressive.seconds - budget) <= min(pass_spp, worker.WARM_SPP) / 2
-
-
-@pytest.mark.parametrize(
-    ("budget", "start", "passes"),
-    [
-        (30, 2, [8, 8, 8]),
-        (30, 4, [11, 11]),  # starting them takes no more than three tenths
-        (30, 15, [1, 1]),  # one sample takes half of it
-        (10_000, 0, [2048, 2048, 2048, 2048, 1808]),  # the largest pass
-    ],
-)
-def test_passes_are_as_large_as_the_cost_of_starting_one_asks_for(budget, start, passes):
-    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 2048, start=float(start))
-    worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget))
-    assert [one.spp for one in progressive.passes] == passes and abs(progressive.seconds - budget) <= 2
-
-
-def test_passes_may_turn_out_to_be_slower_or_faster():
-    assert worker._samples_of_a_pass(Recorded(100, 1.0, 4.0, 4.0, 50.0), 30, iter(range(100)))[0] == 2
-    progressive = Recorded(100, 13.0, 13.0, 16.0, 16.0, 30.0, 25.5, start=12.0)
-    worker._measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=30))
-    assert progressive.seconds == 25.5  # four more samples would take 15 seconds
-
-
 def test_worker_that_dies_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr(worker.sys, "executable", "/bin/false")
     result = worker.run(worker.Job("p", "path", CORNELL, str(tmp_path / "a.exr"), spp=1))
@@ -419,3 +349,15 @@ def test_usage_errors(arguments, message, capsys):
         status = error.code
     assert status == 2
     assert message in capsys.readouterr().err
+
+
+def test_cold_images_begin_with_empty_kernel_caches(tmp_path, capsys):
+    status = compare.main([
+        CORNELL, "-i", "path", "--cold", "--spp", "2", "--seeds", "2", "--width", "16", "-r", "path:64", "--cache",
+        str(tmp_path / "cache"), "-o", str(tmp_path),
+    ])  # fmt: skip
+    assert status == 0, capsys.readouterr().out
+    renders = json.loads((tmp_path / "results.json").read_text())["scenes"][0]["renders"]
+    assert len(renders) == 2
+    for render in renders:
+        assert render["cold"] and render["cold_pass_kept"] and render["seconds"] == render["cold_seconds"]

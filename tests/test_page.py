@@ -22,7 +22,7 @@ def results_of(out):
 
 
 def unpack(packed):
-    """Image codes as viewer.js unpacks them."""
+    """Image codes as pixels.js unpacks them."""
     planes = np.frombuffer(zlib.decompress(base64.b64decode(packed["data"])), np.uint8)
     shape = (packed["depth"], packed["channels"], packed["height"], packed["width"])
     planes = planes.reshape(shape).astype(np.uint16)
@@ -46,6 +46,22 @@ def test_planes_survive_their_encoding():
     assert unpack(page_images.plane(np.array([[np.nan, -1, 2, 0.5]])))[..., 0].tolist() == [[255, 0, 255, 128]]
 
 
+def test_errors_survive_their_encoding():
+    errors = np.geomspace(1e-4, 10, 200).reshape(10, 20)
+    low, high = page_images.RELATIVE_ENDS
+    found = low * (high / low) ** (unpack(page_images.relative(errors))[..., 0] / 255)
+    np.testing.assert_allclose(found, errors, rtol=0.025)
+    errors = np.linspace(-1, 1, 200).reshape(10, 20)
+    roots = (unpack(page_images.signed(errors))[..., 0] - 127.5) / 127.5
+    np.testing.assert_allclose(roots * np.abs(roots), errors, atol=0.01)
+    assert unpack(page_images.signed(np.array([[-5, np.inf, 0.0]])))[..., 0].tolist() == [[0, 255, 128]]
+
+
+def test_stills_are_jpeg_files():
+    still = page_images.jpeg(np.full((8, 8, 3), 200, np.uint8))
+    assert still.startswith("data:image/jpeg;base64,") and base64.b64decode(still.partition(",")[2])[:2] == b"\xff\xd8"
+
+
 def test_large_images_are_shown_by_means_of_blocks(monkeypatch):
     image = np.random.default_rng(0).random((7, 5, 3))
     assert page_images.reduce(image) is image
@@ -62,7 +78,7 @@ def test_large_images_are_shown_by_means_of_blocks(monkeypatch):
 
 def test_page_needs_nothing_else(swept):
     page = (swept / "report.html").read_text()
-    assert not re.findall(r"""(?:src|href)=["'](?!data:|#)[^"']*""", page)
+    assert not re.findall(r"""(?:src|href)=["'](?!data:|#)[^"']*""", page)  # links to EXR files are made by scripts
     assert not re.findall(r"@import|url\((?!#|data:)", page)
     assert len(page) < 1_000_000
     figures = re.findall("<figure>(<svg.*?</svg>)", page, flags=re.DOTALL)
@@ -111,7 +127,7 @@ def choose(page, selector, value):
 
 def shown(page):
     """The names in the corners, and where the cut between the pictures is, as a share of the stage."""
-    names = page.value("['left', 'right'].map((side) => document.querySelector(`.badge.${side}`).textContent)")
+    names = page.value("['left', 'right'].map((side) => document.querySelector(`.badge.${side} b`).textContent)")
     cut = page.value(
         "parseFloat(document.querySelector('.over').style.clipPath.match(/([0-9.]+)px\\)/)[1]) / "
         "document.querySelector('.over').width"
@@ -148,7 +164,7 @@ def test_errors_are_shown(page, swept):
     expected = images.read_png(swept / "cornell.path.spp=1.error.png").astype(int)
     for x, y in ((3, 4), (12, 8), (20, 20)):
         np.testing.assert_allclose(pixel(page, ".under", x, y), expected[y, x], atol=4)
-    for kind in ("distance", "flip"):
+    for kind in ("signed", "distance", "flip"):
         choose(page, ".kind", kind)
         assert shown(page)[0][0] == f"path spp=1: {kind}"
     choose(page, ".kind", "image")
@@ -181,12 +197,12 @@ def test_a_click_flips(page):
     assert shown(page)[0] == ["path spp=1", "reference"]
 
 
-def test_the_wheel_zooms_and_pictures_move(page):
+def test_the_wheel_zooms_with_control_and_pictures_move(page):
     transform = "document.querySelector('.under').style.transform"
     x, y = page.centre(".stage")
     page.click(".fit")
     before = page.value(transform)
-    page.wheel(x - 60, y, -100)
+    page.wheel(x - 60, y, -100, control=True)
     page.wait(f"{transform} !== {json.dumps(before)}")
     zoomed = page.value(transform)
     page.drag(x - 60, y, x - 80, y)

@@ -1,6 +1,8 @@
-"""Files that a sweep writes, strips of pictures, and --check."""
+"""Files that a sweep writes, and strips of pictures."""
 
+import html
 import json
+import re
 from pathlib import Path
 
 import jsonschema
@@ -9,10 +11,9 @@ import numpy as np
 import pytest
 
 import compare
-from comparison import analysis, baseline, images, metrics, references, report, strip, tables
-from comparison.command_line import UsageError
+from comparison import analysis, images, metrics, plots, references, strip, tables
 
-from .conftest import CORNELL, SWEEP
+from .conftest import CORNELL
 
 ROOT = Path(__file__).resolve().parent.parent
 SCHEMA = json.loads((ROOT / "comparison" / "results.schema.json").read_text())
@@ -175,19 +176,69 @@ def test_readings_say_what_is_not_known():
     assert tables.equal_costs({}, "seconds") == []
 
 
-def test_times_that_include_compilation_are_named():
-    renders = [
-        {"label": "a", "setting": "spp=4", "load_average": 0.0, "cold_pass_kept": kept, "cold_seconds": cold}
-        for kept, cold in ((True, 70.0), (True, None), (False, 2.0))
+def of_budget(label, *seconds, budget=10.0):
+    """Runs of an integrator with some seeds."""
+    return [
+        {"label": label, "setting": "", "seed": seed, "load_average": 0.0, "budget": budget, "seconds": one}
+        for seed, one in enumerate(seconds)
     ]
-    assert tables.warnings({"renders": renders[1:]}, cores=2) == []
-    assert "The time of a spp=4 includes compilation" in tables.warnings({"renders": renders}, cores=2)[0]
+
+
+def test_times_that_are_not_equal_are_named():
+    failed = [{"label": "c", "setting": "", "load_average": 0.0, "budget": 10.0, "error": "no memory"}]
+    renders = of_budget("a", 9.0, 11.0) + of_budget("b", 10.9) + failed
+    assert tables.warnings({"renders": renders}, cores=2) == []
+    renders += of_budget("long", 14.0) + of_budget("other", 20.0, budget=20.0)
+    (warning,) = tables.warnings({"renders": renders}, cores=2)
+    assert warning == "Not at equal time: of 10 s, a took 10 s and long 14 s."
+    given_samples = of_budget("a", 1.0, budget=None) + of_budget("b", 9.0, budget=None)
+    assert tables.warnings({"renders": given_samples}, cores=2) == []
+
+
+def test_errors_that_the_noise_hides_are_named():
+    points = [
+        {"label": label, "setting": "spp=4", "cost": cost, "below_noise": label != "b"}
+        for cost in analysis.COSTS for label in "abc"
+    ]  # fmt: skip
+    (warning,) = tables.warnings({"renders": [], "points": points}, cores=2)
+    assert "hides the error of a spp=4, c spp=4:" in warning
 
 
 def test_a_busy_machine_is_named():
-    scene = {"renders": [{"load_average": 1.0}, {"load_average": 3.5}]}
+    scene = {"renders": of_budget("a", 1.0) + of_budget("b", 1.0)}
+    scene["renders"][1]["load_average"] = 3.5
     assert tables.warnings(scene, cores=4) == []
     assert "load 3.5 on 2 cores" in tables.warnings(scene, cores=2)[0]
+
+
+def test_errors_at_one_setting_each_are_bars():
+    renders = [
+        run | {"rays_per_sample": None, "errors": {"relmse": error, "noise": {"relmse": noise}}}
+        for run, error, noise in (
+            (of_budget("a", 3.0)[0], 0.1, 0.0), (of_budget("b", 4.0)[0], 0.02, 0.05), (of_budget("c", 5.0)[0], 0.0, 0.0)
+        )
+    ]  # fmt: skip
+    ((_, of), _) = analysis.points(renders, "relmse")
+    svg = plots.error_bars(of, ["a", "b", "c"], "relmse")
+    texts = re.findall(r"<text[^>]*>([^<]*)</text>", svg)
+    assert {"a", "b", "c", "0.1, 3 s", "&lt; 0.05, 4 s"} <= set(texts)
+    assert "currentColor" in svg and "#010203" not in svg
+
+
+def test_page_begins_with_the_verdict(swept):
+    """The sentence, warnings, and a table of scenes and integrators."""
+    results, page = results_of(swept), (swept / "report.html").read_text()
+    page = html.unescape(page)
+    (first, *_) = results["summary"]["sentences"]
+    places = [page.index(text) for text in (f'<p class="headline">{first}', '<table class="summary">', "<h2>cornell")]
+    assert places == sorted(places)
+    for scene in results["scenes"]:
+        for warning in tables.doubts(scene):
+            assert page.index(warning) < places[1]
+    assert results["summary"]["base"] == "path" and list(results["summary"]["scenes"]["cornell"]) == [
+        "path", "lightcuts", "vpl",
+    ]  # fmt: skip
+    assert "error ÷ path’s" in page
 
 
 # --- Strips ---
@@ -230,95 +281,3 @@ def test_strip_refuses(swept, tmp_path, capsys, arguments, message):
 def test_strip_needs_a_comparison(tmp_path, capsys):
     assert strip.main([str(tmp_path), "--output", str(tmp_path / "a.png")]) == 2
     assert "no results.json in" in capsys.readouterr().err
-
-
-# --- --check ---
-
-
-def fake_results(speed_up):
-    """Results of two integrators whose errors are inverse to their time, the second of them so many times faster."""
-    renders = [
-        {
-            "label": label, "setting": f"spp={spp}", "seed": 0, "seconds": spp / factor, "rays_per_sample": None,
-            "spp": spp, "errors": {"relmse": 1 / spp, "noise": {"relmse": 0}},
-        }
-        for label, factor in (("path", 1.0), ("fast", speed_up)) for spp in (1, 4, 16)
-    ]  # fmt: skip
-    scene = {"name": "box", "renders": renders}
-    scene |= analysis.analyse(renders, ["path", "fast"], "relmse")
-    return {"format": report.FORMAT, "metrics": {"compared": "relmse"}, "scenes": [scene]}
-
-
-def test_single_points_are_not_compared_as_curves():
-    results = fake_results(5)
-    one, two = ([("path", f"spp={spp}"), ("fast", f"spp={spp}")] for spp in (4, 16))
-    (scene,) = without(results, *one, *two)["scenes"]
-    found = analysis.analyse(scene["renders"], ["path", "fast"], "relmse")
-    assert len(found["points"]) == 2 and found["equal_errors"] == found["equal_costs"] == {}
-    (scene,) = without(fake_results(5), *one, two[0])["scenes"]
-    assert analysis.analyse(scene["renders"], ["path", "fast"], "relmse")["equal_errors"]["seconds"]
-
-
-def test_check_finds_speed_ups_that_fell():
-    before = fake_results(5)
-    assert baseline.check(fake_results(4.2), before, 0.2) == []
-    lines = baseline.check(fake_results(3.5), before, 0.2)
-    assert len(lines) == 4 and lines[0].startswith(
-        "box: fast over path, seconds at error 0.1: 5× before, 3.5× now, 30%"
-    )
-    assert baseline.check(fake_results(3.5), before, 0.5) == []
-
-
-def without(results, *unwanted):
-    """The same results without the runs of some (label, setting)."""
-    for scene in results["scenes"]:
-        scene["renders"] = [one for one in scene["renders"] if (one["label"], one["setting"]) not in unwanted]
-    return results
-
-
-def test_check_finds_errors_that_are_no_longer_reached():
-    slow = [("fast", "spp=4"), ("fast", "spp=16")]
-    lines = baseline.check(without(fake_results(5), *slow), fake_results(5), 0.2)
-    assert len(lines) == 3 and all(line.endswith(": 5× before, not reached now") for line in lines)
-    lines = baseline.check(without(fake_results(5), *slow, ("fast", "spp=1")), fake_results(5), 0.2)
-    assert len(lines) == 4 and all(line.endswith("no such curves now") for line in lines)
-    lines = baseline.check(without(fake_results(5), ("path", "spp=4"), ("path", "spp=16")), fake_results(5), 0.2)
-    assert len(lines) == 3 and all(line.endswith("not reached now by the first") for line in lines)
-
-
-def test_check_lets_pass_what_is_better_than_it_can_tell():
-    """Where even the cheapest setting is better than the error, a bound has to do."""
-    cheap = [("fast", "spp=1"), ("fast", "spp=4")]
-    assert len(baseline.check(without(fake_results(5), *cheap), fake_results(5), 0.2)) == 4
-    assert baseline.check(without(fake_results(100), *cheap), fake_results(5), 0.2) == []
-    lines = baseline.check(without(fake_results(5), ("path", "spp=1"), ("path", "spp=4")), fake_results(5), 0.2)
-    assert lines and all(line.endswith("only known by bounds now") for line in lines)
-
-
-def test_check_refuses_what_cannot_be_compared(tmp_path):
-    file = tmp_path / "a.json"
-    file.write_text(json.dumps(fake_results(5)))
-    assert baseline.read(file, "relmse", ["box", "other"])["scenes"][0]["name"] == "box"
-    with pytest.raises(UsageError, match="none of these scenes"):
-        baseline.read(file, "relmse", ["other"])
-    with pytest.raises(UsageError, match="are relmse, not rmse"):
-        baseline.read(file, "rmse", ["box"])
-    for content in ("{}", "[]", '{"format": 1}'):
-        file.write_text(content)
-        with pytest.raises(UsageError, match=r"is no results\.json of format 2"):
-            baseline.read(file, "relmse", ["box"])
-    file.write_text(json.dumps(fake_results(5) | {"scenes": []}))
-    with pytest.raises(UsageError, match="no speed-ups"):
-        baseline.read(file, "relmse", ["box"])
-
-
-def test_check_sets_the_exit_status(swept, tmp_path, capsys, monkeypatch):
-    """With everything finished, nothing is rendered again."""
-    monkeypatch.setattr("comparison.worker.run", lambda *_: pytest.fail("rendered again"))
-    results = results_of(swept)
-    entry = {"value": 1, "at_most": None, "low": None, "high": None, "speed_up": 1e9}
-    results["scenes"][0]["equal_errors"]["rays"] = [{"error": 0.05, "costs": {"lightcuts": entry, "vpl": entry}}]
-    (tmp_path / "baseline.json").write_text(json.dumps(results))
-    again = [*SWEEP, "-o", str(swept), "--cache", str(swept / "cache"), "--resume", "--check"]
-    assert compare.main([*again, str(tmp_path / "baseline.json")]) == 3
-    assert "vpl over lightcuts, rays at error 0.05: 1e+09× before" in capsys.readouterr().err

@@ -1,73 +1,30 @@
-"use strict";
 // The pictures of a scene: two of them, A and B, in place, split by a line that can be dragged, or flipped.
-// The pixels are those of comparison/page_images.py.
 
-const BITS_LEFT_OUT = 3;
-const palettes = JSON.parse(document.getElementById("palettes").textContent);
-
-// Linear colour of every code: half-precision numbers without sign.
-const linear = Float32Array.from({ length: 1 << (15 - BITS_LEFT_OUT) }, (_, code) => {
-  const half = code << BITS_LEFT_OUT, exponent = half >> 10, mantissa = half & 1023;
-  return exponent ? 2 ** (exponent - 15) * (1 + mantissa / 1024) : (2 ** -14 * mantissa) / 1024;
-});
-
-// Decode a picture into codes, one after another pixel by pixel.
-async function decode(packed) {
-  const bytes = Uint8Array.from(atob(packed.data), (letter) => letter.charCodeAt(0));
-  const inflated = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const planes = new Uint8Array(await new Response(inflated).arrayBuffer());
-  const { width, height, channels, depth } = packed, size = width * height * channels;
-  const codes = new Uint16Array(size), mask = depth === 1 ? 255 : 65535;
-  for (let channel = 0; channel < channels; channel++) {
-    for (let y = 0; y < height; y++) {
-      for (let x = 0, code = 0; x < width; x++) {
-        const at = (channel * height + y) * width + x;
-        code = (code + planes[at] + (depth === 2 ? planes[size + at] << 8 : 0)) & mask;
-        codes[(y * width + x) * channels + channel] = code;
-      }
-    }
-  }
-  return codes;
-}
-
-// The byte that a colour is shown as, for every code: exposure and the sRGB curve.
-function toneCurve(stops) {
-  return Uint8Array.from(linear, (value) => {
-    const exposed = Math.min(1, value * 2 ** stops);
-    return 255 * (exposed <= 0.0031308 ? 12.92 * exposed : 1.055 * exposed ** (1 / 2.4) - 0.055) + 0.5;
-  });
-}
-
-function paint(canvas, packed, codes, kind, stops) {
-  canvas.width = packed.width;
-  canvas.height = packed.height;
-  const context = canvas.getContext("2d"), pixels = context.createImageData(packed.width, packed.height);
-  const count = packed.width * packed.height, curve = kind === "image" ? toneCurve(stops) : null;
-  for (let i = 0; i < count; i++) {
-    for (let channel = 0; channel < 3; channel++) {
-      pixels.data[4 * i + channel] = curve ? curve[codes[3 * i + channel]] : palettes[kind][3 * codes[i] + channel];
-    }
-    pixels.data[4 * i + 3] = 255;
-  }
-  context.putImageData(pixels, 0, 0);
-}
+const HIGHEST = 640; // CSS pixels of a stage, unless it fills the screen
+const FURTHEST = 64; // zoom
 
 class Viewer {
   constructor(root) {
+    this.root = root;
     this.find = (selector) => root.querySelector(selector);
-    this.views = JSON.parse(this.find(".views").textContent);
-    this.stage = this.find(".stage");
-    this.decoded = new Map();
+    const { views, exposure, metric } = JSON.parse(this.find(".views").textContent);
+    Object.assign(this, { views, exposure, metric, stage: this.find(".stage") });
+    this.decoded = new Map(); // packed picture -> codes
+    this.painted = new Map(); // index of a view, kind and exposure -> canvas
     this.split = 0.5; // of the stage's width
     this.flipping = false;
     this.flipped = false;
+    this.picking = false; // an inset
     this.zoom = 1; // 1 fits
     this.origin = [0, 0]; // of the picture on the stage, CSS pixels
     for (const select of [this.find(".a"), this.find(".b")]) {
-      this.views.forEach((view, index) => select.add(new Option(view.title, index)));
+      views.forEach((view, index) => select.add(new Option(view.title, index)));
     }
     [this.find(".a").value, this.find(".b").value] = this.first();
+    this.tiles = new Tiles(this, this.find(".tiles"));
     this.listen();
+    root.classList.add("live");
+    this.say("");
     this.repaint();
   }
 
@@ -82,47 +39,130 @@ class Viewer {
   listen() {
     for (const name of [".a", ".b", ".kind"]) this.find(name).addEventListener("change", () => this.repaint());
     this.find(".exposure").addEventListener("input", () => this.repaint());
-    this.find(".flip").addEventListener("click", () => this.flip());
-    this.find(".split").addEventListener("click", () => {
-      this.flipping = this.flipped = false;
-      this.place();
-    });
     const centre = () => [this.stage.clientWidth / 2, this.stage.clientHeight / 2];
-    this.find(".in").addEventListener("click", () => this.scale(1.5, centre()));
-    this.find(".out").addEventListener("click", () => this.scale(1 / 1.5, centre()));
-    this.find(".fit").addEventListener("click", () => this.scale(0, [0, 0]));
-    this.stage.addEventListener("wheel", (event) => {
+    this.actions = {
+      flip: () => this.flip(),
+      split: () => this.setSplit(),
+      in: () => this.scale(1.5, centre()),
+      out: () => this.scale(1 / 1.5, centre()),
+      fit: () => this.scale(0, [0, 0]),
+      all: () => this.toggleTiles(),
+      inset: () => this.toggleInset(),
+      full: () => this.toggleFull(),
+    };
+    for (const [name, act] of Object.entries(this.actions)) this.find(`button.${name}`).addEventListener("click", act);
+    this.stage.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+    this.stage.addEventListener("pointermove", (event) => this.hover(event));
+    this.stage.addEventListener("pointerleave", () => this.say(""));
+    this.find(".handle").addEventListener("keydown", (event) => {
+      const step = { ArrowLeft: -0.02, ArrowRight: 0.02 }[event.key];
+      if (!step) return;
       event.preventDefault();
-      const box = this.stage.getBoundingClientRect();
-      this.scale(1.2 ** -Math.sign(event.deltaY), [event.clientX - box.left, event.clientY - box.top]);
-    }, { passive: false });
-    this.stage.addEventListener("keydown", (event) => this.key(event));
-    drag(this.find(".handle"), (dx, dy, x) => {
-      const box = this.stage.getBoundingClientRect();
-      this.moveSplit((x - box.left) / box.width - this.split);
+      event.stopPropagation();
+      this.moveSplit(step);
     });
-    drag(this.stage, (dx, dy) => this.move(dx, dy));
-    new ResizeObserver(() => this.place()).observe(this.stage.parentElement);
+    drag(this.find(".handle"), ({ x }) => this.moveSplit((x - this.stage.getBoundingClientRect().left) / this.stage.clientWidth - this.split));
+    drag(this.stage, (step) => (this.picking ? this.pick(step) : this.move(step.dx, step.dy)), () => this.picked());
+    const sizes = new ResizeObserver(() => this.place());
+    for (const element of [this.root, this.find(".tiles")]) sizes.observe(element);
   }
 
-  key(event) {
-    const step = { ArrowLeft: -0.02, ArrowRight: 0.02 }[event.key];
-    if (event.key === " ") this.flip();
-    else if (step && !this.flipping) this.moveSplit(step);
-    else return;
-    event.preventDefault();
+  // --- What is shown ---
+
+  get kind() {
+    return this.find(".kind").value;
+  }
+
+  get stops() {
+    return Number(this.find(".exposure").value);
+  }
+
+  // Indices of the views that can be seen.
+  visible() {
+    const [a, b] = [".a", ".b"].map((name) => Number(this.find(name).value));
+    return this.flipping ? [this.flipped ? b : a] : [a, b];
+  }
+
+  // Show one picture, whole.
+  show(index) {
+    if (!this.views[index]) return;
+    this.find(".a").value = index;
+    [this.flipping, this.flipped] = [true, false];
+    this.repaint();
+  }
+
+  // Show a picture on the right of the line.
+  showBeside(index) {
+    if (!this.views[index]) return;
+    this.find(".b").value = index;
+    this.flipping = this.flipped = false;
+    this.repaint();
+  }
+
+  // Show what another viewer does, as far as there is the same.
+  adopt(other) {
+    for (const name of [".a", ".b"]) {
+      const title = other.views[other.find(name).value].title;
+      const index = this.views.findIndex((view) => view.title === title);
+      if (index >= 0) this.find(name).value = index;
+    }
+    for (const name of [".kind", ".exposure"]) this.find(name).value = other.find(name).value;
+    if (!this.kind) this.find(".kind").value = "image";
+    [this.flipping, this.flipped, this.split] = [other.flipping, other.flipped, other.split];
+    this.tiles.are_shown = other.tiles.are_shown;
+    this.repaint();
   }
 
   flip() {
-    this.flipped = this.flipping && !this.flipped;
-    if (!this.flipping) this.flipped = true; // from the split, A being known, to B
+    this.flipped = this.flipping ? !this.flipped : true; // from the split, A being known, to B
     this.flipping = true;
+    this.place();
+  }
+
+  setSplit() {
+    this.flipping = this.flipped = false;
     this.place();
   }
 
   moveSplit(by) {
     this.split = Math.min(1, Math.max(0, this.split + by));
     this.place();
+  }
+
+  changeExposure(by) {
+    this.find(".exposure").value = this.stops + by;
+    this.repaint();
+  }
+
+  nextKind() {
+    const select = this.find(".kind");
+    select.selectedIndex = (select.selectedIndex + 1) % select.length;
+    this.repaint();
+  }
+
+  toggleTiles() {
+    this.tiles.are_shown = !this.tiles.are_shown;
+    this.place();
+  }
+
+  toggleFull(on = !this.root.classList.contains("full")) {
+    this.root.classList.toggle("full", on);
+    document.documentElement.classList.toggle("covered", on);
+    if (on && !document.fullscreenElement) document.documentElement.requestFullscreen?.().catch(() => {});
+    if (!on && document.fullscreenElement) document.exitFullscreen();
+    this.place();
+  }
+
+  // --- Zoom, and the part that is seen ---
+
+  wheel(event) {
+    if (!event.ctrlKey && !event.metaKey && !this.root.classList.contains("full")) {
+      this.say("Hold Ctrl to zoom with the wheel.");
+      return; // the page scrolls
+    }
+    event.preventDefault();
+    const box = this.stage.getBoundingClientRect();
+    this.scale(1.2 ** -Math.sign(event.deltaY), [event.clientX - box.left, event.clientY - box.top]);
   }
 
   move(dx, dy) {
@@ -133,72 +173,157 @@ class Viewer {
   // Zoom by a factor about a point of the stage; 0 fits again.
   scale(factor, about) {
     const old = this.zoom;
-    this.zoom = factor ? Math.min(64, Math.max(1, old * factor)) : 1;
+    this.zoom = factor ? Math.min(FURTHEST, Math.max(1, old * factor)) : 1;
     this.origin = this.origin.map((from, axis) => about[axis] - ((about[axis] - from) * this.zoom) / old);
     this.place();
   }
 
-  // The picture that a selection shows: images have no errors against themselves.
-  shown(selection) {
-    const view = this.views[this.find(selection).value], kind = this.find(".kind").value;
-    return view.maps[kind] ? [view, kind, view.maps[kind]] : [view, "image", view.image];
+  // CSS pixels of the stage that a pixel of the picture takes when it fits.
+  get fit() {
+    const { width, height } = this.views[0].image, isFull = this.root.classList.contains("full");
+    const others = this.find(".controls").offsetHeight + this.find(".tiles").offsetHeight + 80;
+    const highest = isFull ? window.innerHeight - others : HIGHEST;
+    const bar = this.find(".bar"), beside = bar.hidden ? 0 : bar.offsetWidth + 8;
+    return Math.min((this.find(".screen").clientWidth - beside) / width, Math.max(200, highest) / height);
+  }
+
+  // The part of the picture that is seen: [x, y, width, height] in its pixels.
+  region() {
+    const { width, height } = this.views[0].image, pixel = this.fit * this.zoom;
+    return [-this.origin[0] / pixel, -this.origin[1] / pixel, width / this.zoom, height / this.zoom];
+  }
+
+  // The pixel of the picture at a place of the window.
+  pixelAt({ x, y }) {
+    const box = this.stage.getBoundingClientRect(), pixel = this.fit * this.zoom, { width, height } = this.views[0].image;
+    const inside = (value, size) => Math.min(size - 1, Math.max(0, Math.floor(value / pixel)));
+    return [inside(x - box.left - this.origin[0], width), inside(y - box.top - this.origin[1], height)];
+  }
+
+  // --- Insets ---
+
+  toggleInset() {
+    this.picking = !this.picking && !this.tiles.inset;
+    this.tiles.inset = null;
+    this.say(this.picking ? "Drag a rectangle on the picture." : "");
+    this.place();
+  }
+
+  pick({ from, x, y }) {
+    const [a, b] = [this.pixelAt(from), this.pixelAt({ x, y })];
+    const low = a.map((one, axis) => Math.min(one, b[axis]));
+    this.tiles.inset = [...low, ...a.map((one, axis) => Math.abs(one - b[axis]) + 1)];
+    this.place();
+  }
+
+  picked() {
+    if (this.tiles.inset) this.picking = false;
+    this.place();
+  }
+
+  // --- Numbers under the pointer ---
+
+  say(text) {
+    this.find(".readout").textContent = text || this.find(".readout").dataset.help;
+  }
+
+  async hover(event) {
+    const [x, y] = this.pixelAt(event), parts = [];
+    for (const index of new Set(this.visible())) {
+      const view = this.views[index], at = y * view.image.width + x, codes = await this.codes(view.image);
+      const radiance = [0, 1, 2].map((channel) => Number((linear[codes[3 * at + channel]] / this.exposure).toPrecision(2)));
+      const map = view.maps[this.kind], error = map && maps[this.kind].number((await this.codes(map))[at]);
+      parts.push(`${view.title} ${radiance.join(" ")}${map ? ` (${maps[this.kind].text(error)})` : ""}`);
+    }
+    this.say(`x ${x}, y ${y}: ${parts.join(" | ")}`);
+  }
+
+  // --- Painting ---
+
+  codes(packed) {
+    if (!this.decoded.has(packed)) this.decoded.set(packed, decode(packed));
+    return this.decoded.get(packed);
+  }
+
+  // The kind in which a view is shown: references have no errors against themselves.
+  kindOf(view) {
+    return view.maps[this.kind] ? this.kind : "image";
+  }
+
+  // Return the painted picture of a view.
+  async picture(index) {
+    const view = this.views[index], kind = this.kindOf(view), key = `${kind} ${this.stops}`, old = this.painted.get(index);
+    if (old?.key === key) return old.canvas;
+    const packed = kind === "image" ? view.image : view.maps[kind];
+    const canvas = paint(packed, await this.codes(packed), kind, this.stops);
+    this.painted.set(index, { key, canvas });
+    return canvas;
   }
 
   async repaint() {
-    const turn = (this.turn = (this.turn || 0) + 1), stops = Number(this.find(".exposure").value);
-    this.find("output").textContent = `${stops > 0 ? "+" : ""}${stops} EV`;
-    const wanted = [this.shown(".a"), this.shown(".b")];
-    for (const [, , packed] of wanted) {
-      if (!this.decoded.has(packed)) this.decoded.set(packed, decode(packed));
+    const turn = (this.turn = (this.turn || 0) + 1), { stops, kind } = this;
+    this.find(".of-exposure").hidden = kind === "flip";
+    this.find(".of-exposure output").textContent = `${stops > 0 ? "+" : ""}${stops} EV`;
+    this.find(".bar").hidden = kind === "image";
+    if (kind !== "image") {
+      paintScale(this.find(".bar canvas"), kind);
+      maps[kind].ends(stops).forEach((text, i) => (this.root.querySelectorAll(".bar output")[i].textContent = text));
     }
-    const codes = await Promise.all(wanted.map(([, , packed]) => this.decoded.get(packed)));
+    const indices = [".a", ".b"].map((name) => Number(this.find(name).value));
+    const pictures = await Promise.all(indices.map((index) => this.picture(index)));
     if (turn !== this.turn) return; // something else was asked for meanwhile
-    ["under", "over"].forEach((name, i) => paint(this.find(`.${name}`), wanted[i][2], codes[i], wanted[i][1], stops));
-    this.titles = wanted.map(([view, kind]) => (kind === "image" ? view.title : `${view.title}: ${kind}`));
+    ["under", "over"].forEach((name, i) => {
+      const canvas = this.find(`.${name}`);
+      Object.assign(canvas, { width: pictures[i].width, height: pictures[i].height });
+      canvas.getContext("2d").drawImage(pictures[i], 0, 0);
+    });
+    this.names = indices.map((index) => {
+      const view = this.views[index], kind = this.kindOf(view);
+      const title = kind === "image" ? view.title : `${view.title}: ${kind}`;
+      return [title, view.error];
+    });
     this.place();
     this.stage.dataset.painted = turn;
   }
 
-  // Put canvases, line and names where they belong.
+  // Put canvases, line, frame and names where they belong.
   place() {
-    const under = this.find(".under"), over = this.find(".over"), handle = this.find(".handle");
-    const width = this.stage.parentElement.clientWidth, fit = Math.min(width / under.width, 640 / under.height);
-    this.stage.style.width = `${under.width * fit}px`;
-    this.stage.style.height = `${under.height * fit}px`;
-    const size = [under.width * fit, under.height * fit];
+    if (!this.names) return;
+    const under = this.find(".under"), over = this.find(".over"), handle = this.find(".handle"), { fit } = this;
+    const size = [under.width * fit, under.height * fit], pixel = fit * this.zoom;
+    Object.assign(this.stage.style, { width: `${size[0]}px`, height: `${size[1]}px` });
     this.origin = this.origin.map((from, axis) => Math.min(0, Math.max(from, size[axis] * (1 - this.zoom))));
     for (const canvas of [under, over]) {
-      canvas.style.transform = `translate(${this.origin[0]}px, ${this.origin[1]}px) scale(${fit * this.zoom})`;
+      canvas.style.transform = `translate(${this.origin[0]}px, ${this.origin[1]}px) scale(${pixel})`;
     }
     const line = this.flipping ? (this.flipped ? 0 : size[0]) : this.split * size[0];
-    const cut = Math.min(over.width, Math.max(0, (line - this.origin[0]) / (fit * this.zoom)));
-    over.style.clipPath = `inset(0 0 0 ${cut}px)`;
+    over.style.clipPath = `inset(0 0 0 ${Math.min(over.width, Math.max(0, (line - this.origin[0]) / pixel))}px)`;
     handle.style.left = `${line}px`;
     handle.setAttribute("aria-valuenow", Math.round(100 * this.split));
-    this.stage.classList.toggle("flipping", this.flipping);
-    this.find(".flip").setAttribute("aria-pressed", this.flipping);
-    this.find(".split").setAttribute("aria-pressed", !this.flipping);
-    const [a, b] = this.titles || ["", ""];
-    this.find(".badge.left").textContent = this.flipping && this.flipped ? "" : a;
-    this.find(".badge.right").textContent = this.flipping && !this.flipped ? "" : b;
+    for (const [name, on] of Object.entries({ flipping: this.flipping, picking: this.picking, zoomed: this.zoom > 1 })) {
+      this.stage.classList.toggle(name, on);
+    }
+    const pressed = { flip: this.flipping, split: !this.flipping, all: this.tiles.are_shown,
+      inset: this.picking || Boolean(this.tiles.inset), full: this.root.classList.contains("full") };
+    for (const [name, on] of Object.entries(pressed)) this.find(`button.${name}`).setAttribute("aria-pressed", on);
+    this.frame(pixel);
+    const [left, right] = [!this.flipping || !this.flipped, !this.flipping || this.flipped];
+    this.label(".badge.left", left ? this.names[0] : ["", ""]);
+    this.label(".badge.right", right ? this.names[1] : ["", ""]);
+    this.tiles.draw();
+  }
+
+  frame(pixel) {
+    const frame = this.find(".frame"), { inset } = this.tiles;
+    frame.hidden = !inset;
+    if (!inset) return;
+    const [left, top] = [0, 1].map((axis) => this.origin[axis] + inset[axis] * pixel);
+    Object.assign(frame.style, { left: `${left}px`, top: `${top}px`, width: `${inset[2] * pixel}px`, height: `${inset[3] * pixel}px` });
+  }
+
+  label(selector, [title, error]) {
+    this.find(`${selector} b`).textContent = title;
+    this.find(`${selector} span`).textContent = error;
+    this.find(`${selector} span`).dataset.metric = this.metric;
   }
 }
-
-// Call `move` with the pointer's steps, and where it is, while it is held down on an element.
-function drag(element, move) {
-  element.addEventListener("pointerdown", (event) => {
-    if (event.target !== element && event.target.tagName !== "CANVAS") return;
-    element.setPointerCapture(event.pointerId);
-    let [x, y] = [event.clientX, event.clientY];
-    const step = (next) => {
-      move(next.clientX - x, next.clientY - y, next.clientX);
-      [x, y] = [next.clientX, next.clientY];
-    };
-    element.addEventListener("pointermove", step);
-    for (const end of ["pointerup", "pointercancel"]) {
-      element.addEventListener(end, () => element.removeEventListener("pointermove", step), { once: true });
-    }
-  });
-}
-
-for (const root of document.querySelectorAll(".viewer")) new Viewer(root);

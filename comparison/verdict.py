@@ -1,0 +1,208 @@
+"""What a comparison comes to: each integrator beside the first, scene by scene, by geometric means, and in a sentence.
+
+All ratios are an integrator's number over the first one's, so that less than 1 is better. Where there are curves they
+are geometric means of what is read off these, else they are those of single images. The time that the first integrator
+would take for the error of another's image is then told only where it is one of Mitsuba's own: by its error, which
+falls with its samples, while that of others need not.
+"""
+
+import numpy as np
+
+from . import analysis, curves, metrics, tables
+
+UNBIASED = ("path", "direct", "volpath", "volpathmis", "ptracer")
+KINDS = ("error", "time")
+ALIKE = 1.05  # ratios up to this, and down to its inverse, are no difference where there is no interval
+PARTS = ("half", "a third", "a quarter", "a fifth", "a sixth", "a seventh", "an eighth", "a ninth", "a tenth")
+
+
+def summarise(scenes, metric):
+    """Return the "summary" of results.schema.json for the results of some scenes."""
+    labels = list(dict.fromkeys(render["label"] for scene in scenes for render in scene["renders"]))
+    rows = {scene["name"]: _row(scene, labels, metric) for scene in scenes}
+    means = {
+        label: {kind: _over_scenes([row[label][kind] for row in rows.values() if label in row]) for kind in KINDS}
+        for label in labels[1:]
+    }
+    order = sorted(means, key=lambda label: (means[label]["time"] or means[label]["error"] or {}).get("value", np.inf))
+    sentences = [text for label in order if (text := _sentence(label, labels[0], rows))]
+    if means and not sentences:
+        verb = "compares" if len(order) == 1 else "compare"
+        sentences = [f"How {_listed(order)} {verb} with {labels[0]} cannot be told from these runs."]
+    return {"base": labels[0] if labels else None, "scenes": rows, "means": means, "sentences": sentences}
+
+
+def _row(scene, labels, metric):
+    """Return what there is to say of the integrators of a scene: a dict from labels."""
+    of = dict(analysis.points(scene["renders"], metric))["seconds"]
+    found = {}
+    for label in labels:
+        points = [point for point in of if point.label == label]
+        if not points:
+            continue
+        best = min(points, key=lambda point: np.mean(list(point.error.values())))
+        errors = [
+            render["errors"] for render in scene["renders"]
+            if "errors" in render and (render["label"], render["setting"]) == (label, best.name)
+        ]  # fmt: skip
+        found[label] = {
+            "setting": best.name,
+            "seconds": float(np.mean(list(best.cost.values()))),
+            "measured": float(np.mean(list(best.error.values()))),
+            "hidden": best.mean() is None,
+            "bias": float(np.mean([one["bias"] for one in errors])),
+            "error": None,
+            "time": None,
+        }
+    if labels and labels[0] in found:
+        for label in found:
+            if label != labels[0]:
+                found[label] |= _ratios(scene, of, labels[0], label, metric)
+    return found
+
+
+def _ratios(scene, of, base, label, metric):
+    """Return "error" (at equal time) and "time" (at equal error) of a label over the first one, None if not known."""
+    at_errors, at_costs = (scene.get(key, {}).get("seconds") for key in ("equal_errors", "equal_costs"))
+    if at_errors:
+        return {
+            "time": _read_off([entry["costs"] for entry in at_errors], base, label),
+            "error": _read_off([entry["errors"] for entry in at_costs], base, label),
+        }
+    first, other = (next(point for point in of if point.label == name) for name in (base, label))
+    seconds = sorted(float(np.mean(list(point.cost.values()))) for point in (first, other))
+    is_equal_time = seconds[1] <= (1 + tables.UNEQUAL) * seconds[0]
+    error = _of_points(first, other, lambda cost, error: error) if is_equal_time else None
+    integrator = next(render["integrator"] for render in scene["renders"] if render["label"] == base)
+    if integrator not in UNBIASED:
+        return {"error": error, "time": None}
+    power = 1 if metric in metrics.SQUARED else 2
+    time = _of_points(first, other, lambda cost, error: cost * error**power)
+    return {"error": error, "time": time and time | {"extrapolated": True}}
+
+
+def _ratio(value, bound=None, low=None, high=None):
+    """Return a ratio; `bound` says that it is "at_most" or "at_least" this."""
+    return {"value": float(value), "bound": bound, "low": low, "high": high, "extrapolated": False}
+
+
+def _read_off(entries, base, label):
+    """Return the geometric mean of what was read off two curves; a bound where nothing else is known."""
+    readings = [entry[label] for entry in entries if label in entry and base in entry]
+    exact = [one for one in readings if one["speed_up"]]
+    if exact:
+        ends = [None, None]
+        if all(one["speed_up_low"] for one in exact):
+            ends = [1 / _mean(one[f"speed_up_{end}"] for one in exact) for end in ("high", "low")]
+        return _ratio(1 / _mean(one["speed_up"] for one in exact), None, *ends)
+    least = [one["speed_up_at_least"] for one in readings if one["speed_up_at_least"]]
+    if least:
+        return _ratio(1 / _mean(least), "at_most")
+    pairs = [(entry[label]["value"], entry[base]["at_most"]) for entry in entries if label in entry and base in entry]
+    over = [value / most for value, most in pairs if value and most]
+    return _ratio(_mean(over), "at_least") if over else None
+
+
+def _of_points(first, other, value):
+    """Return the ratio of `value(cost, error)` of two points; a bound where the noise hides one error."""
+
+    def ratio(without):
+        pair = [point.mean(without) for point in (other, first)]
+        return value(*pair[0]) / value(*pair[1]) if all(pair) else None
+
+    if exact := ratio(None):
+        return _ratio(exact, None, *curves.interval(ratio, sorted({*first.cost, *other.cost})))
+    means, bounds = ([at(point) for point in (other, first)] for at in (curves.Point.mean, curves.Point.bound))
+    if bounds[0] and means[1]:
+        return _ratio(value(*bounds[0]) / value(*means[1]), "at_most")
+    return _ratio(value(*means[0]) / value(*bounds[1]), "at_least") if means[0] and bounds[1] else None
+
+
+def _mean(values):
+    """Return the geometric mean."""
+    return float(np.exp(np.mean(np.log(list(values)))))
+
+
+def _over_scenes(ratios):
+    """Return the geometric mean of the ratios of several scenes, with "scenes", how many have one; None for none, and
+    where some are only known to be small and others to be large."""
+    known = [ratio for ratio in ratios if ratio]
+    bounds = {ratio["bound"] for ratio in known} - {None}
+    if not known or len(bounds) > 1:
+        return None
+    mean = _ratio(_mean(ratio["value"] for ratio in known), *bounds)
+    return mean | {"extrapolated": any(ratio["extrapolated"] for ratio in known), "scenes": len(known)}
+
+
+def verdict_of(ratio):
+    """Return "better", "worse", "alike", or None where that cannot be told."""
+    if ratio is None:
+        return None
+    low, high = ratio["low"], ratio["high"]
+    if low is None:
+        low, high = ratio["value"] / ALIKE, ratio["value"] * ALIKE
+    if high < 1 and ratio["bound"] != "at_least":
+        return "better"
+    if low > 1 and ratio["bound"] != "at_most":
+        return "worse"
+    return None if ratio["bound"] else "alike"
+
+
+def _sentence(label, base, rows):
+    """Say how an integrator compares with the first; None where nothing is known."""
+    kind = "time" if any(row.get(label, {}).get("time") for row in rows.values()) else "error"
+    ratios = {name: row[label][kind] for name, row in rows.items() if row.get(label, {}).get(kind)}
+    if not ratios:
+        return None
+    if len(rows) == 1:
+        return f"{label} {WORDS[kind]['one'].format(size=size(*ratios.values()), base=base)} in {next(iter(ratios))}."
+    mean = _over_scenes(ratios.values())
+    of = {one: [name for name, ratio in ratios.items() if verdict_of(ratio) == one] for one in ("better", "worse")}
+    text = f"{label} {WORDS[kind]['less'].format(base=base)} in {len(of['better'])} of {len(rows)} scenes"
+    if mean:
+        text += f": {size(mean)} {WORDS[kind]['of']} in the geometric mean"
+        text += f" over {mean['scenes']} of them" if mean["scenes"] < len(rows) else ""
+    worse = [f"{name} ({number(ratios[name])})" for name in of["worse"]]
+    return f"{text}. {WORDS[kind]['more']} in {_listed(worse)}." if worse else f"{text}."
+
+
+WORDS = {
+    "time": {
+        "one": "needs {size} the time of {base} for the same error",
+        "less": "needs less time than {base} for the same error",
+        "of": "its time",
+        "more": "It needs more",
+    },
+    "error": {
+        "one": "has {size} the error of {base} at equal time",
+        "less": "has a smaller error than {base} at equal time",
+        "of": "its error",
+        "more": "It has a larger one",
+    },
+}
+
+
+def size(ratio):
+    """Write a ratio so that "the time" can follow: "a fifth of", "1.4 times", "at most half of"."""
+    value, parts = ratio["value"], round(1 / ratio["value"])
+    about = "about " if ratio["extrapolated"] else ""
+    bound = {"at_most": "at most ", "at_least": "at least ", None: about}[ratio["bound"]]
+    if not ratio["bound"] and 1 / ALIKE <= value <= ALIKE:
+        return "about"
+    if value > 1:
+        return f"{bound}{value:.0f} times" if value >= 9.5 else f"{bound}{value:.2g} times"
+    if parts > 10:
+        return f"{bound}1/{parts} of"
+    if parts >= 2 and abs(value * parts - 1) < 0.08:
+        return f"{bound}{PARTS[parts - 2]} of"
+    return f"{bound}{value:.0%} of"
+
+
+def number(ratio):
+    """Write a ratio in a table: "0.21×", "≤ 0.5×"."""
+    sign = {"at_most": "≤ ", "at_least": "≥ ", None: ""}[ratio["bound"]]
+    return f"{sign}{tables.number(float(format(ratio['value'], '.2g')))}×"
+
+
+def _listed(names):
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
