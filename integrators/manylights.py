@@ -29,6 +29,8 @@ from .manual import manual_page
 
 # Camera rays of the pilot, and those that are followed at a time, which bounds memory
 _PILOT, _WAVEFRONT = 1 << 15, 1 << 21
+# Rays by which emitters are learned, as a share of the camera rays
+_LEARNING_SHARE = 0.25
 # c of the split, as a multiple of the distance between lights
 _TAPER = 1.0
 # c of paths that are whole, beyond every distance, world units: nothing is left to virtual lights
@@ -147,7 +149,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
     def _sample(self, view: View):
         """(Radiance of each camera ray, whether it is opaque in the film's alpha)."""
         clock, self.statistics = Clock(), {}
-        pilot, chosen = self._balance(view)
+        pilot = self._pilot(view)
+        chosen = self._balance(view, pilot)
+        mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
         clock.lap(Stage.PILOT)
         lights = self._lights(view, pilot, chosen, clock)
         limits = self._limits(view, lights.smallest_distance if lights else _WHOLE, self.max_depth)
@@ -183,24 +187,27 @@ class ManyLightsIntegrator(GatheringIntegrator):
         roulette = dr.opaque(mi.UInt32, rr_depth or self.rr_depth)
         return Limits(longest, roulette, dr.opaque(mi.Float, c**2), view.perturbed, self.hide_emitters)
 
-    def _balance(self, view: View) -> tuple[Pilot | None, Balance]:
-        """The pilot, and what it leads to; no pilot where virtual lights are out of the question."""
-        if not self.virtual_lights:
-            return None, without_lights("virtual_lights is off")
-        if self.max_depth <= 2:
-            return None, without_lights("no light is indirect at this max_depth")
-        if view.perturbed.everywhere:
-            return None, without_lights("bump or normal maps are in shape groups")
+    def _pilot(self, view: View) -> Pilot:
+        """The pilot, from which emitters are learned."""
         pairs = max(min(_PILOT, view.count // 4) // 2, 1)
         apart = max(view.count // pairs // 2 * 2, 2)
         lane = np.minimum(np.arange(pairs)[:, None] * apart + [0, 1], view.count - 1).reshape(-1)
         found, vertices = view.follow(upload(mi.UInt32, lane), self._limits(view, _WHOLE, self.max_depth), 1)
         pilot = Pilot.of(found, vertices, lane // view.samples)
-        chosen = balance(pilot.radiance, pilot.indirect, view.count, view.samples)
-        mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
-        return pilot, chosen
+        view.emission.learn(*pilot.vertices, int(_LEARNING_SHARE * view.count), derived_seed(view.seed, 6))
+        return pilot
 
-    def _lights(self, view: View, pilot: Pilot | None, chosen: Balance, clock: Clock) -> LightSet | None:
+    def _balance(self, view: View, pilot: Pilot) -> Balance:
+        """What the pilot leads to."""
+        if not self.virtual_lights:
+            return without_lights("virtual_lights is off")
+        if self.max_depth <= 2:
+            return without_lights("no light is indirect at this max_depth")
+        if view.perturbed.everywhere:
+            return without_lights("bump or normal maps are in shape groups")
+        return balance(pilot.radiance, pilot.indirect, view.count, view.samples)
+
+    def _lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> LightSet | None:
         """Virtual lights and their tree; None where there are none."""
         if chosen.light_paths == 0:
             return None

@@ -8,6 +8,9 @@ jittered.  The radiance of the direction itself is used, so nothing is lost betw
 
 from __future__ import annotations
 
+import hashlib
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -26,13 +29,41 @@ _DEFAULT_WIDTH, _LARGEST_WIDTH = 1024, 2048
 _EVEN_SHARE = 0.02
 
 
+@dataclass
+class _Last:
+    """The regions that were made last, and what of."""
+
+    key: tuple | None = None
+    regions: EnvironmentRegions | None = None
+
+
+_last = _Last()
+
+
+def regions_of(environment, count: int, most_columns: int) -> EnvironmentRegions:
+    """Regions of an environment: those of the last call where nothing has changed since."""
+    key = mi.variant(), count, most_columns, _fingerprint(environment)
+    if _last.key != key:
+        _last.key, _last.regions = key, EnvironmentRegions(environment, count, most_columns)
+    return _last.regions
+
+
+def _fingerprint(environment) -> str:
+    """What tells environments apart: all that Mitsuba prints of one, and the values of its parameters."""
+    digest = hashlib.blake2b(str(environment).encode())
+    for name, value in parameters_of(environment).items():
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(value).tobytes() if dr.is_array_v(value) else str(value).encode())
+    return digest.hexdigest()
+
+
 class EnvironmentRegions:
     """``count`` regions: ``axis`` (count, 3), ``cone_cos`` (count,) contain their directions; ``irradiance`` (count,):
-    radiance (mean over channels) integrated over solid angle; all float64."""
+    radiance (mean over channels) integrated over solid angle; all float64.  ``most_columns``: of the table."""
 
-    def __init__(self, environment, count: int):
+    def __init__(self, environment, count: int, most_columns: int = _LARGEST_WIDTH):
         self._environment = environment
-        width = _table_width(environment)
+        width = min(_table_width(environment), most_columns)
         radiance = _read(environment, width)
         height = len(radiance)
         edges = np.cos(np.linspace(0, np.pi, height + 1))
@@ -143,9 +174,12 @@ def _read_cells(environment, cells: np.ndarray, width: int, across: int) -> np.n
     sampler = independent_sampler(0, count)
     total = dr.zeros(mi.Float, count)
     row, column = upload(mi.Float, cells // width), upload(mi.Float, cells % width)
+    # Opaque, so that all evaluations are one kernel
+    high, wide = (dr.opaque(mi.Float, step) for step in (np.pi / height, 2 * np.pi / width))
     for k in range(across**2):
-        jitter = (mi.Point2f(k % across, k // across) + sampler.next_2d()) / across
-        polar, azimuth = (row + jitter.x) * (np.pi / height), (column + jitter.y) * (2 * np.pi / width)
+        offset = mi.Point2f(*(dr.opaque(mi.Float, part / across) for part in (k % across, k // across)))
+        jitter = offset + sampler.next_2d() * dr.opaque(mi.Float, 1 / across)
+        polar, azimuth = (row + jitter.x) * high, (column + jitter.y) * wide
         sine, cosine = dr.sincos(polar)
         si = dr.zeros(mi.SurfaceInteraction3f, count)
         si.wi = -mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), cosine)

@@ -7,9 +7,11 @@ What a first surface receives by way of a second one is split so that nothing is
 
 In the order to read in:
 
+- ``facing``: which of six ways a surface faces
 - ``floors``: the split: floors of BSDFs, and the share w of virtual lights
 - ``remainder``: paths as ``path`` follows them, less what virtual lights carry; ``follow``
 - ``next_event``: next-event estimation: how emitters are chosen
+- ``learned_emitters``: emitters, and regions of the environment, chosen by what a pilot's vertices see of them
 - ``emitter_tree``: a tree over emitters with a place, by which one is drawn for a vertex
 - ``numbers``: random numbers that are spread well over the samples of a pixel
 - ``pilot``: a few paths that tell where light is wanted

@@ -12,6 +12,7 @@ from ..lights.emitters import Emitters, read_emitters, registered_shapes
 from ..lights.virtual_lights import DeviceLights, VirtualLights, spot_falloff
 from ..points.camera_paths import emitted_towards
 from .emitter_tree import EmitterTree
+from .learned_emitters import LearnedEmitters
 
 # With fewer emitters, what is hidden decides more than what is near, and Mitsuba's own choice is as good
 _FEWEST_IN_TREE = 64
@@ -24,8 +25,9 @@ _LEAST_SHARE = 0.1
 def emitters_of(scene):
     """The choice of emitters that suits a scene: :class:`UniformEmitters`, or :class:`TreeEmitters` where they are
     many, and all of kinds that arrays can hold."""
-    if len(scene.emitters()) < _FEWEST_IN_TREE:
-        return UniformEmitters(scene)
+    count = len(scene.emitters())
+    if count < _FEWEST_IN_TREE:
+        return LearnedEmitters(scene) if count > 1 or scene.environment() is not None else UniformEmitters(scene)
     try:
         emitters = read_emitters(scene)
     except ValueError:
@@ -42,13 +44,20 @@ class UniformEmitters:
     def __init__(self, scene):
         self._scene = scene
 
-    def sample(self, scene, si, chosen, place, active):
+    def learn(self, position, normal, rays: int, seed: int) -> None:
+        """There is nothing to learn."""
+
+    def site(self, si, side):
+        """Where the choice is a choice of its own: everywhere the same."""
+        return mi.UInt32(0)
+
+    def sample(self, si, site, chosen, member, place, active):
         """A direction to an emitter: (direction, visible radiance over density, density per solid angle, whether the
         emitter is a point or a direction)."""
-        ds, weight = scene.sample_emitter_direction(si, place, True, active)
+        ds, weight = self._scene.sample_emitter_direction(si, place, True, active)
         return ds.d, finite_or_zero(mi.unpolarized_spectrum(weight)), ds.pdf, ds.delta
 
-    def met(self, vertex, ray, si, has_density, active):
+    def met(self, vertex, site, ray, si, has_density, active):
         """Radiance that a ray from ``vertex`` met at ``si``, and the density with which :meth:`sample` would have drawn
         it there."""
         origin = dr.zeros(mi.Interaction3f)
@@ -67,7 +76,7 @@ class TreeEmitters:
     """
 
     def __init__(self, scene, emitters: Emitters):
-        self._emitters, self._environment = emitters, emitters.environment
+        self._scene, self._emitters, self._environment = scene, emitters, emitters.environment
         omni = VirtualLights.concatenate([emitters.points, emitters.spots])
         # Kernels fetch both alike: the cone of a point emitter is all around
         omni.kind = "spot"
@@ -84,7 +93,6 @@ class TreeEmitters:
         self._directional = DeviceLights(emitters.directional) if emitters.directional.count else None
         self._distant = emitters.directional.count + (self._environment is not None)
         sphere = bounding_sphere(scene)
-        self._far = 2 * float(sphere.radius)
         self._share = 1.0
         if self._distant:
             # By what would arrive if nothing was between, from half way to the edge of the scene
@@ -111,14 +119,21 @@ class TreeEmitters:
         by_tree = self._tree.probability(row, position, active)
         return self._share * ((1 - _UNIFORM_SHARE) * by_tree + _UNIFORM_SHARE / self._tree.count)
 
-    def sample(self, scene, si, chosen, place, active):
+    def learn(self, position, normal, rays: int, seed: int) -> None:
+        """As :meth:`UniformEmitters.learn`."""
+
+    def site(self, si, side):
+        """As :meth:`UniformEmitters.site`."""
+        return mi.UInt32(0)
+
+    def sample(self, si, site, chosen, member, place, active):
         """As :meth:`UniformEmitters.sample`."""
         near = active & (chosen < self._share)
         number = dr.minimum(chosen / self._share, dr.one_minus_epsilon(mi.Float))
         row = self._draw(si.p, number, near)
         probability = self._probability(row, si.p, near)
         target, toward = mi.Point3f(si.p), mi.Vector3f(0, 0, 1)
-        weight, density, is_point = mi.UnpolarizedSpectrum(0), mi.Float(0), mi.Bool(False)
+        weight, density, is_point, far = mi.UnpolarizedSpectrum(0), mi.Float(0), mi.Bool(False), mi.Bool(False)
         if self._omni is not None:
             here = near & (row < self._first_area)
             light = self._omni.gather(row, here)
@@ -147,22 +162,22 @@ class TreeEmitters:
             if self._environment is not None:
                 here = active & ~near & (index == last)
                 ds, radiance = self._environment.sample_direction(si, place, here)
-                target, toward = dr.select(here, ds.p, target), dr.select(here, ds.d, toward)
+                toward, far = dr.select(here, ds.d, toward), far | here
                 weight = dr.select(here, mi.unpolarized_spectrum(radiance) / one, weight)
                 density = dr.select(here, ds.pdf * one, density)
             if self._directional is not None:
                 here = active & ~near & (index < self._emitters.directional.count)
                 light = self._directional.gather(index, here)
-                target = dr.select(here, si.p - light.direction * self._far, target)
-                toward = dr.select(here, -light.direction, toward)
+                toward, far = dr.select(here, -light.direction, toward), far | here
                 weight = dr.select(here, rgb_to_spectrum(light.intensity) / one, weight)
                 density, is_point = dr.select(here, one, density), is_point | here
         weight = finite_or_zero(weight)
         arrives = active & (dr.max(weight) > 0) & (density > 0)
-        blocked = scene.ray_test(si.spawn_ray_to(target), arrives)
+        ray = dr.select(far, si.spawn_ray(toward), si.spawn_ray_to(target))
+        blocked = self._scene.ray_test(ray, arrives)
         return toward, dr.select(arrives & ~blocked, weight, 0), density, is_point
 
-    def met(self, vertex, ray, si, has_density, active):
+    def met(self, vertex, site, ray, si, has_density, active):
         """As :meth:`UniformEmitters.met`."""
         origin = dr.zeros(mi.Interaction3f)
         origin.p = vertex

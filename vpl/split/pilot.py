@@ -30,9 +30,11 @@ class Pilot:
 
     ``arrivals``: their second vertices, where they have a floor, as their first ones have; ``pixel``, ``radiance``,
     ``indirect`` (n,): the pixel of each path, what it found, and the part that came by way of its second vertex.
+    ``vertices``: positions and normals, (m, 3) each, of both.
     """
 
     arrivals: Arrivals
+    vertices: tuple[np.ndarray, np.ndarray]
     pixel: np.ndarray
     radiance: np.ndarray
     indirect: np.ndarray
@@ -47,7 +49,10 @@ class Pilot:
         arrived = (weight > 0) & np.isfinite(weight) & np.isfinite(position).all(1)
         indirect = np.where(arrived, np.maximum(radiance - np.nan_to_num(before), 0), 0)
         arrivals = Arrivals(position[arrived], normal[arrived], weight[arrived].astype(np.float64), indirect[arrived])
-        return cls(arrivals, pixel, radiance, indirect)
+        first, facing, depth = (download(x) for x in (vertices.position, vertices.normal, vertices.depth))
+        seen = (depth > 0) & np.isfinite(first).all(1)
+        vertices = tuple(np.concatenate(x) for x in ((first[seen], position[arrived]), (facing[seen], normal[arrived])))
+        return cls(arrivals, vertices, pixel, radiance, indirect)
 
     def indirect_nearby(self, width: int, pixels: int) -> np.ndarray:
         """Mean indirect light of the tile that each pixel is in, (pixels,), in an image so many pixels wide."""

@@ -21,6 +21,7 @@ from ..cuts.light_cuts import collect_cuts, limited_cuts, upload_thresholds
 from ..points.bsdf_proxies import MaterialProxy
 from ..points.surfaces import LambertianSurface, Receiver
 from ..transport.evaluation import Transport, evaluate_pairs
+from .facing import WAYS, facing
 from .remainder import GatherVertices
 
 
@@ -69,7 +70,7 @@ class PixelClusters:
     def __init__(self, vertices: GatherVertices, rays, samples: int):
         position, normal = download(vertices.position), download(vertices.normal)
         pixel = download(rays).astype(np.int64) // samples
-        key = pixel * 6 + _facing(normal)
+        key = pixel * WAYS + facing(normal)
         order = np.argsort(key, kind="stable")
         position, normal, key = position[order], normal[order], key[order]
         first = np.flatnonzero(np.diff(key, prepend=-1))
@@ -79,7 +80,7 @@ class PixelClusters:
         size = np.diff(first, append=len(key))
         self.cluster = np.repeat(np.arange(len(first)), size)
         cosine = np.minimum.reduceat((normal * axis[self.cluster]).sum(1), first)
-        self.pixel = key[first] // 6
+        self.pixel = key[first] // WAYS
         # Rounded down, so that every normal is inside
         self.receivers = Receivers.of(0.5 * (low + high), 0.5 * (high - low), axis, np.maximum(cosine - 2e-6, -1))
         self.first, self.size = upload(mi.UInt32, first), upload(mi.UInt32, size)
@@ -118,12 +119,6 @@ class PixelClusters:
             surface,
             dr.gather(mi.UnpolarizedSpectrum, self._weight, row) * factor,
         )
-
-
-def _facing(normal: np.ndarray) -> np.ndarray:
-    """Which of six ways normals (n, 3) face: 0 to 5."""
-    axis = np.abs(normal).argmax(1)
-    return 2 * axis + (normal[np.arange(len(normal)), axis] < 0)
 
 
 def light_clusters(

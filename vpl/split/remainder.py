@@ -44,7 +44,8 @@ class FirstEdge:
     """First edges of paths, one per lane, evaluated.
 
     ``vertex``: where they begin; ``ray``; ``throughput``: unpolarized spectrum; ``density``: of the direction, per
-    solid angle; ``delta``: whether it was drawn from none; ``state``: see above; ``active``.
+    solid angle; ``delta``: whether it was drawn from none; ``state``: see above; ``site``: of the vertex,
+    :mod:`vpl.split.next_event`; ``active``.
     """
 
     vertex: object
@@ -53,16 +54,17 @@ class FirstEdge:
     density: object
     delta: object
     state: object
+    site: object
     active: object
 
     @classmethod
     def of_camera(cls, ray, active) -> FirstEdge:
         """Camera rays."""
         count = dr.width(ray.d)
-        return cls.of(ray.o, ray, ones(count), dr.opaque(mi.Float, 1.0, count), True, SEEKING, active)
+        return cls.of(ray.o, ray, ones(count), dr.opaque(mi.Float, 1.0, count), True, SEEKING, mi.UInt32(0), active)
 
     @classmethod
-    def of(cls, vertex, ray, throughput, density, delta: bool, state: int, active) -> FirstEdge:
+    def of(cls, vertex, ray, throughput, density, delta: bool, state: int, site, active) -> FirstEdge:
         """Rays in directions of a density."""
         count = dr.width(ray.d)
         # Opaque and of full width, so that all paths are followed by one kernel
@@ -77,6 +79,7 @@ class FirstEdge:
             density,
             wide == (0 if delta else 1),
             dr.full(mi.UInt32, state, count),
+            site + dr.opaque(mi.UInt32, 0, count),
             active,
         )
         dr.make_opaque(edge)
@@ -99,11 +102,12 @@ class Found:
 class GatherVertices:
     """First vertices with a floor, one per lane: where virtual lights are gathered.
 
-    ``position``, ``normal`` (shading normal, on the side that is seen), ``flat`` (geometric normal); ``weight``: what
-    irradiance there contributes to the camera ray, throughput times floor, 0 where there is no such vertex; ``depth``:
-    edges from the camera; ``arrival``: the vertex after it, if it has a floor too, ``arrival_normal``: the
-    normal of the side that was met, ``arrival_weight``: what irradiance there would contribute if virtual lights
-    carried all of it (w = 1), and ``before``: the radiance that the path found before it; means over channels.
+    ``position``, ``normal`` (shading normal, on the side that is seen), ``flat`` (geometric normal), ``depth``: edges
+    from the camera; ``weight``: what irradiance there contributes to the camera ray, throughput times floor, 0 where
+    there is no such vertex: the others are of the last one that scatters, ``depth`` 0 if there is none; ``arrival``:
+    the vertex after it, if it has a floor too, ``arrival_normal``: the normal of the side that was met,
+    ``arrival_weight``: what irradiance there would contribute if virtual lights carried all of it (w = 1), and
+    ``before``: the radiance that the path found before it; means over channels.
     """
 
     position: object
@@ -140,6 +144,7 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
     throughput, active = mi.UnpolarizedSpectrum(first.throughput), mi.Bool(first.active)
     density, delta, state = mi.Float(first.density), mi.Bool(first.delta), mi.UInt32(first.state)
     depth, eta, valid, spread = mi.UInt32(0), mi.Float(1), mi.Bool(False), state == SEEKING
+    site = mi.UInt32(first.site)
     # Of what x1 sends on, the part that virtual lights carry but for w and the floor of x2; and the cosine there
     carried, cosine = dr.zeros(mi.UnpolarizedSpectrum, count), mi.Float(1)
     position, normal, flat = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0)
@@ -156,7 +161,7 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
             hidden = active & (depth == 0) & (~si.is_valid() | si.shape.is_emitter())
 
         # ---------------------- Emission, by BSDF sampling ----------------------
-        emitted, other = emission.met(vertex, ray, si, ~delta, active & ~hidden)
+        emitted, other = emission.met(vertex, site, ray, si, ~delta, active & ~hidden)
         contribution = throughput * emitted * power_heuristic(density, other)
         radiance += contribution
         drawn, length, level = _draw(drawn, length, level, contribution, depth + 1, sampler)
@@ -189,16 +194,18 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
         # ---------------------- A vertex where lights are gathered ----------------------
         gathers = smooth & (state == SEEKING) & agrees(si, side) & (dr.max(floor) > 0)
         gathers &= depth + 2 < limits.max_depth
-        position, normal = dr.select(gathers, si.p, position), dr.select(gathers, si.sh_frame.n * side, normal)
-        flat, edges = dr.select(gathers, si.n, flat), dr.select(gathers, depth + 1, edges)
+        seeks = smooth & (state == SEEKING)
+        position, normal = dr.select(seeks, si.p, position), dr.select(seeks, si.sh_frame.n * side, normal)
+        flat, edges = dr.select(seeks, si.n, flat), dr.select(seeks, depth + 1, edges)
         weight = dr.select(gathers, throughput * floor, weight)
 
         # ---------------------- Emission, by next-event estimation ----------------------
         first_numbers = spread & smooth
         spread &= ~smooth
+        site, member = emission.site(si, side), sampler.next_1d()
         chosen = dr.select(first_numbers, numbers[0], sampler.next_1d())
         place = dr.select(first_numbers, numbers[1], sampler.next_2d())
-        toward, incident, density_there, is_point = emission.sample(scene, si, chosen, place, smooth)
+        toward, incident, density_there, is_point = emission.sample(si, site, chosen, member, place, smooth)
         local = si.to_local(toward)
         value, density_here = bsdf.eval_pdf(context, si, local, smooth)
         value = throughput * mi.unpolarized_spectrum(value)

@@ -129,10 +129,11 @@ def _irradiance(scene, emission, rays, limits: Limits, seed: int):
     count = dr.width(rays.o)
     sampler = independent_sampler(derived_seed(seed, 0), count)
     si = scene.ray_intersect(rays)
-    facing = si.sh_frame.n * side_of(si)
+    side = side_of(si)
+    facing, site = si.sh_frame.n * side, emission.site(si, side)
     # ---------------------- Next-event estimation ----------------------
     toward, incident, density, is_point = emission.sample(
-        scene, si, sampler.next_1d(), sampler.next_2d(), si.is_valid()
+        si, site, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), si.is_valid()
     )
     cosine = dr.maximum(dr.dot(facing, toward), 0)
     mis = dr.select(is_point, 1, power_heuristic(density, cosine * dr.inv_pi))
@@ -140,8 +141,8 @@ def _irradiance(scene, emission, rays, limits: Limits, seed: int):
     # ---------------------- A path that begins with a direction drawn by the cosine ----------------------
     local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
     ray, density, draw = si.spawn_ray(mi.Frame3f(facing).to_world(local)), local.z * dr.inv_pi, sampler.next_1d()
-    dr.eval(si.p, nearest, ray, density, draw)
-    edge = FirstEdge.of(si.p, ray, ones(count) * dr.pi, density, False, PAST, True)
+    dr.eval(si.p, nearest, ray, density, draw, site)
+    edge = FirstEdge.of(si.p, ray, ones(count) * dr.pi, density, False, PAST, site, True)
     numbers = spread_numbers(dr.arange(mi.UInt32, count), 1, seed)
     found, _ = follow(scene, emission, edge, numbers, independent_sampler(derived_seed(seed, 1), count), limits)
     # Gather points further from the camera may use shorter paths only: a light stands for paths of one length, and has

@@ -1,0 +1,236 @@
+"""Emitters chosen by what a pilot's vertices see of them, place by place.
+
+Space is divided into cubes, and the vertices in a cube by the way that they face: a site.  Sites in which the pilot's
+paths had vertices learn which emitters light them: from some of their vertices one ray goes to every emitter, and to
+every region of the environment (:mod:`vpl.direct.environment_regions`), so that a room that sees the sky through a
+window aims there.  A share of the samples is kept for Mitsuba's own choice, which is all that other sites have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import channel_mean, download, finite_or_zero, upload, upload_vectors
+from ..core.sampling import find_interval, independent_sampler
+from ..direct.environment_regions import regions_of
+from .facing import WAYS, facing, facing_of
+
+# Regions of the environment, and columns of the table that they are made from
+_REGIONS, _COLUMNS = 256, 512
+# Share of the samples for which every emitter has the same probability
+_UNIFORM_SHARE = 0.3
+# Rays from a site to each emitter and region; how many of them all sites may have together
+_RAYS_EACH, _MOST_RAYS = 2, 1 << 20
+# Rays that a site's average visibility counts for
+_PRIOR = 0.5
+# Cubes along the longest side of where vertices are, at most; a share of them at its ends that may lie outside
+_FINEST_GRID, _OUTLIERS = 32, 0.005
+
+
+@dataclass
+class Sites:
+    """Numbers of sites: ``low`` and ``size`` of the cubes' grid, ``resolution`` along its axes, all opaque;
+    ``table``: the site of each cube and facing, 0 where nothing is known."""
+
+    low: object
+    size: object
+    resolution: object
+    table: object
+
+    @classmethod
+    def none(cls) -> Sites:
+        """Nothing is known anywhere."""
+        return cls._of(np.zeros(3), 1.0, np.ones(3, np.int64), np.zeros(WAYS, np.int64))
+
+    @classmethod
+    def _of(cls, low, size, resolution, table) -> Sites:
+        return cls(
+            mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in low)),
+            dr.opaque(mi.Float, float(size)),
+            mi.Vector3u(*(dr.opaque(mi.UInt32, int(x)) for x in resolution)),
+            upload(mi.UInt32, table),
+        )
+
+    @classmethod
+    def around(cls, position: np.ndarray, normal: np.ndarray, most: int) -> tuple[Sites, np.ndarray]:
+        """(Sites of vertices (n, 3), the site of each): at most ``most``, numbered from 1."""
+        low, high = np.quantile(position, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
+        longest = max(float((high - low).max()), np.finfo(np.float32).tiny)
+        for cubes in range(_FINEST_GRID, 0, -1):
+            size = longest / cubes
+            resolution = np.maximum(np.ceil((high - low) / size), 1).astype(np.int64)
+            cell = np.clip(np.floor((position - low) / size), 0, resolution - 1).astype(np.int64)
+            key = ((cell[:, 2] * resolution[1] + cell[:, 1]) * resolution[0] + cell[:, 0]) * WAYS + facing(normal)
+            known, site = np.unique(key, return_inverse=True)
+            if len(known) <= most or cubes == 1:
+                break
+        table = np.zeros(WAYS * resolution.prod(), np.int64)
+        table[known] = np.arange(1, len(known) + 1)
+        return cls._of(low, size, resolution, table), site + 1
+
+    def at(self, position, normal):
+        """The site of each position, for vertices that face ``normal``."""
+        cell = [
+            mi.UInt32(dr.clip((x - low) / self.size, 0, mi.Float(count - 1)))
+            for x, low, count in zip(position, self.low, self.resolution, strict=True)
+        ]
+        cube = (cell[2] * self.resolution.y + cell[1]) * self.resolution.x + cell[0]
+        return dr.gather(mi.UInt32, self.table, cube * WAYS + facing_of(normal))
+
+
+class LearnedEmitters:
+    """The choice of emitters by site; before :meth:`learn`, every emitter has the same probability everywhere."""
+
+    def __init__(self, scene):
+        self._scene, self._emitters = scene, scene.emitters_dr()
+        self._environment, self._count = scene.environment(), len(scene.emitters())
+        self._regions, self._environment_number = None, -1
+        if self._environment is not None:
+            self._regions = regions_of(self._environment, _REGIONS, _COLUMNS)
+            self._environment_number = [e.is_environment() for e in scene.emitters()].index(True)
+        self._sources = self._count + (self._regions.count if self._regions else 0)
+        registry = download(dr.reinterpret_array(mi.UInt32, self._emitters))
+        numbers = np.zeros(registry.max() + 2, np.int64)
+        numbers[registry] = np.arange(self._count)
+        self._number_of = upload(mi.UInt32, numbers)
+        self._sites = Sites.none()
+        alike = np.zeros(self._sources)
+        alike[: self._count] = 1 / self._count
+        # Twice, because arrays of one entry make other kernels
+        self._use(np.stack([alike, alike]))
+
+    def _use(self, probability: np.ndarray) -> None:
+        """``probability`` (sites, sources) float64 of each source; rows sum to 1."""
+        cumulative = np.concatenate([[0.0], np.cumsum(probability)])
+        self._cumulative = upload(dr.float64_array_t(mi.Float), cumulative)
+        self._probability = upload(mi.Float, np.diff(cumulative))
+
+    # ---------------------- Learning ----------------------
+
+    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> None:
+        """Learn from vertices, (n, 3) each, with about so many rays at most."""
+        each = _RAYS_EACH * self._sources
+        most = min(rays, _MOST_RAYS) // each
+        if most < 1 or len(position) == 0:
+            return
+        self._sites, site = Sites.around(position, normal, most)
+        size = np.bincount(site)[1:]
+        order, sites = np.argsort(site, kind="stable"), len(size)
+        first = upload(mi.UInt32, np.cumsum(size) - size)
+        lane = dr.arange(mi.UInt32, sites * each)
+        row = lane // dr.opaque(mi.UInt32, each)
+        source = lane // _RAYS_EACH % dr.opaque(mi.UInt32, self._sources)
+        sampler = independent_sampler(seed, len(lane))
+        number = mi.UInt32(sampler.next_1d() * mi.Float(dr.gather(mi.UInt32, upload(mi.UInt32, size), row)))
+        vertex = dr.gather(mi.UInt32, first, row) + number
+        unoccluded, seen = self._looks(*(upload_vectors(mi.Point3f, x[order]) for x in (position, normal)), vertex,
+                                       source, sampler)  # fmt: skip
+        unoccluded, seen = (
+            download(x).astype(np.float64).reshape(sites, self._sources, _RAYS_EACH) for x in (unoccluded, seen)
+        )
+        self._use(self._shares(unoccluded, seen))
+
+    def _looks(self, positions, normals, vertex, source, sampler):
+        """(Irradiance that a source would give a vertex by one sample if nothing was between, whether nothing is)."""
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(vertex))
+        si.p, si.n = dr.gather(mi.Point3f, positions, vertex), mi.Normal3f(dr.gather(mi.Point3f, normals, vertex))
+        si.sh_frame = mi.Frame3f(si.n)
+        direction, weight, _, _, ray = self._draw(si, source, sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
+        light = channel_mean(weight) * dr.maximum(dr.dot(direction, si.n), 0)
+        seen = dr.select((light > 0) & ~self._scene.ray_test(ray, light > 0), mi.Float(1), 0)
+        dr.eval(light, seen)
+        return light, seen
+
+    def _shares(self, unoccluded: np.ndarray, seen: np.ndarray) -> np.ndarray:
+        """Probabilities (sites + 1, sources), the first row where nothing is known: root mean squares of what arrived."""
+        possible = np.nan_to_num(unoccluded, posinf=0) ** 2
+        if self._regions:
+            # Its regions stand for the environment
+            possible[:, self._environment_number] = 0
+        found = possible * seen
+        visible = found.sum((1, 2)) / np.maximum(possible.sum((1, 2)), np.finfo(np.float64).tiny)
+        power = (found + _PRIOR / _RAYS_EACH * visible[:, None, None] * possible).mean(2) ** 0.5
+        total = power.sum(1, keepdims=True)
+        alike = np.zeros(self._sources)
+        alike[: self._count] = 1 / self._count
+        learned = np.where(total > 0, power / np.maximum(total, np.finfo(np.float64).tiny), alike)
+        return np.concatenate([alike[None], (1 - _UNIFORM_SHARE) * learned + _UNIFORM_SHARE * alike])
+
+    # ---------------------- Sampling ----------------------
+
+    def site(self, si, side):
+        """The site of a vertex; ``side``: see :func:`vpl.split.floors.side_of`."""
+        return self._sites.at(si.p, si.sh_frame.n * side)
+
+    def _draw(self, si, source, member, place, active):
+        """A direction to each source: (direction, radiance over density, density of the direction, whether the source
+        is a point or a direction, shadow ray)."""
+        of_emitter = active & (source < self._count)
+        emitter = dr.gather(mi.EmitterPtr, self._emitters, dr.minimum(source, self._count - 1))
+        ds, weight = emitter.sample_direction(si, place, of_emitter)
+        weight = finite_or_zero(mi.unpolarized_spectrum(weight)) & of_emitter
+        # Emitters that are infinitely far away have a place outside of the scene's box, which may be too small: Mitsuba
+        # 3.9.1 leaves rectangles out of it
+        far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+        ray = dr.select(far, si.spawn_ray(ds.d), si.spawn_ray_to(ds.p))
+        direction, density, delta = ds.d, ds.pdf, ds.delta & of_emitter
+        if self._regions:
+            of_region = active & ~of_emitter
+            region = dr.select(of_region, source - self._count, 0)
+            away, arriving, region_density = self._regions.sample(region, member, place, of_region)
+            direction = dr.select(of_region, away, direction)
+            weight = dr.select(of_region, arriving, weight)
+            density = dr.select(of_region, region_density, density)
+            ray = dr.select(of_region, si.spawn_ray(direction), ray)
+        return direction, weight, density, delta, ray
+
+    def sample(self, si, site, chosen, member, place, active):
+        """A direction to an emitter: (direction, visible radiance over density, density per solid angle, whether the
+        emitter is a point or a direction)."""
+        first = site * self._sources
+        row = find_interval(self._cumulative, first, first + self._sources, chosen)
+        source, probability = row - first, dr.gather(mi.Float, self._probability, row, active)
+        direction, weight, density, delta, ray = self._draw(si, source, member, place, active)
+        whole = density * probability
+        if self._regions:
+            # What both the emitter and its regions may draw has the sum of their densities
+            of_environment = active & ((source >= self._count) | (source == self._environment_number))
+            both = self._environment_density(si, site, direction, of_environment)
+            whole = dr.select(of_environment, both, whole)
+        weight *= density / whole
+        arrives = active & (dr.max(weight) > 0) & (whole > 0)
+        blocked = self._scene.ray_test(ray, arrives)
+        return direction, dr.select(arrives & ~blocked, weight, 0), whole, delta
+
+    def _environment_density(self, si, site, direction, active):
+        """Density with which a direction to the environment is drawn."""
+        region, density = self._regions.find(direction, active)
+        first = site * self._sources
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.d = direction
+        own = self._environment.pdf_direction(si, ds, active)
+        by_emitter = dr.gather(mi.Float, self._probability, first + self._environment_number, active)
+        return own * by_emitter + density * dr.gather(mi.Float, self._probability, first + self._count + region, active)
+
+    def met(self, vertex, site, ray, si, has_density, active):
+        """Radiance that a ray from ``vertex`` met at ``si``, and the density with which :meth:`sample` would have drawn
+        it there."""
+        origin = dr.zeros(mi.Interaction3f)
+        origin.p = vertex
+        ds = mi.DirectionSample3f(self._scene, si, origin)
+        emitter = si.emitter(self._scene, active)
+        emitted = finite_or_zero(mi.unpolarized_spectrum(emitter.eval(si, active))) & active
+        wanted = active & has_density & (emitter != None)  # noqa: E711
+        number = dr.gather(mi.UInt32, self._number_of, dr.reinterpret_array(mi.UInt32, emitter), wanted)
+        near = wanted & si.is_valid()
+        probability = dr.gather(mi.Float, self._probability, site * self._sources + number, near)
+        density = emitter.pdf_direction(origin, ds, near) * probability
+        if self._regions:
+            density = dr.select(
+                si.is_valid(), density, self._environment_density(origin, site, ray.d, wanted & ~si.is_valid())
+            )
+        return emitted, density
