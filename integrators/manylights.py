@@ -155,7 +155,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
         clock.lap(Stage.PILOT)
         lights = self._lights(view, pilot, chosen, clock)
         limits = self._limits(view, lights.smallest_distance if lights else _WHOLE, self.max_depth)
-        expected = pilot.indirect_nearby(view.width, -(-view.count // view.samples)) if lights else None
+        pixels = np.arange(-(-view.count // view.samples))
+        expected = pilot.nearby(pilot.indirect, view.width, pixels) if lights else None
         radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
         # Whole pixels at a time
         most = max(_WAVEFRONT // view.samples, 1) * view.samples
@@ -167,9 +168,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
             found, vertices = view.follow(lane, limits, 4, first)
             clock.lap(Stage.TRACED)
             if lights:
-                pixels = expected[first // view.samples :][: -(-len(lane) // view.samples)]
+                nearby = expected[first // view.samples :][: -(-len(lane) // view.samples)]
                 seed = derived_seed(view.seed, 5, first)
-                found.radiance += self._gather(view, lights, chosen, vertices, found, pixels, seed, clock)
+                found.radiance += self._gather(view, lights, chosen, vertices, found, nearby, seed, clock)
             dr.scatter(radiance, found.radiance, lane)
             dr.scatter(valid, found.valid, lane)
             dr.eval(radiance, valid)
@@ -205,7 +206,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
             return without_lights("no light is indirect at this max_depth")
         if view.perturbed.everywhere:
             return without_lights("bump or normal maps are in shape groups")
-        return balance(pilot.radiance, pilot.indirect, view.count, view.samples)
+        brightness = pilot.nearby(pilot.radiance, view.width, pilot.pixel)
+        return balance(pilot.radiance, pilot.indirect, brightness, view.count, view.samples)
 
     def _lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> LightSet | None:
         """Virtual lights and their tree; None where there are none."""

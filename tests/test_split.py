@@ -304,7 +304,8 @@ def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
 def test_lights_pay_where_indirect_light_is_the_noise_and_only_there():
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
-    assert balance(indirect, indirect, 10**8, 64).light_paths > 0
-    assert balance(indirect, indirect, 10**4, 64).light_paths == 0
-    assert balance(direct, 1e-3 * indirect, 10**7, 64).light_paths == 0
-    assert balance(direct, 0 * indirect, 10**8, 64).light_paths == 0
+    level = np.ones(10_000)
+    assert balance(indirect, indirect, level, 10**8, 64).light_paths > 0
+    assert balance(indirect, indirect, level, 10**4, 64).light_paths == 0
+    assert balance(direct, 1e-3 * indirect, level, 10**7, 64).light_paths == 0
+    assert balance(direct, 0 * indirect, level, 10**8, 64).light_paths == 0

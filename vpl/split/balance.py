@@ -25,6 +25,8 @@ _RAYS = (0.25, 8.0)
 # Bound on a pair of clusters, relative to its pixel, with which a cut has so many rays, and how the two go together
 _ERROR, _RAYS_AT_ERROR, _SLOPE = 0.05, 70, 1.6
 _FINEST, _COARSEST = 0.003, 0.2
+# Squared brightness of the image that black places are taken to have, and share of the worst that is left out
+_BLACK, _WORST = 0.01, 0.001
 # Gather vertices of a pixel: one of so many samples, and at most so many
 _SAMPLES_A_VERTEX, _MOST_VERTICES = 4, 16
 
@@ -40,16 +42,16 @@ class Balance:
     reason: str
 
 
-def balance(radiance: np.ndarray, indirect: np.ndarray, paths: int, samples: int) -> Balance:
+def balance(radiance: np.ndarray, indirect: np.ndarray, brightness: np.ndarray, paths: int, samples: int) -> Balance:
     """The balance for ``paths`` camera paths, ``samples`` a pixel.
 
     ``radiance`` (n,): what a pilot's paths found, two next to each other from one pixel; ``indirect`` (n,): the part of
-    it that came by way of surfaces that virtual lights may stand for.
+    it that came by way of surfaces that virtual lights may stand for; ``brightness`` (n,): of the image around.
     """
     if not indirect.any():
         return without_lights("no light comes by way of surfaces that virtual lights could stand for")
-    noise, of_indirect = _noise(radiance, radiance), _noise(indirect, radiance)
-    share = min(of_indirect / max(noise, np.finfo(np.float64).tiny), 1.0)
+    noise, direct = _noise(radiance, brightness), _noise(radiance - indirect, brightness)
+    share = max(1 - direct / max(noise, np.finfo(np.float64).tiny), 0.0)
     # Relative variance of what a path from the camera brings by way of lights
     spread = len(indirect) * np.sum(indirect**2) / np.sum(indirect) ** 2
     wanted = np.clip(spread / _SET_ERROR**2, _SHARES[0] * paths, _SHARES[1] * paths)
@@ -60,7 +62,7 @@ def balance(radiance: np.ndarray, indirect: np.ndarray, paths: int, samples: int
             f"virtual lights would cost as much as {cost / paths:.2g} of the paths and save {share:.0%} of them"
         )
     # The least of (noise of paths / samples + noise of cuts / rays) × (samples + rays × their cost)
-    rest = 0.5 * noise * (1 - _GAIN * share)
+    rest = noise * (1 - _GAIN * share)
     rays = samples * np.clip((_CUT_NOISE / (_RAY_COST * max(rest, 1e-9))) ** 0.5, *_RAYS)
     error = float(np.clip(_ERROR * (rays / _RAYS_AT_ERROR) ** -_SLOPE, _FINEST, _COARSEST))
     vertices = int(np.clip(samples // _SAMPLES_A_VERTEX, 1, _MOST_VERTICES))
@@ -72,8 +74,11 @@ def without_lights(reason: str) -> Balance:
     return Balance(0, 0.0, 0, reason)
 
 
-def _noise(values: np.ndarray, radiance: np.ndarray) -> float:
-    """Variance between the two paths of a pixel, relative to the brightness of the pixel and of the image."""
-    first, second = (values[: len(values) // 2 * 2].astype(np.float64).reshape(-1, 2)).T
-    level = radiance[: len(values) // 2 * 2].reshape(-1, 2).mean(1, dtype=np.float64)
-    return float(np.mean((first - second) ** 2 / (level**2 + level.mean() ** 2 + np.finfo(np.float64).tiny)))
+def _noise(values: np.ndarray, brightness: np.ndarray) -> float:
+    """Variance of a path, from the two of each pixel, relative to brightness, as images are judged: without the worst,
+    and as if no place was black."""
+    count = len(values) // 2
+    first, second = values[: 2 * count].astype(np.float64).reshape(-1, 2).T
+    level = brightness[: 2 * count : 2] ** 2 + _BLACK * np.mean(brightness) ** 2
+    error = np.sort(0.5 * (first - second) ** 2 / np.maximum(level, np.finfo(np.float64).tiny))
+    return float(np.mean(error[: count - int(_WORST * count)])) if count else 0.0

@@ -54,10 +54,13 @@ class Pilot:
         vertices = tuple(np.concatenate(x) for x in ((first[seen], position[arrived]), (facing[seen], normal[arrived])))
         return cls(arrivals, vertices, pixel, radiance, indirect)
 
-    def indirect_nearby(self, width: int, pixels: int) -> np.ndarray:
-        """Mean indirect light of the tile that each pixel is in, (pixels,), in an image so many pixels wide."""
-        number = np.arange(pixels)
-        tile = number // width // _TILE * (width // _TILE + 1) + number % width // _TILE
-        of_path = tile[self.pixel]
-        count = np.bincount(of_path, minlength=tile.max() + 1)
-        return (np.bincount(of_path, self.indirect, tile.max() + 1) / np.maximum(count, 1))[tile]
+    def nearby(self, values: np.ndarray, width: int, pixels: np.ndarray) -> np.ndarray:
+        """Mean of the paths' ``values`` in the tile that each of some pixels is in, in an image so many pixels wide."""
+        tiles, of_path = _tile(pixels, width), _tile(self.pixel, width)
+        size = max(tiles.max(), of_path.max()) + 1
+        count = np.bincount(of_path, minlength=size)
+        return (np.bincount(of_path, values, size) / np.maximum(count, 1))[tiles]
+
+
+def _tile(pixel: np.ndarray, width: int) -> np.ndarray:
+    return pixel // width // _TILE * (width // _TILE + 1) + pixel % width // _TILE
