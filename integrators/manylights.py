@@ -15,11 +15,12 @@ from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.points.camera_paths import SceneTraits, refuse_media
 from vpl.split.balance import Balance, balance, without_lights
+from vpl.split.gather_vertices import GatherVertices, drawn_later
 from vpl.split.next_event import emitters_of
 from vpl.split.numbers import spread_numbers
 from vpl.split.pilot import Pilot
 from vpl.split.pixel_clusters import PixelClusters, light_clusters
-from vpl.split.remainder import FirstEdge, Found, GatherVertices, Limits, follow
+from vpl.split.remainder import FirstEdge, Found, Limits, follow
 from vpl.split.surface_lights import surface_lights
 from vpl.transport.evaluation import Transport
 
@@ -62,7 +63,7 @@ class View:
     def count(self) -> int:
         return dr.width(self.ray.o)
 
-    def follow(self, lane, limits: Limits, *stream: int) -> tuple[Found, GatherVertices]:
+    def follow(self, lane, limits: Limits, *stream: int):
         """Follow the camera rays ``lane`` (UInt32): see :func:`vpl.split.remainder.follow`."""
         seed, ray = derived_seed(self.seed, *stream), self.ray
         part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
@@ -165,12 +166,12 @@ class ManyLightsIntegrator(GatheringIntegrator):
                 break
             lane = dr.arange(mi.UInt32, min(most, view.count - first)) + dr.opaque(mi.UInt32, first)
             dr.eval(lane)
-            found, vertices = view.follow(lane, limits, 4, first)
+            found, vertices, later, _ = view.follow(lane, limits, 4, first)
             clock.lap(Stage.TRACED)
             if lights:
                 nearby = expected[first // view.samples :][: -(-len(lane) // view.samples)]
                 seed = derived_seed(view.seed, 5, first)
-                found.radiance += self._gather(view, lights, chosen, vertices, found, nearby, seed, clock)
+                found.radiance += self._gather(view, lights, chosen, (vertices, later), found, nearby, seed, clock)
             dr.scatter(radiance, found.radiance, lane)
             dr.scatter(valid, found.valid, lane)
             dr.eval(radiance, valid)
@@ -186,15 +187,17 @@ class ManyLightsIntegrator(GatheringIntegrator):
     def _limits(self, view: View, c: float, max_depth: float, rr_depth: int | None = None) -> Limits:
         longest = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF)))
         roulette = dr.opaque(mi.UInt32, rr_depth or self.rr_depth)
-        return Limits(longest, roulette, dr.opaque(mi.Float, c**2), view.perturbed, self.hide_emitters)
+        again = dr.opaque(mi.Bool, c < _WHOLE)
+        return Limits(longest, roulette, dr.opaque(mi.Float, c**2), again, view.perturbed, self.hide_emitters)
 
     def _pilot(self, view: View) -> Pilot:
         """The pilot, from which emitters are learned."""
         pairs = max(min(_PILOT, view.count // 4) // 2, 1)
         apart = max(view.count // pairs // 2 * 2, 2)
         lane = np.minimum(np.arange(pairs)[:, None] * apart + [0, 1], view.count - 1).reshape(-1)
-        found, vertices = view.follow(upload(mi.UInt32, lane), self._limits(view, _WHOLE, self.max_depth), 1)
-        pilot = Pilot.of(found, vertices, lane // view.samples)
+        lanes, limits = upload(mi.UInt32, lane), self._limits(view, _WHOLE, self.max_depth)
+        found, vertices, _, arrival = view.follow(lanes, limits, 1)
+        pilot = Pilot.of(found, vertices, arrival, lane // view.samples)
         view.emission.learn(*pilot.vertices, int(_LEARNING_SHARE * view.count), derived_seed(view.seed, 6))
         return pilot
 
@@ -239,10 +242,20 @@ class ManyLightsIntegrator(GatheringIntegrator):
         lit = dr.zeros(mi.UnpolarizedSpectrum, count)
         dr.eval(lit)
         turn = dr.arange(mi.UInt32, count) % dr.opaque(mi.UInt32, samples) % dr.opaque(mi.UInt32, step)
-        rays = dr.compress((turn == 0) & (dr.max(vertices.weight) > 0))
+        first, later = vertices
+        rays = dr.compress((turn == 0) & (dr.max(first.weight) > 0))
         if len(rays) == 0:
             return lit
-        clusters = PixelClusters(vertices.select(rays), rays, samples)
+        picked, (later_rays, factor) = (
+            first.select(rays),
+            drawn_later(first, later, samples, kept, derived_seed(seed, 0)),
+        )
+        alone = len(later_rays)
+        if alone:
+            # As many as there would be among the first vertices that are lit
+            factor *= dr.opaque(mi.Float, kept / samples)
+            picked, rays = picked.and_then(later.select(later_rays, factor)), dr.concat((rays, later_rays))
+        clusters = PixelClusters(picked, rays, samples, alone)
         clock.lap(Stage.CLUSTERS)
         traced = np.nan_to_num(download(channel_mean(found.radiance)))
         level = np.add.reduceat(np.maximum(traced, 0), np.arange(0, count, samples)) / samples + expected
@@ -251,7 +264,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         shadow_rays = light_clusters(transport, clusters, level, chosen.error, _MAX_CUT, seed, lit)
         clock.lap(Stage.CUTS)
         more = {"shadow_rays": shadow_rays, "gather_points": len(rays), "clusters": clusters.count}
-        add_statistics(self.statistics, more)
+        add_statistics(self.statistics, more | {"later": alone})
         # Every step-th sample stands for all
         return lit * dr.opaque(mi.Float, samples / kept)
 

@@ -20,7 +20,8 @@ from vpl.split.cells import Cells
 from vpl.split.floors import agrees, carried_share, floor_of, side_of
 from vpl.split.numbers import spread_numbers
 from vpl.split.pixel_clusters import PixelClusters, Receivers
-from vpl.split.remainder import GatherVertices, power_heuristic
+from vpl.split.gather_vertices import GatherVertices, drawn_later
+from vpl.split.remainder import power_heuristic
 from vpl.transport.bounds import contribution_bound
 from vpl.transport.contribution import contribution
 
@@ -280,10 +281,9 @@ def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
     weight = rng.uniform(0.01, 1, (count, 3))
     normal = unit_vectors(rng, count).astype(np.float64)
     position = points(rng.normal(size=(count, 3)))
-    zero = dr.zeros(mi.Float, count)
     vertices = GatherVertices(
         position, mi.Normal3f(points(normal)), mi.Normal3f(points(normal)), mi.Color3f(points(weight)),
-        dr.full(mi.UInt32, 1, count), position, mi.Normal3f(points(normal)), zero, zero,
+        dr.full(mi.UInt32, 1, count),
     )  # fmt: skip
     clusters = PixelClusters(vertices, dr.arange(mi.UInt32, count), samples)
     first, size = np.array(clusters.first), np.array(clusters.size)
@@ -309,3 +309,28 @@ def test_lights_pay_where_indirect_light_is_the_noise_and_only_there():
     assert balance(indirect, indirect, level, 10**4, 64).light_paths == 0
     assert balance(direct, 1e-3 * indirect, level, 10**7, 64).light_paths == 0
     assert balance(direct, 0 * indirect, level, 10**8, 64).light_paths == 0
+
+
+def test_later_vertices_are_drawn_by_weight_and_stand_for_all_of_them():
+    rng, pixels, samples, most = np.random.default_rng(2), 50, 8, 3
+    weights = []
+    for share in (0.5, 0.3):
+        weight = rng.exponential(size=(pixels * samples, 3)) * (rng.random((pixels * samples, 1)) < share)
+        weights.append(np.where(rng.random((pixels * samples, 1)) < 0.2, -weight, weight))
+    first, later = (
+        GatherVertices(None, None, None, mi.Color3f(*(upload(mi.Float, x) for x in weight.T)), None)
+        for weight in weights
+    )
+    mean, seeds = np.zeros(pixels * samples), 4000
+    for seed in range(seeds):
+        ray, factor = (np.array(x) for x in drawn_later(first, later, samples, most, seed))
+        assert (np.diff(ray.astype(int)) >= 0).all()
+        assert np.bincount(ray // samples, minlength=pixels).max() <= most
+        np.add.at(mean, ray, factor / seeds)
+    drawn = np.abs(weights[1]).mean(1) > 0
+    assert (mean[~drawn] == 0).all()
+    # Systematic sampling: a count is right on average, with a variance below that of one draw by its share
+    total = np.abs(weights).mean(2).sum(0).reshape(pixels, samples).sum(1).repeat(samples) / most
+    share = np.abs(weights[1]).mean(1) / total
+    spread = (np.maximum(share, 1e-9) / seeds) ** 0.5
+    assert (np.abs(mean - 1)[drawn] * share[drawn] < 5 * spread[drawn]).all()

@@ -14,6 +14,7 @@ In the order to read in:
 - ``learned_emitters``: emitters, and regions of the environment, chosen by what a pilot's vertices see of them
 - ``emitter_tree``: a tree over emitters with a place, by which one is drawn for a vertex
 - ``numbers``: random numbers that are spread well over the samples of a pixel
+- ``gather_vertices``: vertices where virtual lights are gathered, and which of the later ones are
 - ``pilot``: a few paths that tell where light is wanted
 - ``balance``: what the pilot decides: whether lights pay, how many, how finely they are clustered
 - ``cells``: boxes where camera paths arrive, and random lines that meet surfaces in them with a known density

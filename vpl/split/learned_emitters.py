@@ -146,7 +146,7 @@ class LearnedEmitters:
         return light, seen
 
     def _shares(self, unoccluded: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        """Probabilities (sites + 1, sources) by root mean squares of what arrived; in the first row nothing is known."""
+        """Probabilities (sites + 1, sources) by root mean squares of what arrived; first where nothing is known."""
         possible = np.nan_to_num(unoccluded, posinf=0) ** 2
         if self._regions:
             # Its regions stand for the environment

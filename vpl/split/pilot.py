@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.arrays import channel_mean, download
-from .remainder import Found, GatherVertices
+from .gather_vertices import Arrival, GatherVertices
+from .remainder import Found
 
 # Tiles of the pilot's image, in pixels
 _TILE = 16
@@ -40,11 +41,11 @@ class Pilot:
     indirect: np.ndarray
 
     @classmethod
-    def of(cls, found: Found, vertices: GatherVertices, pixel: np.ndarray) -> Pilot:
+    def of(cls, found: Found, vertices: GatherVertices, arrival: Arrival, pixel: np.ndarray) -> Pilot:
         """The pilot of some paths of the pixels ``pixel``."""
         radiance = np.nan_to_num(download(channel_mean(found.radiance)).astype(np.float64), posinf=0, neginf=0)
         position, normal, weight, before = (
-            download(x) for x in (vertices.arrival, vertices.arrival_normal, vertices.arrival_weight, vertices.before)
+            download(x) for x in (arrival.position, arrival.normal, arrival.weight, arrival.before)
         )
         arrived = (weight > 0) & np.isfinite(weight) & np.isfinite(position).all(1)
         indirect = np.where(arrived, np.maximum(radiance - np.nan_to_num(before), 0), 0)

@@ -22,7 +22,7 @@ from ..points.bsdf_proxies import MaterialProxy
 from ..points.surfaces import LambertianSurface, Receiver
 from ..transport.evaluation import Transport, evaluate_pairs
 from .facing import WAYS, facing
-from .remainder import GatherVertices
+from .gather_vertices import GatherVertices
 
 
 @dataclass
@@ -63,14 +63,15 @@ class Receivers:
 class PixelClusters:
     """Clusters of the gather vertices of pixels.
 
-    ``vertices``: with weight, evaluated; ``rays``: UInt32, ascending, the camera ray of each; ``samples``: camera rays
-    of a pixel, next to each other.
+    ``vertices``: with weight, evaluated; ``rays``: UInt32, the camera ray of each; ``samples``: camera rays of a pixel,
+    next to each other; ``alone``: so many vertices, the last ones, are clusters of their own.
     """
 
-    def __init__(self, vertices: GatherVertices, rays, samples: int):
+    def __init__(self, vertices: GatherVertices, rays, samples: int, alone: int = 0):
         position, normal = download(vertices.position), download(vertices.normal)
         pixel = download(rays).astype(np.int64) // samples
         key = pixel * WAYS + facing(normal)
+        key[len(key) - alone :] = (pixel.max() + 1) * WAYS + np.arange(alone)
         order = np.argsort(key, kind="stable")
         position, normal, key = position[order], normal[order], key[order]
         first = np.flatnonzero(np.diff(key, prepend=-1))
@@ -80,7 +81,7 @@ class PixelClusters:
         size = np.diff(first, append=len(key))
         self.cluster = np.repeat(np.arange(len(first)), size)
         cosine = np.minimum.reduceat((normal * axis[self.cluster]).sum(1), first)
-        self.pixel = key[first] // WAYS
+        self.pixel = pixel[order[first]]
         # Rounded down, so that every normal is inside
         self.receivers = Receivers.of(0.5 * (low + high), 0.5 * (high - low), axis, np.maximum(cosine - 2e-6, -1))
         self.first, self.size = upload(mi.UInt32, first), upload(mi.UInt32, size)
@@ -90,7 +91,7 @@ class PixelClusters:
             dr.gather(mi.UnpolarizedSpectrum, vertices.weight, along),
         )
         at = [dr.gather(type(x), x, along) for x in (vertices.position, vertices.flat, vertices.normal, vertices.depth)]
-        self._level = channel_mean(self._weight)
+        self._level = channel_mean(dr.abs(self._weight))
         self.cumulative = running_sums(self._level)
         sums = download(self.cumulative)
         self.weight = sums[first + size] - sums[first]

@@ -4,7 +4,7 @@ A path from the camera goes on through mirrors and glass to its first vertex wit
 gathered.  What its next vertex x2 would send back by w F1 F2 is theirs (:mod:`vpl.split.floors`) and is taken off the
 BSDF of x2, in next-event estimation as well as in the throughput of the path, which goes on from x2 as ``path`` would.
 The rest may be negative.  Russian roulette by how much is left ends most paths at x2: nearly all of them where both
-surfaces are Lambertian and far apart.
+surfaces are Lambertian and far apart.  What goes on may be gathered in turn, at x2 and wherever there is a floor.
 
 The same kernel follows paths of which nothing is taken off: those that find the irradiance of a virtual light.
 """
@@ -16,12 +16,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import channel_mean, ones
+from ..core.arrays import channel_mean, ones, select_record
 from ..direct.emitter_sampling import power_heuristic
 from ..lights.perturbed import Perturbed
 from .floors import agrees, carried_share, floor_of, side_of
+from .gather_vertices import Arrival, GatherVertices
 
-# Where a path is: before its first vertex with a floor; on its way from that to the next vertex; and past it
+# Where a path is: before its first vertex with a floor; on its way from one where lights are gathered to the next
+# vertex; and anywhere else
 SEEKING, CONNECTING, PAST = range(3)
 # No path is ended with more than this probability because little is left of it: what is left is known only roughly
 _LEAST_SURVIVAL = 0.02
@@ -29,12 +31,13 @@ _LEAST_SURVIVAL = 0.02
 
 @dataclass
 class Limits:
-    """``max_depth`` (edges), ``rr_depth``: as in ``path``, UInt32; ``squared_c``: of the split, world units²; all
-    opaque.  ``perturbed``: shapes without a floor; ``hide_emitters``: of Python."""
+    """``max_depth`` (edges), ``rr_depth``: as in ``path``, UInt32; ``squared_c``: of the split, world units²; ``again``:
+    whether lights are gathered after the first vertex, too; all opaque.  ``perturbed``: shapes without a floor; ``hide_emitters``: of Python."""
 
     max_depth: object
     rr_depth: object
     squared_c: object
+    again: object
     perturbed: Perturbed
     hide_emitters: bool
 
@@ -98,38 +101,10 @@ class Found:
     valid: object
 
 
-@dataclass
-class GatherVertices:
-    """First vertices with a floor, one per lane: where virtual lights are gathered.
-
-    ``position``, ``normal`` (shading normal, on the side that is seen), ``flat`` (geometric normal), ``depth``: edges
-    from the camera; ``weight``: what irradiance there contributes to the camera ray, throughput times floor, 0 where
-    there is no such vertex: the others are of the last one that scatters, ``depth`` 0 if there is none; ``arrival``:
-    the vertex after it, if it has a floor too, ``arrival_normal``: the normal of the side that was met,
-    ``arrival_weight``: what irradiance there would contribute if virtual lights carried all of it (w = 1), and
-    ``before``: the radiance that the path found before it; means over channels.
-    """
-
-    position: object
-    normal: object
-    flat: object
-    weight: object
-    depth: object
-    arrival: object
-    arrival_normal: object
-    arrival_weight: object
-    before: object
-
-    def select(self, index) -> GatherVertices:
-        """Those picked by an index array, evaluated."""
-        picked = GatherVertices(*(dr.gather(type(x), x, index) for x in vars(self).values()))
-        dr.eval(picked)
-        return picked
-
-
 @dr.syntax
 def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
-    """Follow paths to their ends: (:class:`Found`, :class:`GatherVertices`), evaluated.
+    """Follow paths to their ends: (:class:`Found`, first gather vertices, one of the later ones, drawn by weight, and
+    :class:`Arrival`), evaluated.
 
     ``emission``: how emitters are sampled, see :mod:`vpl.split.next_event`; ``numbers``: (number, pair, number, pair)
     for the first vertex that scatters, which choose an emitter, a place on it, a lobe, and a direction; ``sampler``:
@@ -147,10 +122,9 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
     site = mi.UInt32(first.site)
     # Of what x1 sends on, the part that virtual lights carry but for w and the floor of x2; and the cosine there
     carried, cosine = dr.zeros(mi.UnpolarizedSpectrum, count), mi.Float(1)
-    position, normal, flat = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0)
-    weight, edges = dr.zeros(mi.UnpolarizedSpectrum, count), mi.UInt32(0)
-    arrival, arrival_normal = mi.Point3f(0), mi.Normal3f(0)
-    arrival_weight, before = mi.Float(0), mi.Float(0)
+    vertices = GatherVertices.none(count)
+    later, all_later = GatherVertices.none(count), mi.Float(0)
+    arrival = Arrival.none()
 
     while dr.hint(active, exclude=[first, numbers, limits, emission, context, count, other_lobes]):
         # ---------------------- Next vertex ----------------------
@@ -170,15 +144,13 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
         goes_on = active & si.is_valid() & (depth + 1 < limits.max_depth) & ~hidden
         flags, side = bsdf.flags(), side_of(si)
         smooth = goes_on & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-        floor = floor_of(si, bsdf, side, limits.perturbed, smooth & (state <= CONNECTING))
+        floor = floor_of(si, bsdf, side, limits.perturbed, smooth & (limits.again | (state <= CONNECTING)))
         w = carried_share(limits.squared_c, cosine, dr.abs(dr.dot(si.n, ray.d)), dr.square(si.t))
         # Lights at x2 shine to where its shading normal faces, too
         connects = smooth & (state == CONNECTING) & agrees(si, side)
         carried = dr.select(connects, carried * floor, 0)
         met = si.n * dr.mulsign(mi.Float(1), -dr.dot(si.n, ray.d))
-        arrival, arrival_normal = dr.select(connects, si.p, arrival), dr.select(connects, met, arrival_normal)
-        arrival_weight = dr.select(connects, channel_mean(carried), arrival_weight)
-        before = dr.select(connects, channel_mean(radiance), before)
+        arrival = select_record(connects, Arrival(si.p, met, channel_mean(carried), channel_mean(radiance)), arrival)
         carried *= w
 
         # ---------------------- The path ends at a Lambertian x2, unless something is left of it ----------------------
@@ -192,12 +164,16 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
         carried /= left
 
         # ---------------------- A vertex where lights are gathered ----------------------
-        gathers = smooth & (state == SEEKING) & agrees(si, side) & (dr.max(floor) > 0)
-        gathers &= depth + 2 < limits.max_depth
         seeks = smooth & (state == SEEKING)
-        position, normal = dr.select(seeks, si.p, position), dr.select(seeks, si.sh_frame.n * side, normal)
-        flat, edges = dr.select(seeks, si.n, flat), dr.select(seeks, depth + 1, edges)
-        weight = dr.select(gathers, throughput * floor, weight)
+        gathers = (seeks | (smooth & limits.again)) & agrees(si, side) & (dr.max(floor) > 0)
+        gathers &= depth + 2 < limits.max_depth
+        weight = dr.select(gathers, throughput * floor - carried, 0)
+        here = GatherVertices(si.p, si.sh_frame.n * side, si.n, weight, depth + 1)
+        vertices = select_record(seeks, here, vertices)
+        amount = dr.select(gathers & ~seeks, channel_mean(dr.abs(weight)), 0)
+        all_later += amount
+        taken = sampler.next_1d() * all_later < amount
+        later = select_record(taken, here, later)
 
         # ---------------------- Emission, by next-event estimation ----------------------
         first_numbers = spread & smooth
@@ -229,7 +205,7 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
         throughput = full - carried * lambertian
         kept = dr.max(dr.abs(throughput)) / dr.max(dr.abs(full))
         kept = dr.select((dr.max(carried) > 0) & dr.isfinite(kept), dr.clip(kept, _LEAST_SURVIVAL, 1), 1)
-        carried = dr.select(gathers, weight * lambertian, 0)
+        carried = weight * lambertian
         onward = dr.select(gathers & ~delta, mi.UInt32(CONNECTING), mi.UInt32(PAST))
         state = dr.select((state == SEEKING) & ~gathers, mi.UInt32(SEEKING), onward)
         ray, vertex = si.spawn_ray(dr.select(hidden, ray.d, si.to_world(bs.wo))), mi.Point3f(si.p)
@@ -248,12 +224,10 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
             delta, eta = delta | passes, dr.select(passes, 1, eta)
             state = dr.select(passes, mi.UInt32(SEEKING), state)
 
-    found, vertices = (
-        Found(radiance, drawn * dr.select(level > 0, level / dr.sum(dr.abs(drawn)), 0), length, valid),
-        GatherVertices(position, normal, flat, weight, edges, arrival, arrival_normal, arrival_weight, before),
-    )
-    dr.eval(found, vertices)
-    return found, vertices
+    found = Found(radiance, drawn * dr.select(level > 0, level / dr.sum(dr.abs(drawn)), 0), length, valid)
+    later.weight *= dr.select(all_later > 0, all_later / channel_mean(dr.abs(later.weight)), 0)
+    dr.eval(found, vertices, later, arrival)
+    return found, vertices, later, arrival
 
 
 def _draw(drawn, length, level, contribution, edges, sampler):

@@ -144,7 +144,7 @@ def _irradiance(scene, emission, rays, limits: Limits, seed: int):
     dr.eval(si.p, nearest, ray, density, draw, site)
     edge = FirstEdge.of(si.p, ray, ones(count) * dr.pi, density, False, PAST, site, True)
     numbers = spread_numbers(dr.arange(mi.UInt32, count), 1, seed)
-    found, _ = follow(scene, emission, edge, numbers, independent_sampler(derived_seed(seed, 1), count), limits)
+    found, *_ = follow(scene, emission, edge, numbers, independent_sampler(derived_seed(seed, 1), count), limits)
     # Gather points further from the camera may use shorter paths only: a light stands for paths of one length, and has
     # the colour of none but these
     level, more = dr.sum(nearest), dr.sum(found.drawn)

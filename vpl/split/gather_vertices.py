@@ -1,0 +1,97 @@
+"""Vertices of camera paths at which virtual lights are gathered, and which of them are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import channel_mean, download, upload
+
+
+@dataclass
+class GatherVertices:
+    """Vertices of paths, one per lane.
+
+    ``position``, ``normal`` (shading normal, on the side that is seen), ``flat`` (geometric normal), ``depth``: edges
+    from the camera, 0 where there is no vertex; ``weight``: what irradiance that virtual lights send there contributes
+    to the camera ray, unpolarized spectrum, may be negative; 0 where none is gathered.
+    """
+
+    position: object
+    normal: object
+    flat: object
+    weight: object
+    depth: object
+
+    @classmethod
+    def none(cls, count: int) -> GatherVertices:
+        """No vertices."""
+        weight = dr.zeros(mi.UnpolarizedSpectrum, count)
+        return cls(mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0), weight, mi.UInt32(0))
+
+    def select(self, index, factor=1) -> GatherVertices:
+        """Those picked by an index array, with their weights times ``factor``, evaluated."""
+        picked = GatherVertices(*(dr.gather(type(x), x, index) for x in vars(self).values()))
+        picked.weight *= factor
+        dr.eval(picked)
+        return picked
+
+    def and_then(self, more: GatherVertices) -> GatherVertices:
+        """These, and others after them, evaluated."""
+        both = GatherVertices(*(_joined(x, y) for x, y in zip(vars(self).values(), vars(more).values(), strict=True)))
+        dr.eval(both)
+        return both
+
+
+def _joined(first, second):
+    if dr.depth_v(first) == 1:
+        return dr.concat((first, second))
+    return type(first)(*(dr.concat(channels) for channels in zip(first, second, strict=True)))
+
+
+@dataclass
+class Arrival:
+    """Second vertices of paths, met by an edge from a first one where lights are gathered, one per lane.
+
+    ``position``; ``normal`` of the side that was met; ``weight``: what irradiance there would contribute if virtual
+    lights carried all of it (w = 1), 0 where there is no such vertex or it has no floor; ``before``: the radiance that
+    the path found before it; means over channels.
+    """
+
+    position: object
+    normal: object
+    weight: object
+    before: object
+
+    @classmethod
+    def none(cls) -> Arrival:
+        """No arrivals."""
+        return cls(mi.Point3f(0), mi.Normal3f(0), mi.Float(0), mi.Float(0))
+
+
+def drawn_later(first: GatherVertices, later: GatherVertices, samples: int, most: int, seed: int):
+    """Some of the ``later`` vertices of each pixel, drawn so that each has the weight that ``most`` vertices of the
+    pixel would have on average if all of its light was theirs: (camera rays, ascending, factors of their weights).
+
+    Systematic sampling along each pixel, from a random start.  ``samples``: camera rays of a pixel, side by side.
+    """
+    of_first, of_later = (
+        np.nan_to_num(download(channel_mean(dr.abs(x.weight))).astype(np.float64), posinf=0) for x in (first, later)
+    )
+    pixels = np.arange(0, len(of_first), samples)
+    sums = np.add.reduceat(of_later, pixels)
+    step = (sums + np.add.reduceat(of_first, pixels)) / most
+    start = np.random.default_rng(seed).random(len(pixels))
+    number = np.floor(sums / np.where(sums > 0, step, 1) + start).astype(np.int64)
+    pixel = np.repeat(np.arange(len(pixels)), number)
+    rank = np.arange(len(pixel)) - np.repeat(np.cumsum(number) - number, number)
+    cumulative = np.cumsum(of_later)
+    target = (cumulative[pixels] - of_later[pixels])[pixel] + (rank + 1 - start[pixel]) * step[pixel]
+    ray = np.minimum(np.searchsorted(cumulative, target, side="left"), len(of_later) - 1)
+    # Rounding must not lead to a neighbouring pixel or to a vertex without weight
+    kept = (of_later[ray] > 0) & (ray // samples == pixel)
+    ray, factor = ray[kept], step[pixel[kept]] / of_later[ray[kept]]
+    return upload(mi.UInt32, ray), upload(mi.Float, factor)
