@@ -15,12 +15,12 @@ from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.points.camera_paths import SceneTraits, refuse_media
 from vpl.split.balance import Balance, balance, without_lights
-from vpl.split.gather_vertices import GatherVertices, drawn_later
+from vpl.split.gather_vertices import drawn_later
 from vpl.split.next_event import emitters_of
 from vpl.split.numbers import spread_numbers
 from vpl.split.pilot import Pilot
 from vpl.split.pixel_clusters import PixelClusters, light_clusters
-from vpl.split.remainder import FirstEdge, Found, Limits, follow
+from vpl.split.remainder import FirstEdge, Limits, follow
 from vpl.split.surface_lights import surface_lights
 from vpl.transport.evaluation import Transport
 

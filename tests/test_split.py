@@ -18,9 +18,9 @@ from vpl.points.surfaces import LambertianSurface
 from vpl.split.balance import balance
 from vpl.split.cells import Cells
 from vpl.split.floors import agrees, carried_share, floor_of, side_of
+from vpl.split.gather_vertices import GatherVertices, drawn_later
 from vpl.split.numbers import spread_numbers
 from vpl.split.pixel_clusters import PixelClusters, Receivers
-from vpl.split.gather_vertices import GatherVertices, drawn_later
 from vpl.split.remainder import power_heuristic
 from vpl.transport.bounds import contribution_bound
 from vpl.transport.contribution import contribution
