@@ -31,8 +31,11 @@ _LEAST_SURVIVAL = 0.02
 
 @dataclass
 class Limits:
-    """``max_depth`` (edges), ``rr_depth``: as in ``path``, UInt32; ``squared_c``: of the split, world units²; ``again``:
-    whether lights are gathered after the first vertex, too; all opaque.  ``perturbed``: shapes without a floor; ``hide_emitters``: of Python."""
+    """``max_depth`` (edges), ``rr_depth``: as in ``path``, UInt32; ``squared_c``: of the split, world units²;
+    ``again``: whether lights are gathered after the first vertex, too; all opaque.
+
+    ``perturbed``: shapes without a floor; ``hide_emitters``: of Python.
+    """
 
     max_depth: object
     rr_depth: object
