@@ -8,7 +8,7 @@ import pytest
 
 from vpl.split import balance
 
-from .catalogue import EMITTERS, MATERIALS, ONE_PIXEL, SENSORS, film, one_of, rgb, stage
+from .catalogue import EMITTERS, MATERIALS, ONE_PIXEL, SENSORS, film, image, one_of, rgb, stage
 from .conftest import (
     area_light,
     assert_same_mean_over_seeds,
@@ -75,6 +75,13 @@ def test_a_closed_box(max_depth):
 def test_emitters(emitter):
     ball = {"ball": {"type": "sphere", "center": [-0.6, -0.4, 0.3], "radius": 0.55, "bsdf": {"type": "plastic"}}}
     assert_image_of_path(stage(EMITTERS[emitter](), ball, 16), max_depth=4)
+
+
+def test_a_turned_sphere_with_a_texture():
+    patches = image(np.random.default_rng(3).uniform(0, 8, (4, 8, 3)) ** 2) | {"filter_type": "nearest"}
+    turned = mi.ScalarTransform4f().translate([0, 0.1, 0]).rotate([0, 0, 1], 25).rotate([1, 0, 0], 60).scale(0.35)
+    glowing = {"type": "sphere", "to_world": turned, "emitter": {"type": "area", "radiance": patches}}
+    assert_image_of_path(closed_box({"ball": glowing}, 16), max_depth=4)
 
 
 @pytest.mark.parametrize("material", QUICK_MATERIALS)

@@ -16,6 +16,7 @@ import numpy as np
 from ..core.arrays import download, finite_or_zero, select_record, upload
 from ..core.parameters import matrix_of, parameters_of
 from ..lights.emitters import AreaEmitters, registered_shapes
+from ..lights.spheres import Sphere, sphere_coordinates
 
 PARALLELOGRAM, TRIANGLE, DISK, SPHERE, SHAPE = range(5)
 
@@ -117,7 +118,7 @@ class EmitterPieces:
         if SHAPE in self._kinds:
             whole = active & (kind == SHAPE)
             # By area, because texture coordinates come with positions only
-            ps = self._area.on_shape("sample_position", row, interaction.time, sample, whole)
+            ps = self._area.sample_position(row, interaction.time, sample, whole)
             other = PieceSample(ps.p, ps.n, ps.uv, _flat_density(interaction.p, ps.p, ps.n, size))
             found = select_record(whole, other, found)
         active = active & (found.pdf > 0)
@@ -167,10 +168,7 @@ class EmitterPieces:
         """Texture coordinates of a point of a sphere with the given x and z axes."""
         if self._uv is None:
             return mi.Point2f(0)
-        y = dr.cross(axis, across) * handed
-        azimuth = dr.atan2(dr.dot(outward, y), dr.dot(outward, across))
-        azimuth = dr.select(azimuth < 0, azimuth + dr.two_pi, azimuth)
-        return mi.Point2f(azimuth * dr.inv_two_pi, dr.safe_acos(dr.dot(outward, axis)) * dr.inv_pi)
+        return sphere_coordinates(outward, across, axis, handed)
 
     def _texture_coordinates(self, piece, a, b, active):
         if self._uv is None:
@@ -284,9 +282,8 @@ def _pieces_of(shape, textured: bool) -> _Pieces:
     if name == "Disk" and not textured:
         return _one(DISK, origin, linear[:, 0], linear[:, 1], np.linalg.inv(linear).T[:, 2])
     if name == "Sphere":
-        radius = np.linalg.norm(linear[:, 0])
-        facts = (radius, -1 if shape.has_flipped_normals() else 1, np.sign(np.linalg.det(linear)))
-        return _one(SPHERE, origin, facts, linear[:, 0] / radius, linear[:, 2])
+        sphere = Sphere.of(shape)
+        return _one(SPHERE, sphere.center, (sphere.radius, sphere.side, sphere.handed), sphere.across, sphere.axis)
     return _one(SHAPE, (0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 1))
 
 
