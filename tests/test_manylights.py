@@ -18,6 +18,7 @@ from .conftest import (
     sensor,
     wall,
 )  # fmt: skip
+from .test_area_emitters import smooth_octahedron
 from .test_masks_in_between import veiled_room
 
 # What the quick run tests
@@ -82,6 +83,10 @@ def test_a_turned_sphere_with_a_texture():
     turned = mi.ScalarTransform4f().translate([0, 0.1, 0]).rotate([0, 0, 1], 25).rotate([1, 0, 0], 60).scale(0.35)
     glowing = {"type": "sphere", "to_world": turned, "emitter": {"type": "area", "radiance": patches}}
     assert_image_of_path(closed_box({"ball": glowing}, 16), max_depth=4)
+
+
+def test_a_glowing_mesh_with_vertex_normals():
+    assert_image_of_path(closed_box(smooth_octahedron(), 16), max_depth=4)
 
 
 @pytest.mark.parametrize("material", QUICK_MATERIALS)
