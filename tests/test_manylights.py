@@ -20,6 +20,7 @@ from .conftest import (
 )  # fmt: skip
 from .test_area_emitters import smooth_octahedron
 from .test_masks_in_between import veiled_room
+from .test_small_suns import sunny
 
 # What the quick run tests
 QUICK_EMITTERS = ("point", "spot", "directional", "rectangle", "envmap", "constant")
@@ -87,6 +88,10 @@ def test_a_turned_sphere_with_a_texture():
 
 def test_a_glowing_mesh_with_vertex_normals():
     assert_image_of_path(closed_box(smooth_octahedron(), 16), max_depth=4)
+
+
+def test_a_sun_of_one_texel():
+    assert_image_of_path(stage(sunny(), one_of(MATERIALS["roughplastic"]()), 16), seeds=8, max_depth=4)
 
 
 @pytest.mark.parametrize("material", QUICK_MATERIALS)
