@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import add_at, channel_mean, download, upload
-from ..core.sampling import derived_seed, find_interval, independent_sampler, running_sums
+from ..core.sampling import derived_seed, find_interval, independent_sampler, precise_sample, running_sums
 from ..lights.light_set import LightGroup
 from ..points.point_clusters import PointClusters
 from ..transport.evaluation import Transport, evaluate_pairs
@@ -104,7 +104,7 @@ class PixelCuts:
         """
         first, count = self.clusters.ranges(pairs.points)
         last = first + count
-        sample = independent_sampler(derived_seed(self._seed, self._kernels), pairs.count).next_1d()
+        sample = precise_sample(independent_sampler(derived_seed(self._seed, self._kernels), pairs.count))
         point = find_interval(self._cumulative, first, last, sample)
 
         def ratio(cumulative):
