@@ -33,6 +33,9 @@ mirrors, glass and masks are followed, but no light that was reflected by a diff
 - All emitters of Mitsuba. Kernels do not grow with the number of point and spot emitters, and of area emitters of one
   colour on meshes, rectangles, disks and spheres; they do with textured ones and projectors.
 - Point, spot and directional emitters are blocked by masks and thin glass, as in ``path``.
+- The camera rays of a pixel that meet surfaces of about the same orientation share the light that arrives there, and
+  each reflects it by itself: with a box filter the image is that of all rays in expectation; wider filters leave
+  textures as they are, and blur edges of shadows and glossy highlights inside of a pixel.
 """,
 }
 _PLACE = re.compile(r"^( *)\{([a-z ]+)\}\n", re.MULTILINE)

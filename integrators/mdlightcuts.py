@@ -48,9 +48,10 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
 
     {what is estimated}
 
-    The samples of a pixel share their light: with a box filter the image is that of all samples in expectation; wider
-    filters blur it inside of a pixel, and second moments over samples mean nothing. Pixels are told apart only for the
-    sensors of the scene; with another one every camera ray counts as a pixel, which is as slow as ``lightcuts``.
+    The samples of a pixel share the light that arrives at them, and each reflects it by itself: with a box filter the
+    image is that of all samples in expectation; wider filters leave textures as they are and blur edges of shadows and
+    glossy highlights inside of a pixel, and second moments over samples mean nothing. Pixels are told apart only for
+    the sensors of the scene; with another one every camera ray counts as a pixel, which is as slow as ``lightcuts``.
 
     **Departures from the paper.** Thresholds come from an estimate made before instead of from a running total, and the
     upper levels of both trees are descended for blocks of pixels at once; see :mod:`vpl.cuts.pixel_cuts`. A

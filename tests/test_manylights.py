@@ -8,7 +8,7 @@ import pytest
 
 from vpl.split import balance
 
-from .catalogue import EMITTERS, MATERIALS, ONE_PIXEL, SENSORS, film, one_of, rgb, stage
+from .catalogue import EMITTERS, MATERIALS, ONE_PIXEL, SENSORS, film, image, one_of, rgb, stage
 from .conftest import (
     area_light,
     assert_same_mean_over_seeds,
@@ -18,7 +18,9 @@ from .conftest import (
     sensor,
     wall,
 )  # fmt: skip
+from .test_area_emitters import smooth_octahedron
 from .test_masks_in_between import veiled_room
+from .test_small_suns import sunny
 
 # What the quick run tests
 QUICK_EMITTERS = ("point", "spot", "directional", "rectangle", "envmap", "constant")
@@ -75,6 +77,21 @@ def test_a_closed_box(max_depth):
 def test_emitters(emitter):
     ball = {"ball": {"type": "sphere", "center": [-0.6, -0.4, 0.3], "radius": 0.55, "bsdf": {"type": "plastic"}}}
     assert_image_of_path(stage(EMITTERS[emitter](), ball, 16), max_depth=4)
+
+
+def test_a_turned_sphere_with_a_texture():
+    patches = image(np.random.default_rng(3).uniform(0, 8, (4, 8, 3)) ** 2) | {"filter_type": "nearest"}
+    turned = mi.ScalarTransform4f().translate([0, 0.1, 0]).rotate([0, 0, 1], 25).rotate([1, 0, 0], 60).scale(0.35)
+    glowing = {"type": "sphere", "to_world": turned, "emitter": {"type": "area", "radiance": patches}}
+    assert_image_of_path(closed_box({"ball": glowing}, 16), max_depth=4)
+
+
+def test_a_glowing_mesh_with_vertex_normals():
+    assert_image_of_path(closed_box(smooth_octahedron(), 16), max_depth=4)
+
+
+def test_a_sun_of_one_texel():
+    assert_image_of_path(stage(sunny(), one_of(MATERIALS["roughplastic"]()), 16), seeds=8, max_depth=4)
 
 
 @pytest.mark.parametrize("material", QUICK_MATERIALS)

@@ -140,11 +140,13 @@ def test_representatives_stand_for_points_of_all_weights_and_colours(black):
     weight[3] = 0
     if black:
         weight[:, 1] = 0
-    radiance = rng.uniform(0, 5, (count, 3))
+    arriving, albedo = rng.uniform(0, 5, (count, 3)), rng.uniform(0, 1, (count, 3)).astype(np.float32)
     pixel = np.repeat([0, 1], 6)
     normal = np.tile(np.float32([0, 0, 1]), (count, 1))
     position = rng.random((count, 3)).astype(np.float32)
-    clusters = PointClusters(batch_of(position, normal), partial(build_gather_tree, pixel, 2, 1))
+    batch = batch_of(position, normal)
+    batch.surfaces.albedo = mi.Color3f(*(upload(mi.Float, column / np.pi) for column in albedo.T))
+    clusters = PointClusters(batch, partial(build_gather_tree, pixel, 2, 1))
     tree = clusters.tree
     along = mi.Color3f(*(upload(mi.Float, column) for column in weight[tree.order].T))
     cuts = PixelCuts(clusters, pixel[tree.order], along, 6, 0)
@@ -152,9 +154,11 @@ def test_representatives_stand_for_points_of_all_weights_and_colours(black):
         inside = tree.order[tree.first[node] : tree.first[node] + tree.count[node]]
         chosen = dr.opaque(mi.UInt32, node, draws)
         point, factor = cuts._representative(Pairs(chosen, chosen))
-        found = (download(factor).reshape(-1, 3) * radiance[tree.order[download(point)]] * np.ones((draws, 1))).mean(0)
-        total = weight[inside].sum(0)
-        mean = (weight[inside] * radiance[inside]).sum(0) / np.where(total > 0, total, 1)
+        found = download(factor).reshape(-1, 3) * arriving[tree.order[download(point)]] * np.ones((draws, 1))
+        found = found.mean(0)
+        strength = (weight * albedo)[inside]
+        total = strength.sum(0)
+        mean = (strength * arriving[inside]).sum(0) / np.where(total > 0, total, 1)
         assert np.allclose(found, mean, rtol=0.03, atol=1e-6)
         assert np.isclose(cuts._share[node], weight[inside].sum(0).max() / 6, rtol=1e-5)
 

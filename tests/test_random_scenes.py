@@ -107,7 +107,8 @@ def test_a_choice_never_falls_on_nothing(weights, seed):
     row = choice.row(upload(mi.Float, uniform)) + dr.zeros(mi.UInt32, 64)
     assert (weights[download(row)] > 0).all()
     assert abs(choice.pmf.sum() - 1) < 1e-9
-    assert np.allclose(choice.pmf, weights / weights.sum())
+    # Probabilities are whole multiples of 2^-23, and none is 0 where the weight is not
+    assert np.allclose(choice.pmf, weights / weights.sum(), atol=(len(weights) + 1) * 2.0**-23)
 
 
 @given(

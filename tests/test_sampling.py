@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from vpl.core.arrays import download
-from vpl.core.sampling import SpreadSamples
+from vpl.core.sampling import Choice, SpreadSamples, independent_sampler, precise_sample
 
 from .conftest import area_light, render, sensor, wall
 
@@ -61,3 +61,24 @@ def test_rays_of_a_pixel_share_a_sequence(variant):
 
     assert noise(16, 1) < 1.5 * noise(1, 16)
     assert noise(16, 1) < 0.3 * noise(1, 1)
+
+
+@pytest.mark.parametrize("rows", [1, 3, 8000, 100_000])
+def test_rows_are_drawn_with_exactly_the_claimed_probability(rows):
+    """By every number that a sampler of Mitsuba may draw."""
+    weight = np.random.default_rng(0).random(rows) ** 20
+    weight[1::7] = 0
+    choice = Choice(weight)
+    count = 1 << 23
+    drawn = download(choice.row(mi.Float(dr.arange(mi.UInt32, count)) * 2.0**-23))
+    assert np.array_equal(np.bincount(drawn, minlength=rows) / count, choice.pmf)
+    assert np.array_equal(choice.pmf > 0, weight > 0)
+    assert np.array_equal(download(choice.probability(dr.arange(mi.UInt32, rows))), choice.pmf.astype(np.float32))
+    assert np.abs(choice.pmf - weight / weight.sum()).max() < 1e-5 + rows * 2.0**-22 * weight.max() / weight.sum()
+
+
+def test_precise_numbers_have_bits_below_those_of_the_sampler(variant):
+    values = download(precise_sample(independent_sampler(1, 100_000)))
+    assert values.dtype == np.float64 and values.min() >= 0 and values.max() < 1
+    for fraction in (values, values * 2**23 % 1):
+        assert stats.kstest(fraction, "uniform").pvalue > 1e-4

@@ -3,7 +3,8 @@
 A pixel's radiance is the sum, over all pairs of one of its gather points and a light, of what the light sends to the
 point, weighted by the point's share of the pixel.  A pair of a gather node and a light node stands for all pairs below;
 it is refined while its bound, times the share of its gather node, is above ``error`` times the radiance of the pixel.
-One point and one light represent it, each drawn by its strength, so that the cut is unbiased.
+One point and one light represent it, each drawn by its strength, so that the cut is unbiased.  A point stands for what
+arrives at the others: each reflects it by itself, so that textures are not blurred under filters wider than a pixel.
 
 Departures from the paper: thresholds are known before refinement begins, from estimates of the pixels' radiance,
 instead of following from the running total of a heap, so that all pixels refine at once (:mod:`vpl.cuts.product_cuts`);
@@ -19,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import add_at, channel_mean, download, upload
-from ..core.sampling import derived_seed, find_interval, independent_sampler, running_sums
+from ..core.sampling import derived_seed, find_interval, independent_sampler, precise_sample, running_sums
 from ..lights.light_set import LightGroup
 from ..points.point_clusters import PointClusters
 from ..transport.evaluation import Transport, evaluate_pairs
@@ -43,9 +44,12 @@ class PixelCuts:
         tree = clusters.tree
         end = tree.first.astype(np.int64) + tree.count
         self._of_pixel = pixel[tree.first] == pixel[end - 1]
-        self._cumulative, *self._channels = (running_sums(x) for x in (channel_mean(weight), *weight))
+        self._reflectance = clusters.batch.surfaces.reflectance()
+        dr.eval(self._reflectance)
+        strength = weight * self._reflectance
+        self._cumulative, *self._channels = (running_sums(x) for x in (channel_mean(strength), *strength))
         # Of the channel with most weight: where weights have colours, a pair may add more than the mean suggests
-        channels = np.stack([download(channel) for channel in self._channels])
+        channels = np.stack([download(running_sums(channel)) for channel in weight])
         self._share = (channels[:, end] - channels[:, tree.first]).max(0) / samples
         self._parent, self._leaf = upload(mi.UInt32, tree.parent), upload(mi.UInt32, tree.leaf)
         self._light = dr.zeros(mi.UnpolarizedSpectrum, tree.size)
@@ -82,7 +86,8 @@ class PixelCuts:
         light, scale = group.representatives(pairs.lights)
         surface = self.clusters.batch.surfaces_at(point)
         value, traced = evaluate_pairs(transport, group, surface, light, scale)
-        value = mi.UnpolarizedSpectrum(value * factor)
+        reflectance = dr.gather(type(self._reflectance), self._reflectance, point)
+        value = mi.UnpolarizedSpectrum(dr.select(reflectance > 0, value / reflectance, 0) * factor)
         bad = ~dr.all(dr.isfinite(value))
         add_at(self._light, dr.select(bad, 0, value), pairs.points)
         add_at(self.pairs, dr.ones(mi.Float, pairs.count), pairs.points)
@@ -93,13 +98,13 @@ class PixelCuts:
         self.dropped += int(dr.sum(bad)[0])
 
     def _representative(self, pairs: Pairs):
-        """A point of every pair's gather node, drawn by weight, and the factor on its radiance.
+        """A point of every pair's gather node, drawn by weight and reflectance, and the factor on what arrives there.
 
-        Where weights have colours, the factor makes up for those of the point that was drawn.
+        Where these have colours, the factor makes up for those of the point that was drawn.
         """
         first, count = self.clusters.ranges(pairs.points)
         last = first + count
-        sample = independent_sampler(derived_seed(self._seed, self._kernels), pairs.count).next_1d()
+        sample = precise_sample(independent_sampler(derived_seed(self._seed, self._kernels), pairs.count))
         point = find_interval(self._cumulative, first, last, sample)
 
         def ratio(cumulative):
@@ -115,7 +120,8 @@ class PixelCuts:
     def per_point(self):
         """(Radiance, pairs): for every point along the tree, from all nodes that hold it; pairs are shared out."""
         share = dr.rcp(mi.Float(upload(mi.UInt32, self.clusters.tree.count)))
-        return self._sum_from_root(self._light), self._sum_from_root(self.pairs * share)
+        radiance = self._reflectance * self._sum_from_root(self._light)
+        return radiance, self._sum_from_root(self.pairs * share)
 
     @dr.syntax
     def _sum_from_root(self, values):

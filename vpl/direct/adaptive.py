@@ -187,7 +187,22 @@ class _BatchLight:
                 part, result = self._light(groups, summed, level, derived_seed(seed, number), halted)
                 per_site[self.sites.of_groups(groups)] = self._columns(part, result)
                 number += 1
-        return per_site[self.sites.point_site]
+        per_point = per_site[self.sites.point_site]
+        per_point[:, :3] *= self._own_reflectance()
+        return per_point
+
+    def _own_reflectance(self) -> np.ndarray:
+        """Reflectance of every point over the mean of its site's, (n, channels) or 1.
+
+        The points of a site share what arrives and not what they reflect: under filters wider than a pixel, textures
+        stay as sharp as they are. The mean over the site remains what was estimated.
+        """
+        if self.sites.count == self.batch.count:
+            return np.ones(1)
+        own, site = download(self.batch.surfaces.reflectance()), self.sites.point_site
+        total = np.stack([np.bincount(site, channel) for channel in own.T], axis=1)
+        mean = (total / self.sites.points[:, None])[site]
+        return np.where(mean > 0, own / np.where(mean > 0, mean, 1), 1)
 
     def _portions(self, groups: np.ndarray, summed: bool):
         """Divide groups into portions that need little enough memory."""

@@ -14,16 +14,21 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import download, finite_or_zero, select_record, upload
+from ..core.cones import mean_axes
 from ..core.parameters import matrix_of, parameters_of
 from ..lights.emitters import AreaEmitters, registered_shapes
+from ..lights.spheres import Sphere, sphere_coordinates
 
 PARALLELOGRAM, TRIANGLE, DISK, SPHERE, SHAPE = range(5)
+# Normals in single precision that differ by no more are the same
+_ROUNDING = 1e-6
 
 
 @dataclass
 class PieceSample:
-    """Points on pieces, one per lane: position, normal of the side that emits, texture coordinates, and the density per
-    solid angle at the reference point (0 where the piece shows it its back)."""
+    """Points on pieces, one per lane: position, normal of the side that emits (of smooth meshes the shading normal, of
+    any length), texture coordinates, and the density per solid angle at the reference point (0 where the piece shows it
+    its back)."""
 
     p: object
     n: object
@@ -34,9 +39,9 @@ class PieceSample:
 class EmitterPieces:
     """All area emitters of a scene as k pieces.
 
-    ``center`` (k, 3), ``radius`` (k,): bounding spheres, world units, float64; ``axis`` (k, 3): unit normals, with
-    ``cone_cos`` (k,) = 1 for flat pieces and -1 for all others, which emit everywhere; ``intensity`` (k,): radiance
-    (mean over channels) times the largest projected area, float64.
+    ``center`` (k, 3), ``radius`` (k,): bounding spheres, world units; ``axis`` (k, 3), ``cone_cos`` (k,): cones around
+    the normals of flat pieces, and a cosine of -1 for all others, which emit everywhere; ``intensity`` (k,): radiance
+    (mean over channels) times the largest projected area.  All float64.
     """
 
     def __init__(self, scene, area: AreaEmitters):
@@ -46,18 +51,21 @@ class EmitterPieces:
         parts = [_pieces_of(shape, row in textured) for row, shape in enumerate(shapes)]
         counts = np.array([len(part.kind) for part in parts], np.int64)
         row = np.repeat(np.arange(len(parts)), counts)
-        kind, corner, first, second, normal, uv = (_joined(parts, name) for name in _COLUMNS)
+        kind, corner, first, second, normal, shading, uv = (_joined(parts, name) for name in _COLUMNS)
         size = _areas(kind, first, second)
         whole = kind == SHAPE
         size[whole] = area.area[row[whole]]
         self.count = len(kind)
         self._store(kind, corner, first, second, normal, size, row)
         self._uv = upload(mi.Float, np.pad(uv, ((0, 0), (0, 2)))) if textured else None
+        smooth = (np.abs(shading - _constant(normal)) > _ROUNDING).any(1)
+        self._shading = upload(mi.Float, np.pad(shading, ((0, 0), (0, 3)))) if smooth.any() else None
         self._first_piece = upload(mi.UInt32, np.cumsum(counts) - counts)
         self._has_meshes = upload(mi.UInt32, np.array([_is_mesh(shape) for shape in shapes], np.uint32))
         self._kinds = set(np.unique(kind).tolist())
         self._hollow = bool((first[kind == SPHERE, 1] < 0).any())
-        self._bound(kind, corner, first, second, normal, size, row, shapes)
+        self._bound(kind, corner, first, second, size, row, shapes)
+        self._face(kind, normal, shading, np.flatnonzero(smooth))
 
     def _store(self, kind, corner, first, second, normal, size, row):
         records = np.zeros((self.count, 16), np.float32)
@@ -67,7 +75,19 @@ class EmitterPieces:
         bits[:, 3], bits[:, 11] = kind, row
         self._records = upload(mi.Float, records)
 
-    def _bound(self, kind, corner, first, second, normal, size, row, shapes):
+    def _face(self, kind, normal, shading, smooth):
+        """Cones of directions that pieces face."""
+        flat = (kind <= DISK)[:, None]
+        self.axis = np.where(flat, normal, (0.0, 0.0, 1.0))
+        self.cone_cos = np.where(flat[:, 0], 1.0, -1.0)
+        # What is interpolated between three normals lies within any cone of less than 90 degrees that holds them
+        normals = shading[smooth, None, :3] + np.insert(shading[smooth, 3:].reshape(-1, 2, 3), 0, 0.0, axis=1)
+        normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), np.finfo(np.float64).tiny)
+        self.axis[smooth], balanced = mean_axes(normals.sum(1), normals[:, 0])
+        cosine = np.einsum("ijk,ik->ij", normals, self.axis[smooth]).min(1)
+        self.cone_cos[smooth] = np.where(balanced | (cosine <= 0), -1.0, np.minimum(cosine, 1))
+
+    def _bound(self, kind, corner, first, second, size, row, shapes):
         corners = np.stack([corner, corner + first, corner + second, corner + first + second], 1)
         corners[kind == TRIANGLE, 3] = corners[kind == TRIANGLE, 0]
         self.center = corners.mean(1)
@@ -83,11 +103,8 @@ class EmitterPieces:
             box = shapes[row[index]].bbox()
             low, high = np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel()
             self.center[index], self.radius[index] = (low + high) / 2, np.linalg.norm(high - low) / 2
-        flat = kind <= DISK
-        self.axis = np.where(flat[:, None], normal, (0.0, 0.0, 1.0))
-        self.cone_cos = np.where(flat, 1.0, -1.0)
         # Convex bodies show a quarter of their surface on average
-        projected = np.where(flat, size, size / 4)
+        projected = np.where(kind <= DISK, size, size / 4)
         self.intensity = projected * self._area.radiance.mean(1, dtype=np.float64)[row]
 
     def _fetch(self, piece, active):
@@ -109,16 +126,17 @@ class EmitterPieces:
             disk = mi.warp.square_to_uniform_disk_concentric(sample)
             a, b = dr.select(kind == DISK, disk.x, a), dr.select(kind == DISK, disk.y, b)
         p = corner + a * first + b * second
-        pdf = _flat_density(interaction.p, p, normal, size)
-        found = PieceSample(p, normal, self._texture_coordinates(piece, a, b, active), pdf)
+        shading = self._shading_normal(piece, a, b, normal, active)
+        pdf = _area_density(interaction.p, p, normal, size, shading)
+        found = PieceSample(p, shading, self._texture_coordinates(piece, a, b, active), pdf)
         if SPHERE in self._kinds:
             of_sphere = self._sample_sphere(interaction.p, corner, first, second, normal, size, sample)
             found = select_record(kind == SPHERE, of_sphere, found)
         if SHAPE in self._kinds:
             whole = active & (kind == SHAPE)
             # By area, because texture coordinates come with positions only
-            ps = self._area.on_shape("sample_position", row, interaction.time, sample, whole)
-            other = PieceSample(ps.p, ps.n, ps.uv, _flat_density(interaction.p, ps.p, ps.n, size))
+            ps = self._area.sample_position(row, interaction.time, sample, whole)
+            other = PieceSample(ps.p, ps.n, ps.uv, _area_density(interaction.p, ps.p, ps.n, size))
             found = select_record(whole, other, found)
         active = active & (found.pdf > 0)
         radiance = self._area.emitted_in_front(row, found, active)
@@ -133,21 +151,21 @@ class EmitterPieces:
         piece = dr.gather(mi.UInt32, self._first_piece, row, active) + dr.select(mesh, preliminary.prim_index, 0)
         kind, corner, first, second, normal, size, _ = self._fetch(piece, active)
         p = ray(preliminary.t)
-        hit = PieceSample(
-            p, normal, self._coordinates_of(piece, p, corner, first, second, active),
-            _flat_density(ray.o, p, normal, size),
-        )  # fmt: skip
+        a, b = _place_in_plane(p, corner, first, second)
+        shading = self._shading_normal(piece, a, b, normal, active)
+        pdf = _area_density(ray.o, p, normal, size, shading)
+        hit = PieceSample(p, shading, self._texture_coordinates(piece, a, b, active), pdf)
         if SPHERE in self._kinds:
             outward = mi.Normal3f(dr.normalize(p - corner))
             of_sphere = PieceSample(p, outward * first.y, self._on_sphere(outward, second, normal, first.z), None)
-            by_area = _flat_density(ray.o, p, of_sphere.n, size)
+            by_area = _area_density(ray.o, p, of_sphere.n, size)
             seen = dr.select(dr.dot(ray.d, of_sphere.n) < 0, _sphere_density(ray.o, corner, first.x), 0)
             of_sphere.pdf = dr.select(first.y > 0, seen, by_area)
             hit = select_record(kind == SPHERE, of_sphere, hit)
         if SHAPE in self._kinds:
             whole = active & (kind == SHAPE)
             si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, whole)
-            other = PieceSample(si.p, si.n, si.uv, _flat_density(ray.o, si.p, si.n, size))
+            other = PieceSample(si.p, si.n, si.uv, _area_density(ray.o, si.p, si.n, size))
             hit = select_record(whole, other, hit)
         shown = active & (hit.pdf > 0)
         return piece, active, self._area.emitted_in_front(row, hit, shown), hit.pdf & shown
@@ -159,7 +177,7 @@ class EmitterPieces:
             n = dr.select(first.y > 0, n, mi.Normal3f(mi.warp.square_to_uniform_sphere(sample)))
         p = center + first.x * n
         pdf = dr.select(
-            first.y > 0, _sphere_density(origin, center, first.x), _flat_density(origin, p, n * first.y, size)
+            first.y > 0, _sphere_density(origin, center, first.x), _area_density(origin, p, n * first.y, size)
         )
         return PieceSample(p, n * first.y, self._on_sphere(n, second, axis, first.z), pdf)
 
@@ -167,10 +185,7 @@ class EmitterPieces:
         """Texture coordinates of a point of a sphere with the given x and z axes."""
         if self._uv is None:
             return mi.Point2f(0)
-        y = dr.cross(axis, across) * handed
-        azimuth = dr.atan2(dr.dot(outward, y), dr.dot(outward, across))
-        azimuth = dr.select(azimuth < 0, azimuth + dr.two_pi, azimuth)
-        return mi.Point2f(azimuth * dr.inv_two_pi, dr.safe_acos(dr.dot(outward, axis)) * dr.inv_pi)
+        return sphere_coordinates(outward, across, axis, handed)
 
     def _texture_coordinates(self, piece, a, b, active):
         if self._uv is None:
@@ -178,23 +193,34 @@ class EmitterPieces:
         origin, along = (dr.gather(mi.Vector4f, self._uv, piece * 2 + k, active) for k in range(2))
         return mi.Point2f(origin.x + a * origin.z + b * along.x, origin.y + a * origin.w + b * along.y)
 
-    def _coordinates_of(self, piece, p, corner, first, second, active):
-        """Texture coordinates of a point in the plane of a piece."""
-        if self._uv is None:
-            return mi.Point2f(0)
-        offset = p - corner
-        ff, fs, ss = dr.squared_norm(first), dr.dot(first, second), dr.squared_norm(second)
-        of, os = dr.dot(offset, first), dr.dot(offset, second)
-        scale = dr.rcp(ff * ss - fs * fs)
-        return self._texture_coordinates(piece, (of * ss - os * fs) * scale, (os * ff - of * fs) * scale, active)
+    def _shading_normal(self, piece, a, b, normal, active):
+        """Normal whose side emits, up to its length."""
+        if self._shading is None:
+            return normal
+        x, y, z = (dr.gather(mi.Vector4f, self._shading, piece * 3 + k, active) for k in range(3))
+        along_a, along_b = mi.Vector3f(x.w, y.x, y.y), mi.Vector3f(y.z, y.w, z.x)
+        return mi.Normal3f(x.xyz + a * along_a + b * along_b)
 
 
-def _flat_density(origin, p, normal, size):
-    """Density per solid angle of a point drawn by area, 0 behind the surface."""
+def _place_in_plane(p, corner, first, second):
+    """Shares of both edges in the offset from the corner to a point in the plane of a piece."""
+    offset = p - corner
+    ff, fs, ss = dr.squared_norm(first), dr.dot(first, second), dr.squared_norm(second)
+    of, os = dr.dot(offset, first), dr.dot(offset, second)
+    scale = dr.rcp(ff * ss - fs * fs)
+    return (of * ss - os * fs) * scale, (os * ff - of * fs) * scale
+
+
+def _area_density(origin, p, normal, size, shading=None):
+    """Density per solid angle of a point drawn by area, 0 on the back.
+
+    ``shading``: the normal whose side emits, where it is not ``normal``.
+    """
     offset = origin - p
     distance2 = dr.squared_norm(offset)
-    cosine = dr.dot(offset, normal) * dr.rsqrt(distance2)
-    return dr.select((cosine > 0) & (distance2 > 0), distance2 / (size * cosine), 0)
+    facing = dr.dot(offset, normal if shading is None else shading) > 0
+    cosine = dr.abs(dr.dot(offset, normal)) * dr.rsqrt(distance2)
+    return dr.select(facing & (cosine > 0) & (distance2 > 0), distance2 / (size * cosine), 0)
 
 
 def _cap(origin, center, radius):
@@ -224,13 +250,13 @@ def _visible_normal(origin, center, radius, sample):
 
 # ---- Reading shapes
 
-_COLUMNS = ("kind", "corner", "first", "second", "normal", "uv")
+_COLUMNS = ("kind", "corner", "first", "second", "normal", "shading", "uv")
 
 
 @dataclass
 class _Pieces:
-    """Pieces of one shape: corner, edges (half-axes of disks), normal; ``uv`` (k, 6): texture coordinates at the corner
-    and their change along both edges.
+    """Pieces of one shape: corner, edges (half-axes of disks), normal; ``shading`` (k, 9): the normal whose side emits,
+    at the corner, and its change along both edges; ``uv`` (k, 6): the same of texture coordinates.
 
     Of spheres: centre, (radius, side that emits: 1 is outside, handedness of the frame), x axis, z axis.
     """
@@ -240,11 +266,12 @@ class _Pieces:
     first: np.ndarray
     second: np.ndarray
     normal: np.ndarray
+    shading: np.ndarray
     uv: np.ndarray
 
 
 def _joined(parts: list[_Pieces], name: str) -> np.ndarray:
-    empty = np.zeros(0, np.uint32) if name == "kind" else np.zeros((0, 6 if name == "uv" else 3))
+    empty = np.zeros(0, np.uint32) if name == "kind" else np.zeros((0, {"shading": 9, "uv": 6}.get(name, 3)))
     return np.concatenate([empty, *(getattr(part, name) for part in parts)])
 
 
@@ -284,16 +311,20 @@ def _pieces_of(shape, textured: bool) -> _Pieces:
     if name == "Disk" and not textured:
         return _one(DISK, origin, linear[:, 0], linear[:, 1], np.linalg.inv(linear).T[:, 2])
     if name == "Sphere":
-        radius = np.linalg.norm(linear[:, 0])
-        facts = (radius, -1 if shape.has_flipped_normals() else 1, np.sign(np.linalg.det(linear)))
-        return _one(SPHERE, origin, facts, linear[:, 0] / radius, linear[:, 2])
+        sphere = Sphere.of(shape)
+        return _one(SPHERE, sphere.center, (sphere.radius, sphere.side, sphere.handed), sphere.across, sphere.axis)
     return _one(SHAPE, (0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 1))
 
 
 def _one(kind, corner, first, second, normal) -> _Pieces:
-    normal = np.asarray(normal, np.float64)
-    rows = [np.asarray(value, np.float64)[None] for value in (corner, first, second, normal / np.linalg.norm(normal))]
-    return _Pieces(np.array([kind], np.uint32), *rows, np.array([[0.0, 0, 1, 0, 0, 1]]))
+    normal = np.asarray(normal, np.float64) / np.linalg.norm(normal)
+    rows = [np.asarray(value, np.float64)[None] for value in (corner, first, second, normal)]
+    return _Pieces(np.array([kind], np.uint32), *rows, _constant(rows[-1]), np.array([[0.0, 0, 1, 0, 0, 1]]))
+
+
+def _constant(normal: np.ndarray) -> np.ndarray:
+    """``shading`` of pieces that are flat to light, too."""
+    return np.pad(normal, ((0, 0), (0, 6)))
 
 
 def _triangles(mesh, textured: bool) -> _Pieces:
@@ -306,14 +337,14 @@ def _triangles(mesh, textured: bool) -> _Pieces:
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     # A triangle without area is never drawn; its normal only has to be a number
     normal = np.where(length > 0, normal / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
+    shading = _constant(normal)
     if mesh.has_vertex_normals() and not mesh.has_face_normals():
-        # Mitsuba lets meshes emit to the side of their shading normals, which mirrored ones have the other way round
-        shading = download(parameters["vertex_normals"]).astype(np.float64).reshape(-1, 3)[faces].sum(1)
-        normal = np.where(np.einsum("ij,ij->i", normal, shading)[:, None] < 0, -normal, normal)
+        at = download(parameters["vertex_normals"]).astype(np.float64).reshape(-1, 3)[faces]
+        shading = np.concatenate([at[:, 0], at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]], 1)
     if mesh.has_flipped_normals():
-        normal = -normal
+        normal, shading = -normal, -shading
     uv = np.tile([0.0, 0, 1, 0, 0, 1], (len(faces), 1))
     if textured and mesh.has_vertex_texcoords():
         at = download(parameters["vertex_texcoords"]).astype(np.float64).reshape(-1, 2)[faces]
         uv = np.concatenate([at[:, 0], at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]], 1)
-    return _Pieces(np.full(len(faces), TRIANGLE, np.uint32), corner, first, second, normal, uv)
+    return _Pieces(np.full(len(faces), TRIANGLE, np.uint32), corner, first, second, normal, shading, uv)

@@ -50,7 +50,7 @@ class ExtendedEmitters:
         weight = dr.zeros(mi.UnpolarizedSpectrum, dr.width(si.p))
         if areas:
             here = active & (row < areas)
-            ds = self.emitters.area.on_shape("sample_direction", row, si, direction_sample, here)
+            ds = self.emitters.area.sample_direction(row, si, direction_sample, here)
             facing = here & (dr.dot(ds.d, ds.n) < 0) & (ds.pdf > 0)
             weight = dr.select(facing, self.emitters.area.emitted_in_front(row, ds, facing) / ds.pdf, 0)
         for number, emitter in enumerate(self.single):

@@ -21,8 +21,10 @@ from ..core.sampling import find_interval, independent_sampler
 from .environment_strata import cones, stratify
 
 _EVALUATIONS = 2  # along each of both axes of a cell, at least
-# The same in cells of environments without an image, next to others so many times as bright: the sun has an edge
+# The same in cells next to others so many times as bright: the sun has an edge, and may be a single texel
 _EDGE_EVALUATIONS, _EDGE_CONTRAST = 16, 2.0
+# In an image, only next to cells so many times as bright as the mean: edges of others are many, and hold little light
+_BRIGHT = 10.0
 _STRATA_WIDTH = 256  # columns of the grid that regions are made of
 _DEFAULT_WIDTH, _LARGEST_WIDTH = 1024, 2048
 # Share of a region's light that is spread evenly over its cells: their table is made from few evaluations
@@ -153,36 +155,40 @@ def _read(environment, width: int) -> np.ndarray:
     image_width = _image_width(environment)
     across = max(_EVALUATIONS, -(-image_width // width))
     radiance = _read_cells(environment, np.arange(width * height), width, across).reshape(height, width)
-    if not image_width:
-        edges = np.flatnonzero(_at_edges(radiance))
-        radiance.reshape(-1)[edges] = _read_cells(environment, edges, width, _EDGE_EVALUATIONS)
+    edges = np.flatnonzero(_at_edges(radiance, _BRIGHT * radiance.mean() if image_width else 0.0))
+    radiance.reshape(-1)[edges] = _read_cells(environment, edges, width, max(_EDGE_EVALUATIONS, 2 * across))
     return radiance
 
 
-def _at_edges(radiance: np.ndarray) -> np.ndarray:
-    """Cells with a far brighter or a far darker one among their eight neighbours, (height, width) bool."""
+def _at_edges(radiance: np.ndarray, least: float) -> np.ndarray:
+    """Cells with a far brighter or a far darker one among their eight neighbours, and one above ``least``: (height,
+    width) bool."""
     padded = np.pad(np.pad(radiance, ((1, 1), (0, 0)), "edge"), ((0, 0), (1, 1)), "wrap")
     around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
-    return around.max((2, 3)) > _EDGE_CONTRAST * around.min((2, 3))
+    brightest = around.max((2, 3))
+    return (brightest > _EDGE_CONTRAST * around.min((2, 3))) & (brightest > least)
 
 
 def _read_cells(environment, cells: np.ndarray, width: int, across: int) -> np.ndarray:
     """Mean radiance of some cells, from ``across`` times ``across`` evaluations in each."""
-    height, count = width // 2, len(cells)
-    if count == 0:
+    if len(cells) == 0:
         return np.zeros(0)
-    sampler = independent_sampler(0, count)
-    total = dr.zeros(mi.Float, count)
     row, column = upload(mi.Float, cells // width), upload(mi.Float, cells % width)
-    # Opaque, so that all evaluations are one kernel
-    high, wide = (dr.opaque(mi.Float, step) for step in (np.pi / height, 2 * np.pi / width))
-    for k in range(across**2):
-        offset = mi.Point2f(*(dr.opaque(mi.Float, part / across) for part in (k % across, k // across)))
-        jitter = offset + sampler.next_2d() * dr.opaque(mi.Float, 1 / across)
-        polar, azimuth = (row + jitter.x) * high, (column + jitter.y) * wide
-        sine, cosine = dr.sincos(polar)
-        si = dr.zeros(mi.SurfaceInteraction3f, count)
-        si.wi = -mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), cosine)
-        total += channel_mean(finite_or_zero(mi.unpolarized_spectrum(environment.eval(si))))
-        dr.eval(total, sampler)
+    steps = dr.opaque(mi.Float, 2 * np.pi / width), dr.opaque(mi.UInt32, across)
+    total = _sum_of_evaluations(environment, row, column, *steps, independent_sampler(0, len(cells)))
     return download(total).astype(np.float64) / across**2
+
+
+@dr.syntax
+def _sum_of_evaluations(environment, row, column, step, across, sampler):
+    """Radiance summed over one direction in each of ``across`` times ``across`` equal parts of a cell."""
+    total, k = dr.zeros(mi.Float, dr.width(row)), mi.UInt32(0)
+    while dr.hint(k < across * across, exclude=[environment, row, column, step, across]):
+        jitter = (mi.Point2f(mi.Float(k % across), mi.Float(k // across)) + sampler.next_2d()) / mi.Float(across)
+        sine, cosine = dr.sincos((row + jitter.x) * step)
+        around_sine, around_cosine = dr.sincos((column + jitter.y) * step)
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(row))
+        si.wi = -mi.Vector3f(sine * around_cosine, sine * around_sine, cosine)
+        total += channel_mean(finite_or_zero(mi.unpolarized_spectrum(environment.eval(si))))
+        k += 1
+    return total

@@ -7,6 +7,7 @@ How data flows, which is also the order to read in::
 
 - ``emitters``: a scene's emitters as rows of arrays (``Emitters``), so that no kernel calls emitter objects
 - ``focus``: where the camera looks, and how far apart lights are there
+- ``spheres``: what Mitsuba says wrongly of points on spheres
 - ``emission``: rays that leave them, group by group
 - ``perturbed``: surfaces with bump or normal maps, and how they scatter light paths
 - ``tracing``: light paths; a virtual light at every diffuse bounce (instant radiosity)

@@ -108,7 +108,7 @@ class AreaEmission:
     def sample(self, stratified, position_sample, direction_sample):
         """Ray and weight (power per path)."""
         row = self._choice.row(stratified)
-        ps = self._area.on_shape("sample_position", row, mi.Float(0), position_sample, mi.Bool(True))
+        ps = self._area.sample_position(row, mi.Float(0), position_sample, mi.Bool(True))
         direction = mi.Frame3f(ps.n).to_world(mi.warp.square_to_cosine_hemisphere(direction_sample))
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(row))
         si.p, si.n = ps.p, ps.n

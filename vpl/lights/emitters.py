@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core.arrays import LARGEST_VALUE, download, finite_or_zero, rgb_to_spectrum, upload, usable
 from ..core.parameters import matrix_of, numbers, parameters_of
+from .spheres import SphereRows
 from .virtual_lights import VirtualLights
 
 # Shapes, besides meshes, on which Mitsuba can sample a point; of others, such as curves, it does not know the area
@@ -26,6 +27,7 @@ class AreaEmitters:
     """Area emitters as rows: the shape's registry index, radiance (RGB), area; textured ones keep their object.
 
     ``shapes``: the shapes one by one, for scenes in which some other shape cannot be sampled; see :meth:`on_shape`.
+    ``spheres``: None where no shape is a sphere.
     """
 
     shape_index: np.ndarray
@@ -33,6 +35,7 @@ class AreaEmitters:
     area: np.ndarray
     textured: list = field(default_factory=list)
     shapes: list | None = None
+    spheres: SphereRows | None = None
 
     @property
     def count(self) -> int:
@@ -66,6 +69,20 @@ class AreaEmitters:
             return dr.switch(mi.UInt32(row), [getattr(shape, method) for shape in self.shapes], *arguments)
         index = dr.gather(mi.UInt32, self._shapes, row, arguments[-1])
         return getattr(dr.reinterpret_array(mi.ShapePtr, index), method)(*arguments)
+
+    def sample_position(self, row, time, sample, active):
+        """A point on the shape of each row, by area: a position sample of Mitsuba."""
+        found = self.on_shape("sample_position", row, time, sample, active)
+        if self.spheres is not None:
+            found.n = self.spheres.normal(row, found, active)
+        return found
+
+    def sample_direction(self, row, si, sample, active):
+        """A point on the shape of each row as seen from ``si``: a direction sample of Mitsuba."""
+        found = self.on_shape("sample_direction", row, si, sample, active)
+        if self.spheres is not None and self.textured:
+            found.uv = self.spheres.coordinates(row, found, active)
+        return found
 
     def emitted_in_front(self, row, sample, active=True):
         """Radiance that a position sample (or direction sample) on the emitter of ``row`` sends to its front."""
@@ -151,7 +168,7 @@ def _can_be_sampled(shape) -> bool:
 
 def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
     """Area emitters, the number of rows with values that are not finite, and emitters that only look like area ones."""
-    indices, radiances, textured, unusual = [], [], [], []
+    indices, radiances, textured, spheres, unusual = [], [], [], [], []
     glowing = [(index, shape) for index, shape in registered_shapes(scene) if shape.is_emitter()]
     # Mitsuba loads shapes in parallel, in an order that changes from run to run; the same seed must give the same image
     glowing.sort(key=lambda row: (row[1].id(), *map(float, (*row[1].bbox().min, *row[1].bbox().max))))
@@ -176,6 +193,7 @@ def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
             radiance = _textured_radiance(emitter, shape)
         indices.append(index)
         radiances.append(radiance)
+        spheres.append(shape if shape.class_name() == "Sphere" else None)
     radiance = np.array(radiances, np.float32).reshape(-1, 3)
     bad = ~usable(radiance).all(1)
     radiance[bad] = 0
@@ -188,7 +206,8 @@ def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
         by_index = dict(glowing)
         shapes = [by_index[index] for index in indices]
         area = np.array([download(shape.surface_area())[0] for shape in shapes], np.float32)
-    return AreaEmitters(shape_index, radiance, area, textured, shapes), int(bad.sum()), unusual
+    rows = SphereRows(spheres) if any(spheres) else None
+    return AreaEmitters(shape_index, radiance, area, textured, shapes, rows), int(bad.sum()), unusual
 
 
 def _sorted_rows(rows: list, columns: int) -> np.ndarray:

@@ -232,7 +232,7 @@ def area_lights(emitters: Emitters, count: int, seed: int) -> VirtualLights:
     choice = Choice(area.power)
     sampler = independent_sampler(seed, count)
     row = choice.row(stratified(sampler, count, 0, count))
-    ps = area.on_shape("sample_position", row, mi.Float(0), sampler.next_2d(), mi.Bool(True))
+    ps = area.sample_position(row, mi.Float(0), sampler.next_2d(), mi.Bool(True))
     intensity = spectrum_to_rgb(area.emitted_in_front(row, ps)) / (ps.pdf * choice.probability(row) * count)
     return VirtualLights.of("oriented", download(ps.p), download(ps.n), download(intensity))
 

@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import channel_mean, download, even_chunks, upload
-from ..core.sampling import derived_seed, find_interval, independent_sampler
+from ..core.sampling import derived_seed, find_interval, independent_sampler, precise_sample
 from ..lights.light_set import LightGroup, LightSet
 from ..lights.light_tree import ESCAPE, DeviceTree, cluster_sizes
 from ..points.point_clusters import PointClusters
@@ -171,7 +171,7 @@ class _Chosen:
             node = dr.gather(mi.UInt32, self.node, place, active)
             start = row * dr.opaque(mi.UInt32, forest.columns)
             low, high = (start + dr.gather(mi.UInt32, ends, node, active) for ends in (forest.first, forest.last))
-            sample = _precise_sample(derived_seed(seed, begin), (end - begin) * count)
+            sample = precise_sample(independent_sampler(derived_seed(seed, begin), (end - begin) * count))
             chosen = find_interval(sums, low, high, sample)
             whole, own = (
                 dr.gather(type(sums), sums, last, active) - dr.gather(type(sums), sums, one, active)
@@ -206,20 +206,14 @@ class _Chosen:
         piece = lane // dr.opaque(mi.UInt32, self.most)
         active = (lane >= dr.gather(mi.UInt32, first, piece)) & (lane < dr.gather(mi.UInt32, last, piece))
         node = dr.gather(mi.UInt32, forest.node, dr.gather(mi.UInt32, self.column, lane), active)
-        drawn, total = _drawn_lights(group.tree, node, _precise_sample(seed, dr.width(lane)), active)
+        sample = precise_sample(independent_sampler(seed, dr.width(lane)))
+        drawn, total = _drawn_lights(group.tree, node, sample, active)
         factor = total / channel_mean(group.lights.gather(drawn, active).intensity)
         scale = dr.gather(mi.Float, self.scale, lane) * factor
         dr.eval(scale)
         dr.scatter(light, drawn, lane, active)
         dr.scatter(self.scale, scale, lane, active)
         dr.eval(light, self.scale)
-
-
-def _precise_sample(seed: int, count: int):
-    """Uniform numbers of 46 bits in double precision."""
-    sampler = independent_sampler(seed, count)
-    precise = dr.float64_array_t(mi.Float)
-    return precise(sampler.next_1d()) + precise(sampler.next_1d()) * 2.0**-23
 
 
 @dr.syntax

@@ -15,6 +15,9 @@ from ..core.arrays import finite_or_zero, rgb_to_spectrum
 from .bsdf_proxies import MaterialProxy
 from .camera_paths import GatherPoints
 
+# Reflectance of a glossy lobe over a diffuse one: a dielectric's from above
+_GLOSS = 0.04
+
 
 @dataclass
 class Surface:
@@ -34,6 +37,10 @@ class LambertianSurface(Surface):
     def material(self):
         """None: an albedo is all that tells one material from another."""
         return None
+
+    def reflectance(self):
+        """Share of the light from all around that is reflected, exactly."""
+        return rgb_to_spectrum(self.albedo * dr.pi)
 
     def reflected(self, to_light, active):
         """BSDF times cosine for light from a world space direction."""
@@ -59,6 +66,13 @@ class ScatteringSurface(Surface):
     def material(self):
         """A number for the BSDF of each surface."""
         return dr.reinterpret_array(mi.UInt32, self.interaction.bsdf())
+
+    def reflectance(self):
+        """Share of the light from all around that is reflected, roughly: as if only diffuse lobes had colours."""
+        bsdf = self.interaction.bsdf()
+        diffuse = finite_or_zero(mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(self.interaction)))
+        has_diffuse = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection)
+        return dr.select(has_diffuse, dr.minimum(diffuse + _GLOSS, 1), 1)
 
     def reflected(self, to_light, active):
         """BSDF times cosine for light from a world space direction."""

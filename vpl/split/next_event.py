@@ -148,7 +148,7 @@ class TreeEmitters:
         if self._areas:
             here = near & (row >= self._first_area)
             row -= self._first_area
-            ds = self._emitters.area.on_shape("sample_direction", row, si, place, here)
+            ds = self._emitters.area.sample_direction(row, si, place, here)
             facing = here & (dr.dot(ds.d, ds.n) < 0) & (ds.pdf > 0)
             radiance = self._emitters.area.emitted_in_front(row, ds, facing)
             target, toward = dr.select(here, ds.p, target), dr.select(here, ds.d, toward)

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import add_at, channel_mean, download, upload, upload_vectors
-from ..core.sampling import derived_seed, find_interval, independent_sampler, running_sums
+from ..core.sampling import derived_seed, find_interval, independent_sampler, precise_sample, running_sums
 from ..cuts.light_cuts import collect_cuts, limited_cuts, upload_thresholds
 from ..points.bsdf_proxies import MaterialProxy
 from ..points.surfaces import LambertianSurface, Receiver
@@ -136,8 +136,8 @@ def light_clusters(
     for number, chunk in enumerate(collect_cuts(transport.lights, clusters.receivers, threshold, sizes)):
         sampler = independent_sampler(derived_seed(seed, number), dr.width(chunk.rows))
         cluster = dr.gather(mi.UInt32, chunk.points, chunk.rows)
-        ray, surface, weight = clusters.draw(cluster, sampler.next_1d())
-        light, scale = chunk.group.draw(chunk.nodes, sampler.next_1d())
+        ray, surface, weight = clusters.draw(cluster, precise_sample(sampler))
+        light, scale = chunk.group.draw(chunk.nodes, precise_sample(sampler))
         value, traced = evaluate_pairs(transport, chunk.group, surface, light, scale)
         value = mi.UnpolarizedSpectrum(value) * weight
         add_at(result, dr.select(dr.all(dr.isfinite(value)), value, 0), ray)
