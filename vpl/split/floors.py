@@ -25,7 +25,7 @@ from ..lights.perturbed import Perturbed
 _DIRECTIONS = [
     np.array(d) / np.linalg.norm(d) for d in ((0, 0, 1), (0.6, 0, 0.8), (-0.35, 0.75, 0.5612), (-0.55, 0.67, 0.5))
 ]
-_PAIRS = ((0, 1), (1, 2), (2, 3))
+_PAIRS = len(_DIRECTIONS) - 1
 
 
 def side_of(si):
@@ -39,6 +39,7 @@ def agrees(si, side):
     return si.wi.z * side > 0
 
 
+@dr.syntax
 def floor_of(si, bsdf, side, perturbed: Perturbed, active):
     """The floor F of a BSDF: its least value over three fixed pairs of directions on one side, an unpolarized spectrum.
 
@@ -48,14 +49,23 @@ def floor_of(si, bsdf, side, perturbed: Perturbed, active):
     it off in fireflies.
     """
     active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & ~perturbed.at(si, active)
-    context, least = mi.BSDFContext(), None
-    for i, j in _PAIRS:
-        turned = mi.SurfaceInteraction3f(si)
-        turned.wi = mi.Vector3f(*_DIRECTIONS[i].tolist()) * mi.Vector3f(1, 1, side)
-        value = bsdf.eval(context, turned, mi.Vector3f(*_DIRECTIONS[j].tolist()) * mi.Vector3f(1, 1, side), active)
-        value = finite_or_zero(mi.unpolarized_spectrum(value)) / float(_DIRECTIONS[j][2])
-        least = value if least is None else dr.minimum(least, value)
+    context, turned, pair = mi.BSDFContext(), mi.SurfaceInteraction3f(si), mi.UInt32(0)
+    least = dr.full(mi.UnpolarizedSpectrum, dr.inf, dr.width(active))
+    # A loop of kernels, so that the code of every material is in them once
+    while dr.hint(pair < _PAIRS, exclude=[si, context, perturbed, turned]):
+        turned.wi, out = _direction(pair, side), _direction(pair + 1, side)
+        value = finite_or_zero(mi.unpolarized_spectrum(bsdf.eval(context, turned, out, active)))
+        least = dr.minimum(least, value / dr.abs(out.z))
+        pair += 1
     return least & active
+
+
+def _direction(number, side):
+    """A fixed direction on one side of a surface."""
+    direction = mi.Vector3f(*_DIRECTIONS[0].tolist())
+    for k, other in enumerate(_DIRECTIONS[1:], 1):
+        direction = dr.select(number == k, mi.Vector3f(*other.tolist()), direction)
+    return direction * mi.Vector3f(1, 1, side)
 
 
 def carried_share(squared_c, cosine1, cosine2, distance2):

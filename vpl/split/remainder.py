@@ -104,7 +104,6 @@ class Found:
     valid: object
 
 
-@dr.syntax
 def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
     """Follow paths to their ends: (:class:`Found`, first gather vertices, one of the later ones, drawn by weight, and
     :class:`Arrival`), evaluated.
@@ -113,6 +112,13 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
     for the first vertex that scatters, which choose an emitter, a place on it, a lobe, and a direction; ``sampler``:
     for all others.
     """
+    # Looking for what a loop does not change records its body, all materials of the scene, twice
+    with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+        return _follow(scene, emission, first, numbers, sampler, limits)
+
+
+@dr.syntax
+def _follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
     # With lobes other than a diffuse reflection, the floor does not tell how much is left
     other_lobes = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.DiffuseReflection)
     context, count = mi.BSDFContext(), dr.width(first.throughput)
