@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 # What making lights and clusters costs besides (kernels that are traced and started, trees), and a path from a light
-_FIXED_COST, _LIGHT_PATH_COST = 200_000, 1.5
+_FIXED_COST, _LIGHT_PATH_COST = 200_000, 4.0
 # Share of the indirect light's variance that lights take away where they carry it
 _GAIN = 0.9
 # Relative standard error that one set of lights leaves in the mean of the image
-_SET_ERROR = 0.015
+_SET_ERROR = 0.03
 # Light paths as a share of the paths from the camera, and how few and how many there may be
-_SHARES, _FEWEST, _MOST = (1 / 16, 1 / 4), 20_000, 500_000
+_SHARES, _FEWEST, _MOST = (1 / 64, 1 / 8), 20_000, 500_000
 # Relative variance that cuts leave, times shadow rays a pixel; and the cost of one of these rays
 _CUT_NOISE, _RAY_COST = 0.1, 0.5
 # Shadow rays for each sample of a pixel, at least and at most
