@@ -71,7 +71,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "illuminationcut", "max_depth": 8, "visibility": "adaptive"}
     """
 

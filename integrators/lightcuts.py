@@ -55,7 +55,7 @@ class LightcutsIntegrator(ManyLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "lightcuts", "max_depth": 8, "error": 0.01}
     """
 

@@ -119,7 +119,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "manylights", "max_depth": 8}
     """
 

@@ -79,7 +79,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "matrixrecovery", "max_depth": 8, "alpha": 0.002}
     """
 

@@ -70,7 +70,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "mdlightcuts", "max_depth": 8, "error": 0.01}
     """
 

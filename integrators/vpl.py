@@ -39,7 +39,7 @@ class VPLIntegrator(ManyLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "vpl", "max_depth": 8, "vpl_count": 1000}
     """
 
