@@ -82,15 +82,14 @@ class DirectLightIntegrator(GatheringIntegrator):
         names = [knob.name for knob in knobs_of(type(self)) if knob.name in taken]
         return DirectOptions(**{name: getattr(self, name) for name in names})
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+    def _render(self, scene, sensor, seed, spp, develop, evaluate):
         """Render as Mitsuba does, but large images in bands of rows; see :mod:`integrators.bands`."""
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         samples = spp or sensor.sampler().sample_count()
-        # The base class calls this method again
+        # Mitsuba's `render` calls this method again
         if self._in_base or self.samples_per_pass < samples or fits_one_band(sensor.film(), samples):
             self._in_base = True
             try:
-                return super().render(scene, sensor, seed, spp, develop, evaluate)
+                return super()._render(scene, sensor, seed, spp, develop, evaluate)
             finally:
                 self._in_base = False
         with dr.suspend_grad():
