@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 
+from integrators.knobs import doubt_percentage
 from vpl.core.exclusive import exclusive
 
 from .convergence import ErrorGoal
@@ -61,6 +62,7 @@ def render(
     another thread renders with the same sensor.
     """
     _check(error=error, time=time, spp=spp, pass_spp=pass_spp)
+    doubt_percentage("error", error or 0)
     if not 0 <= sensor < len(scene.sensors()):
         raise ValueError(f"sensor must be from 0 to {len(scene.sensors()) - 1}, got {sensor!r}")
     if error is None and time is None and spp is None:

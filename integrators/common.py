@@ -21,7 +21,7 @@ from vpl.points.surfaces import Batch, make_batches
 from vpl.transport.evaluation import Transport, mean_radiance
 
 from .gathering import CameraPass, GatheringIntegrator, whole_sum
-from .knobs import Choice, Integer, Number, Words
+from .knobs import Choice, Fraction, Integer, Number, Words
 
 # Gather points by which is judged where the camera looks
 _PLACES = 1024
@@ -116,7 +116,7 @@ class ManyLightIntegrator(GatheringIntegrator):
             "beside virtual lights, and their noise is often most of what is left.",
             minimum=1,
         ),
-        Number(
+        Fraction(
             "direct_error", 0.05,
             "Standard error of the direct light, relative to it, with ``direct=\"adaptive\"``.",
             minimum=1e-4,

@@ -17,7 +17,7 @@ from vpl.points.camera_paths import PixelGrid
 
 from .bands import fits_one_band, random_rays, render_in_bands
 from .gathering import CameraPass, GatheringIntegrator, add_statistics, whole_sum
-from .knobs import Depth, Integer, Number, Words, knobs_of
+from .knobs import Depth, Fraction, Integer, Number, Words, knobs_of
 
 _LEVEL_RAYS = 4096
 
@@ -36,7 +36,7 @@ class DirectLightIntegrator(GatheringIntegrator):
 
     along_curve = False  # the pixels' points stay together
     knobs = (
-        Number(
+        Fraction(
             "error", DirectOptions.error,
             "Standard error to reach in each pixel, as a fraction of its radiance: 0.03 is 3%.",
             minimum=1e-4,

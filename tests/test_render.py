@@ -137,6 +137,11 @@ def test_there_is_one_pass_however_short_the_time(scene):
     assert took.passes == 1 and took.ended_by == "time"
 
 
+def test_an_error_that_looks_like_a_percentage_is_doubted(scene, capfd):
+    manylights.render(scene, error=2.0, spp=1)
+    assert "error is a fraction, 2 means 200%; 2% would be 0.02" in "".join(capfd.readouterr())
+
+
 @pytest.mark.parametrize(("limits", "ended_by"), [({"spp": 8}, "spp"), ({"spp": 10**6}, "error")])
 def test_whatever_is_reached_first_ends_a_render(scene, limits, ended_by):
     assert manylights.render(scene, error=0.3, time=1000, **limits)[1].ended_by == ended_by
