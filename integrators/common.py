@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import drjit as dr
 import mitsuba as mi
 
-from vpl.core.arrays import download
+from vpl.core.arrays import add_at, download
 from vpl.core.sampling import derived_seed
 from vpl.core.stages import Stage
 from vpl.direct.adaptive import DirectOptions, light_directly
@@ -206,7 +206,7 @@ class ManyLightIntegrator(GatheringIntegrator):
             if self.should_stop():
                 break
             part = self.shade(job)
-            dr.scatter_add(radiance, part.radiance, job.batch.index)
+            add_at(radiance, part.radiance, job.batch.index)
             for name in self.offered_aovs:
                 values = getattr(part, name)
                 total = totals.setdefault(name, dr.zeros(type(values), camera.paths.points.count))

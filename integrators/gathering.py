@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from vpl.core.arrays import download, usable
+from vpl.core.arrays import add_at, download, usable
 from vpl.core.exclusive import exclusive
 from vpl.core.stages import Stage
 from vpl.lights.emitters import Emitters, read_emitters
@@ -192,7 +192,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         if points.count:
             lit = points.weight * radiance
             bad = ~dr.all(usable(lit))
-            dr.scatter_add(image, dr.select(bad, 0, lit), points.ray)
+            add_at(image, dr.select(bad, 0, lit), points.ray)
             for name, counter in zip(self.aovs, counters, strict=True):
                 if name in channels:
                     dr.scatter(counter, mi.Float(channels[name]), points.ray)
