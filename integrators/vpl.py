@@ -49,7 +49,7 @@ class VPLIntegrator(ManyLightIntegrator):
         """Sum over all lights; see :func:`vpl.transport.evaluation.sum_all_lights`."""
         count = job.batch.count
         radiance, rays = sum_all_lights(job.transport, job.batch, job.stopped)
-        return ShadeResult(radiance, rays, dr.zeros(mi.UInt32, count), dr.full(mi.UInt32, job.lights.count, count))
+        return ShadeResult(radiance, rays, dr.zeros(mi.UInt32, count), dr.opaque(mi.UInt32, job.lights.count, count))
 
 
 mi.register_integrator("vpl", VPLIntegrator)
