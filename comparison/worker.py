@@ -219,10 +219,12 @@ def main():
     # What others print, such as Mitsuba's log, goes to the standard error
     answer = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    job = Job(**json.loads(sys.stdin.readline()))
+    line = sys.stdin.readline()
+    if not line:  # who wanted to give a job was interrupted
+        return 1
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        result = json.dumps(render(job), allow_nan=False)
+        result = json.dumps(render(Job(**json.loads(line))), allow_nan=False)
         status = 0
     except Exception as error:
         result, status = json.dumps(failure(error)), 1
