@@ -262,11 +262,12 @@ def _compare(options, settings, command):
                 complete = len(done) + 1 == len(options.scenes)
             finally:  # an interruption, too, leaves a report of what there is
                 progress.skip(path)
+                store.forget_kernels()  # of this scene; room for pictures and report
                 comparison.finish()
                 done.append(comparison)
+                progress.write(report.text(comparison.result) + "\n")  # first, as it needs no disk
                 results = report.describe(command, options, [one.result for one in done], complete)
                 report.write(options.out, results, [one.pictures for one in done])
-                progress.write(report.text(comparison.result) + "\n")
         return results
     finally:
         progress.close()

@@ -15,20 +15,39 @@ that and k; see comparison/rendering.py. An EXR file gets all channels, and how 
 tone-mapped. With --denoise an EXR file FILE.exr gets a denoised one, FILE.denoised.exr, beside it; a PNG file shows the
 denoised image.
 
-In Python, `manylights.render(scene, error=0.02)` does the same.
+In Python, `manylights.render(scene, error=0.02)` does the same, and `import manylights` registers the plugins, for the
+variant that is set and each that will be.
 
 Exit status: 0; 1 if rendering failed; 2 for a command that makes no sense; 130 after Ctrl-C.
 """
+# ruff: noqa: E402 (what is imported is found to be this project's before)
 
 import argparse
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
+
+
+def require_own(*packages):
+    """Raise ImportError where Python finds something else, such as a module beside a user's script, by the name of a
+    package of this project."""
+    for package in packages:
+        own, found = Path(__file__).resolve().parent / package, find_spec(package)
+        if found and found.origin and Path(found.origin).resolve().parent != own:
+            raise ImportError(
+                f"the package '{package}' of manylights, {own}, is hidden by {found.origin}: rename that, or make it "
+                "part of a package"
+            )
+
+
+require_own("comparison", "integrators", "vpl")
 
 import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
+import integrators  # noqa: F401 (registers the plugins)
 from comparison import command_line, images
 from comparison.command_line import UsageError, parameter, positive
 from comparison.denoising import import_oidn

@@ -3,6 +3,7 @@
 import re
 import sys
 import tempfile
+import traceback
 from argparse import ArgumentTypeError
 from importlib import metadata
 from pathlib import Path
@@ -174,6 +175,11 @@ def explain(error):
         error = error.__cause__
     message = re.sub(r"\[\w+\.cpp:\d+\] ", "", str(error))
     return " ".join(message.split()) or type(error).__name__
+
+
+def failure(error):
+    """Return what results say of an error that is being handled: its message in one line, and its traceback."""
+    return {"error": explain(error), "traceback": traceback.format_exc()}
 
 
 def exit_status(program, run, interrupted, verbose):

@@ -22,12 +22,15 @@ AOV_PERCENTILES = (1, 99.9)
 
 @contextmanager
 def replacing(path):
-    """Give a temporary path beside `path` that takes its place when the block ends without an error."""
+    """Give a temporary path beside `path` that takes its place when the block ends without an error. An OSError names
+    `path`, which those of a full disk do not."""
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
     finally:
         temporary.unlink(missing_ok=True)
 

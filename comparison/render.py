@@ -6,6 +6,9 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 
+from integrators.knobs import doubt_percentage
+from vpl.core.exclusive import exclusive
+
 from .convergence import ErrorGoal
 from .denoising import Denoiser
 from .interruption import Interruption
@@ -55,9 +58,11 @@ def render(
     KeyboardInterrupt is raised, or RuntimeError after `cancel()`; and KeyboardInterrupt by a second Ctrl-C.
 
     Raises ValueError for values that are not positive, for a sensor that does not exist, and for a scene without an
-    integrator if none is given; ModuleNotFoundError for `denoise` without the package that it needs.
+    integrator if none is given; ModuleNotFoundError for `denoise` without the package that it needs; RuntimeError where
+    another thread renders with the same sensor.
     """
     _check(error=error, time=time, spp=spp, pass_spp=pass_spp)
+    doubt_percentage("error", error or 0)
     if not 0 <= sensor < len(scene.sensors()):
         raise ValueError(f"sensor must be from 0 to {len(scene.sensors()) - 1}, got {sensor!r}")
     if error is None and time is None and spp is None:
@@ -67,7 +72,7 @@ def render(
     running = _Render(Progressive(scene, seed, sensor, _integrator(scene, integrator)), begin, progress)
     reserved = denoiser.filter_seconds if denoiser else 0.0
     sizes = PassSizes(running.progressive.pixels, spp, time and time - reserved, pass_spp, many=error is not None)
-    with Interruption() as interruption:
+    with exclusive(sensor=scene.sensors()[sensor]), Interruption() as interruption:
         running.run(sizes, error and ErrorGoal(error), interruption)
     if not running.progressive.passes:
         raise KeyboardInterrupt if interruption.asked else RuntimeError("cancelled before the first pass was finished")

@@ -1,6 +1,7 @@
 """Progressive rendering: passes of different seeds and their average."""
 
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -69,12 +70,13 @@ class Progressive:
         does one that `accept` refuses when it is finished (None is returned).
         """
         seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
-        begin = time.perf_counter()
-        image = mi.render(self._scene, sensor=self._sensor, integrator=self.integrator, seed=seed, spp=spp)
-        dr.eval(image)
-        dr.sync_thread()
-        seconds = time.perf_counter() - begin
-        spp = self._sensor.sampler().sample_count()
+        # Asked before the render: some integrators, such as `prb`, sample with a clone
+        with _sample_count(self._sensor.sampler(), spp) as spp:
+            begin = time.perf_counter()
+            image = mi.render(self._scene, sensor=self._sensor, integrator=self.integrator, seed=seed, spp=spp)
+            dr.eval(image)
+            dr.sync_thread()
+            seconds = time.perf_counter() - begin
         if not accept():
             return None
         # Not the image that `mi.render` returned: it lacks channels of nested integrators, and names.
@@ -108,6 +110,17 @@ class Progressive:
     def image(self):
         """The average, (height, width, channels) float64."""
         return self._sum / self.spp
+
+
+@contextmanager
+def _sample_count(sampler, spp):
+    """Set the samples per pixel of a sampler for the time of the block, which is given what it rounds them up to."""
+    own = sampler.sample_count()
+    sampler.set_sample_count(spp)
+    try:
+        yield sampler.sample_count()
+    finally:
+        sampler.set_sample_count(own)
 
 
 def _shown(planes, channels):

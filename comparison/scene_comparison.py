@@ -1,13 +1,12 @@
 """Compare integrators on one scene: reference, renders in processes of their own, errors, curves, pictures."""
 
 import math
-import traceback
 from pathlib import Path
 
 import numpy as np
 
 from . import analysis, images, metrics, paper_tables, references, tables, worker
-from .command_line import explain, own_integrators
+from .command_line import failure, own_integrators
 from .pictures import REFERENCE, Pictures
 from .scene_files import SceneFile, short_name
 from .sweeps import order
@@ -69,7 +68,7 @@ class SceneComparison:
             try:
                 self._assess(result)
             except Exception as error:
-                result |= _failure(error)
+                result |= failure(error)
         names = {setting.title: setting.file_name for of in self.settings.values() for setting in of}
         if aovs := self.pictures.write_aovs(names):
             self.result["aovs"] = aovs
@@ -145,13 +144,20 @@ class SceneComparison:
         self._progress.begin(self.path, setting)
         if not kept:
             result = worker.run(job, self._progress.tick)
-            if "error" not in result:
-                self._store.save(result)
+            self._keep(result)
         result |= {"setting": setting.name, "swept": setting.swept, "denoised": False}
         self._progress.end(kept)
         self.result["renders"].append(result)
         if self.options.denoise and "error" not in result:
             self.result["renders"].append(_denoised(result))
+
+    def _keep(self, result):
+        """Keep the result of a run that went well; one that cannot be kept has failed."""
+        if "error" not in result:
+            try:
+                self._store.save(result)
+            except OSError as error:
+                result |= failure(error)
 
     def _job(self, setting, seed):
         options, name = self.options, self.result["name"]
@@ -213,7 +219,7 @@ class SceneComparison:
         return metrics.compare(image, reference.image, reference.standard_error)
 
     def _fail(self, error):
-        self.result |= _failure(error)
+        self.result |= failure(error)
 
 
 def denoised_label(label):
@@ -231,7 +237,3 @@ def _denoised(result):
         "cold_seconds": None if cold is None else cold + result["cold_denoise_seconds"],
         "denoised": True,
     }
-
-
-def _failure(error):
-    return {"error": explain(error), "traceback": traceback.format_exc()}

@@ -1,25 +1,27 @@
-"""Render and measure one integrator on one scene, in a process of its own: `python -m comparison.worker JOB RESULT`.
+"""Render and measure one integrator on one scene, in a process of its own: `python -m comparison.worker`.
 
 In a fresh process with an empty kernel cache the first pass is honestly cold, the memory's peak is this integrator's,
-and a crash loses nothing else. The job is a JSON file (see `Job`), the result another (see `run`).
+and a crash loses nothing else. The job is a line of JSON on the standard input (see `Job`), the result one on the
+standard output (see `run`): a pipe has room where the disk has none.
 """
 
 import hashlib
 import json
 import os
 import resource
+import select
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-import traceback
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from . import images, machine
-from .command_line import explain, set_variant, versions
+from .command_line import failure, set_variant, versions
 from .denoising import Denoiser
 from .measuring import measure
 from .rendering import Progressive, total_statistics
@@ -74,41 +76,50 @@ def run(job, tick=lambda: None):
     ends with this one, even if this one is killed.
     """
     result = asdict(job) | {"load_average": machine.load()}
-    if job.kernel_cache:
-        Path(job.kernel_cache).mkdir(parents=True, exist_ok=True)
-    # Where there is a folder of kernels, beside them: who removes that after a crash removes this too.
-    with tempfile.TemporaryDirectory(prefix="manylights-", dir=job.kernel_cache) as folder:
-        job_file, result_file = Path(folder) / "job.json", Path(folder) / "result.json"
-        job_file.write_text(json.dumps(asdict(job)))
-        kernels = Path(job.kernel_cache or folder) / "kernels"
-        kernels.mkdir(parents=True, exist_ok=True)
-        is_cold = not any(kernels.iterdir())
+    try:
+        return result | _in_new_process(job, tick)
+    except OSError as error:
+        return result | failure(error)
+
+
+def _in_new_process(job, tick):
+    """Return what `run` adds to a job. Raises OSError where there cannot be a process, or a folder for its kernels."""
+    cache = nullcontext(job.kernel_cache) if job.kernel_cache else tempfile.TemporaryDirectory(prefix="manylights-")
+    with cache as kernels:
+        Path(kernels).mkdir(parents=True, exist_ok=True)
+        is_cold = not any(Path(kernels).iterdir())
         environment = os.environ | {"DRJIT_CACHE_DIR": str(kernels)}
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-        command = [sys.executable, "-m", "comparison.worker", str(job_file), str(result_file)]
         # In a session of its own, so that Ctrl-C is for this process alone, which then ends that one.
-        process = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, start_new_session=True)
-        status = _wait(process, tick)
-        if result_file.exists():
-            result |= json.loads(result_file.read_text())
-            return result if is_cold or "error" in result else result | {"cold_seconds": None}
-    if status < 0:
-        return result | {"error": f"the renderer was ended by {signal.Signals(-status).name}", "traceback": ""}
-    return result | {"error": f"the renderer ended with status {status}", "traceback": ""}
+        process = subprocess.Popen(
+            [sys.executable, "-m", "comparison.worker"],
+            env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
+        )  # fmt: skip
+        status, answer = _ask(process, job, tick)
+    if answer:
+        result = json.loads(answer)
+        return result if is_cold or "error" in result else result | {"cold_seconds": None}
+    ended = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+    return {"error": f"the renderer {ended}", "traceback": ""}
 
 
-def _wait(process, tick):
-    """Return the status of a process when it has ended, which it also does if this one is interrupted."""
+def _ask(process, job, tick):
+    """Give a process its job; return its status and its answer when it has ended, which it also does if this one is
+    interrupted."""
     try:
-        while True:
-            try:
-                return process.wait(timeout=TICK)
-            except subprocess.TimeoutExpired:
-                tick()
+        with suppress(BrokenPipeError):  # it has ended already, as its status tells
+            process.stdin.write(json.dumps(asdict(job)).encode() + b"\n")
+            process.stdin.flush()
+        while not select.select([process.stdout], [], [], TICK)[0]:
+            tick()
+        answer = process.stdout.read()
+        return process.wait(), answer
     finally:
         process.kill()
         process.wait()
-        process.stdin.close()
+        process.stdout.close()
+        with suppress(BrokenPipeError):
+            process.stdin.close()
 
 
 def render(job):
@@ -205,15 +216,20 @@ def _end_with_parent():
 
 
 def main():
-    job_file, result_file = map(Path, sys.argv[1:])
+    # What others print, such as Mitsuba's log, goes to the standard error
+    answer = os.fdopen(os.dup(sys.stdout.fileno()), "w")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    line = sys.stdin.readline()
+    if not line:  # who wanted to give a job was interrupted
+        return 1
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        result = json.dumps(render(Job(**json.loads(job_file.read_text()))), allow_nan=False)
+        result = json.dumps(render(Job(**json.loads(line))), allow_nan=False)
         status = 0
     except Exception as error:
-        result, status = json.dumps({"error": explain(error), "traceback": traceback.format_exc()}), 1
-    with images.replacing(result_file) as temporary:
-        temporary.write_text(result)
+        result, status = json.dumps(failure(error)), 1
+    with answer:
+        answer.write(result + "\n")
     return status
 
 

@@ -1,10 +1,11 @@
-"""Many-light integrators for Mitsuba 3: ``import integrators`` and use them like any other plugin.
+"""Many-light integrators for Mitsuba 3: ``import manylights`` and use them like any other plugin.
 
 ``manylights`` renders the image of Mitsuba's ``path``, with less noise in the same time; the others are the methods of
 papers.
 
-The plugins are registered for the current variant, and again whenever ``mi.set_variant`` changes it.  They exist for
-the vectorised ``*_rgb`` and ``*_mono`` variants; elsewhere loading one fails with an error that says so.
+That imports this package, which registers them for the current variant, and again whenever ``mi.set_variant`` changes
+it; and it finds out whether another module of the same name is in the way.  They exist for the vectorised ``*_rgb`` and
+``*_mono`` variants; elsewhere loading one fails with an error that says so.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class AdaptiveDirectIntegrator(DirectLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "adaptivedirect", "error": 0.02}
     """
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import drjit as dr
 import mitsuba as mi
 
-from vpl.core.arrays import download
+from vpl.core.arrays import add_at, download
 from vpl.core.sampling import derived_seed
 from vpl.core.stages import Stage
 from vpl.direct.adaptive import DirectOptions, light_directly
@@ -21,7 +21,7 @@ from vpl.points.surfaces import Batch, make_batches
 from vpl.transport.evaluation import Transport, mean_radiance
 
 from .gathering import CameraPass, GatheringIntegrator, whole_sum
-from .knobs import Choice, Integer, Number, Words
+from .knobs import Choice, Fraction, Integer, Number, Words
 
 # Gather points by which is judged where the camera looks
 _PLACES = 1024
@@ -116,7 +116,7 @@ class ManyLightIntegrator(GatheringIntegrator):
             "beside virtual lights, and their noise is often most of what is left.",
             minimum=1,
         ),
-        Number(
+        Fraction(
             "direct_error", 0.05,
             "Standard error of the direct light, relative to it, with ``direct=\"adaptive\"``.",
             minimum=1e-4,
@@ -206,7 +206,7 @@ class ManyLightIntegrator(GatheringIntegrator):
             if self.should_stop():
                 break
             part = self.shade(job)
-            dr.scatter_add(radiance, part.radiance, job.batch.index)
+            add_at(radiance, part.radiance, job.batch.index)
             for name in self.offered_aovs:
                 values = getattr(part, name)
                 total = totals.setdefault(name, dr.zeros(type(values), camera.paths.points.count))

@@ -17,7 +17,7 @@ from vpl.points.camera_paths import PixelGrid
 
 from .bands import fits_one_band, random_rays, render_in_bands
 from .gathering import CameraPass, GatheringIntegrator, add_statistics, whole_sum
-from .knobs import Depth, Integer, Number, Words, knobs_of
+from .knobs import Depth, Fraction, Integer, Number, Words, knobs_of
 
 _LEVEL_RAYS = 4096
 
@@ -36,7 +36,7 @@ class DirectLightIntegrator(GatheringIntegrator):
 
     along_curve = False  # the pixels' points stay together
     knobs = (
-        Number(
+        Fraction(
             "error", DirectOptions.error,
             "Standard error to reach in each pixel, as a fraction of its radiance: 0.03 is 3%.",
             minimum=1e-4,
@@ -82,15 +82,14 @@ class DirectLightIntegrator(GatheringIntegrator):
         names = [knob.name for knob in knobs_of(type(self)) if knob.name in taken]
         return DirectOptions(**{name: getattr(self, name) for name in names})
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+    def _render(self, scene, sensor, seed, spp, develop, evaluate):
         """Render as Mitsuba does, but large images in bands of rows; see :mod:`integrators.bands`."""
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         samples = spp or sensor.sampler().sample_count()
-        # The base class calls this method again
+        # Mitsuba's `render` calls this method again
         if self._in_base or self.samples_per_pass < samples or fits_one_band(sensor.film(), samples):
             self._in_base = True
             try:
-                return super().render(scene, sensor, seed, spp, develop, evaluate)
+                return super()._render(scene, sensor, seed, spp, develop, evaluate)
             finally:
                 self._in_base = False
         with dr.suspend_grad():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -9,7 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from vpl.core.arrays import download, usable
+from vpl.core.arrays import add_at, download, usable
+from vpl.core.exclusive import exclusive
 from vpl.core.stages import Stage
 from vpl.lights.emitters import Emitters, read_emitters
 from vpl.points.camera_paths import CameraPaths, PixelGrid, SceneTraits, follow_camera_rays, refuse_media, scene_traits
@@ -53,6 +56,17 @@ def add_statistics(totals: dict, more: dict) -> None:
             add_statistics(totals.setdefault(name, {}), value)
         else:
             totals[name] = totals.get(name, 0) + value
+
+
+def _hear_interruptions() -> None:
+    """Give Ctrl-C back to Python, before Mitsuba's own ``render`` takes it for its time.
+
+    It calls the ``render`` that is overridden here once more, which calls it once more.  Without this, that second call
+    would find the handler of the first and leave it behind: the next Ctrl-C would call an integrator that is gone.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, handler)
 
 
 @dataclass
@@ -105,17 +119,37 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         """Channels that ``sample`` returns besides the radiance."""
         return list(self.aovs)
 
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """Render as Mitsuba does; a RuntimeError where another thread uses the sensor, its film and its sampler."""
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        _hear_interruptions()
+        with exclusive(sensor=sensor, integrator=self):
+            return self._render(scene, sensor, seed, spp, develop, evaluate)
+
+    def _render(self, *arguments):
+        """What ``render`` does with its arguments."""
+        return super().render(*arguments)
+
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """Radiance along camera rays; see ``mi.SamplingIntegrator.sample`` for this interface."""
-        if medium is not None:
-            raise ValueError(
-                "the camera is inside a participating medium; many-light integrators support surfaces only"
-            )
-        refuse_media(scene)
-        with dr.suspend_grad():
-            camera = self.begin(scene, sampler, mi.Ray3f(ray), active)
-            radiance, channels, found = self.light(scene, sampler, camera)
-            image, counters = self._assemble(camera, radiance, channels, found)
+        with exclusive(sampler=sampler, integrator=self), dr.suspend_grad():
+            try:
+                if medium is not None:
+                    raise ValueError(
+                        "the camera is inside a participating medium; many-light integrators support surfaces only"
+                    )
+                refuse_media(scene)
+                return self._sample(scene, sampler, mi.Ray3f(ray), active)
+            except Exception as error:
+                # Out of `mi.render` comes another one, which only says that something went wrong
+                mi.Log(mi.LogLevel.Warn, f"{type(self).__name__}: {error}")
+                raise
+
+    def _sample(self, scene, sampler, ray, active):
+        """What ``sample`` returns."""
+        camera = self.begin(scene, sampler, ray, active)
+        radiance, channels, found = self.light(scene, sampler, camera)
+        image, counters = self._assemble(camera, radiance, channels, found)
         finite = dr.all(usable(image)) & (self.max_depth > 0)
         return dr.select(finite, mi.Spectrum(image), 0), camera.valid, counters
 
@@ -158,7 +192,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         if points.count:
             lit = points.weight * radiance
             bad = ~dr.all(usable(lit))
-            dr.scatter_add(image, dr.select(bad, 0, lit), points.ray)
+            add_at(image, dr.select(bad, 0, lit), points.ray)
             for name, counter in zip(self.aovs, counters, strict=True):
                 if name in channels:
                     dr.scatter(counter, mi.Float(channels[name]), points.ray)

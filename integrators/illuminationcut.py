@@ -19,7 +19,7 @@ from vpl.points.point_clusters import PointClusters
 
 from .common import AOVS, AOVS_TEXT, DARK_FLOOR, ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
-from .knobs import Choice, Integer, Number, Words
+from .knobs import Choice, Fraction, Integer, Number, Words
 from .manual import manual_page
 
 # Pairs held before they are evaluated: bounds the memory whatever the image and the error
@@ -71,7 +71,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "illuminationcut", "max_depth": 8, "visibility": "adaptive"}
     """
 
@@ -83,7 +83,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
             "agree the others are taken to see the same; fewer rays, and a bias (see below).",
             words=tuple(_DEFAULT_ERROR),
         ),
-        Number(
+        Fraction(
             "error", lambda plugin: _DEFAULT_ERROR[plugin.visibility],
             "Largest bound of what a pair of clusters contributes to one of its points, as a fraction of the least "
             "radiance among them: 0.01 is 1%. 0 refines to single lights.",

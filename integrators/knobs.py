@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 _PAGE_WIDTH = 118
+# Errors above are likely to be meant as percentages
+_LARGEST_FRACTION = 0.5
 # Read by Mitsuba itself
 _OF_MITSUBA = ("timeout", "samples_per_pass", "block_size")
 
@@ -121,6 +123,15 @@ class Number(_Limited):
         return float(value) if numeric and math.isfinite(value) and self._within(value) else None
 
 
+class Fraction(Number):
+    """Number that says what share of something an error may be."""
+
+    def read(self, plugin, props):
+        value = super().read(plugin, props)
+        doubt_percentage(f'{props.plugin_name()}: property "{self.name}"', value)
+        return value
+
+
 class Boolean(Knob):
     """True or false."""
 
@@ -208,6 +219,15 @@ PATH_KNOBS = (
     Integer("rr_depth", 5, "Edges after which paths may end by Russian roulette.", minimum=1),
     Boolean("hide_emitters", False, "Do not show area emitters and environments to the camera."),
 )  # fmt: skip
+
+
+def doubt_percentage(name: str, value: float) -> None:
+    """Warn of a fraction that looks like a percentage; ``name``: what it is called."""
+    import mitsuba as mi  # not above: pages are filled without it
+
+    if value > _LARGEST_FRACTION:
+        said = f"{name} is a fraction, {value:g} means {value:.0%}; {value:g}% would be {value / 100:g}"
+        mi.Log(mi.LogLevel.Warn, said)
 
 
 def knobs_of(plugin: type) -> tuple[Knob, ...]:

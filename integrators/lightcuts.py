@@ -11,7 +11,7 @@ from vpl.cuts.light_cuts import estimate_radiance, evaluate_cuts, limited_cuts
 
 from .common import DARK_FLOOR, ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
-from .knobs import Integer, Number
+from .knobs import Fraction, Integer
 from .manual import manual_page
 
 # A point's radiance is estimated from coarse cuts at every eighth point, averaged over sixteen neighbours on the curve
@@ -55,12 +55,12 @@ class LightcutsIntegrator(ManyLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "lightcuts", "max_depth": 8, "error": 0.01}
     """
 
     knobs = (
-        Number(
+        Fraction(
             "error", 0.01,
             "Largest bound of the error of one cluster, as a fraction of the radiance around the point: 0.01 is 1%. 0 "
             "refines to single lights.",

@@ -75,7 +75,7 @@ class LightSliceIntegrator(ManyLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "lightslice", "max_depth": 8, "columns": 200}
     """
 

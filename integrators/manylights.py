@@ -13,7 +13,7 @@ from vpl.core.sampling import derived_seed, independent_sampler
 from vpl.core.stages import Stage
 from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.perturbed import Perturbed
-from vpl.points.camera_paths import SceneTraits, refuse_media
+from vpl.points.camera_paths import SceneTraits
 from vpl.split.balance import Balance, balance, without_lights
 from vpl.split.gather_vertices import drawn_later
 from vpl.split.next_event import emitters_of
@@ -119,7 +119,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "manylights", "max_depth": 8}
     """
 
@@ -130,13 +130,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
         ),
     )  # fmt: skip
 
-    def sample(self, scene, sampler, ray, medium=None, active=True):
-        """Radiance along camera rays; see ``mi.SamplingIntegrator.sample`` for this interface."""
-        if medium is not None:
-            raise ValueError("the camera is inside a participating medium; manylights supports surfaces only")
-        refuse_media(scene)
-        with dr.suspend_grad():
-            radiance, valid = self._sample(self._view(scene, sampler, mi.Ray3f(ray), active))
+    def _sample(self, scene, sampler, ray, active):
+        radiance, valid = self._trace(self._view(scene, sampler, ray, active))
         return mi.Spectrum(radiance), valid, []
 
     def _view(self, scene, sampler, ray, active) -> View:
@@ -147,7 +142,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         dr.make_opaque(ray, active)
         return View(scene, emitters_of(scene), Perturbed(scene), ray, active, grid.width, grid.samples, seed)
 
-    def _sample(self, view: View):
+    def _trace(self, view: View):
         """(Radiance of each camera ray, whether it is opaque in the film's alpha)."""
         clock, self.statistics = Clock(), {}
         pilot = self._pilot(view)

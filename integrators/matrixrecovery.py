@@ -54,7 +54,11 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
 
     There is no bound on the error. One light stands for each cluster in a whole slice, which ``alpha`` holds small and
     averages out over seeds; slices show as blotches where ``alpha`` is large. What is predicted wrongly does not
-    average out: images are some tenths of a percent to 3% too bright or too dark, the less the larger ``sampling`` is.
+    average out, and most of it is light that is taken to be blocked. Beside all the same virtual lights, images of 64
+    to 256 pixels' width are darker by 0.2 to 0.5% in the Cornell box and a kitchen (blocks of 8 x 8 pixels by up to
+    11%, and brighter by up to 10%), by 2 to 4% in the scenes ``arcade``, ``banquet`` and ``kitchen_lamps``, and where
+    many small lamps each light a little of the scene far more: ``corridor`` and ``hall`` by 15 and 23% at 64 pixels,
+    by 7 and 8% at 256 (blocks by up to 65%). It is less the larger ``sampling`` is and the more points slices have.
     Penumbrae are noisy, since predictors answer at random where they are not sure. The visibility of a light is one
     number for all channels: what masks and thin glass tint arrives grey.
 
@@ -79,7 +83,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "matrixrecovery", "max_depth": 8, "alpha": 0.002}
     """
 

@@ -18,7 +18,7 @@ from vpl.points.point_clusters import PointClusters
 
 from .common import DARK_FLOOR, ManyLightIntegrator, ShadeJob, ShadeResult
 from .gathering import Clock
-from .knobs import Integer, Number
+from .knobs import Fraction, Integer
 from .manual import manual_page
 
 # Pairs that are shaded and traced at a time, at least
@@ -70,12 +70,12 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "mdlightcuts", "max_depth": 8, "error": 0.01}
     """
 
     knobs = (
-        Number(
+        Fraction(
             "error", 0.01,
             "Largest bound of what a pair of clusters contributes to its pixel, as a fraction of the pixel's radiance: "
             "0.01 is 1%. 0, with ``max_cut`` 0 and ``leaf_points`` 1, takes every light at every point.",

@@ -45,7 +45,7 @@ class UnoccludedDirectIntegrator(DirectLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "unoccludeddirect", "error": 0.02}
     """
 

@@ -39,7 +39,7 @@ class VPLIntegrator(ManyLightIntegrator):
 
         .. code-tab:: python
 
-            import integrators
+            import manylights
             "integrator": {"type": "vpl", "max_depth": 8, "vpl_count": 1000}
     """
 
@@ -49,7 +49,7 @@ class VPLIntegrator(ManyLightIntegrator):
         """Sum over all lights; see :func:`vpl.transport.evaluation.sum_all_lights`."""
         count = job.batch.count
         radiance, rays = sum_all_lights(job.transport, job.batch, job.stopped)
-        return ShadeResult(radiance, rays, dr.zeros(mi.UInt32, count), dr.full(mi.UInt32, job.lights.count, count))
+        return ShadeResult(radiance, rays, dr.zeros(mi.UInt32, count), dr.opaque(mi.UInt32, job.lights.count, count))
 
 
 mi.register_integrator("vpl", VPLIntegrator)

@@ -29,6 +29,16 @@ def test_failed_write_leaves_the_old_file(tmp_path):
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("a.png", "old")]
 
 
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path):
+    with (
+        pytest.raises(OSError, match=r"No space left on device: '.*/a\.json'"),
+        images.replacing(tmp_path / "a.json") as file,
+    ):
+        file.symlink_to("/dev/full")
+        file.write_text("{}")
+    assert not list(tmp_path.iterdir())
+
+
 def test_tone_mapping():
     rgb = np.zeros((20, 20, 3))
     rgb[:2], rgb[2:4], rgb[4:] = 4.0, np.inf, 2.0

@@ -90,3 +90,12 @@ def test_unknown_properties_are_refused_with_those_that_may_have_been_meant(name
     with pytest.raises(ValueError) as error:
         Derived(**{name: 1})
     assert str(error.value).startswith(f'some: unknown property "{name}"; {help}')
+
+
+@pytest.mark.parametrize("value", [0.5, 2.0])
+def test_errors_that_look_like_percentages_are_doubted(value, capfd):
+    plugins = {"lightcuts", "mdlightcuts", "illuminationcut", "adaptivedirect", "unoccludeddirect"}
+    for plugin in plugins:
+        mi.load_dict({"type": plugin, "error": value})
+        said = f'{plugin}: property "error" is a fraction, 2 means 200%; 2% would be 0.02'
+        assert (said in "".join(capfd.readouterr())) == (value > 0.5)

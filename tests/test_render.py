@@ -13,7 +13,7 @@ import manylights
 from comparison import convergence, rendering
 from comparison import render as render_module
 
-from .conftest import cornell, render_with_statistics
+from .conftest import area_light, closed_box, cornell, render_with_statistics, sensor
 
 
 @pytest.fixture
@@ -41,6 +41,30 @@ def test_the_image_is_the_average_of_its_passes(scene):
     parts = [spp * mi.render(scene, spp=spp, seed=rendering.pass_seed(3, k)).numpy() for k, spp in enumerate((4, 4, 2))]
     np.testing.assert_allclose(image.numpy(), sum(parts) / 10, rtol=1e-5)
     assert took.error > 0
+
+
+def test_passes_of_integrators_that_clone_the_sampler_have_the_samples_that_were_asked_for(scene):
+    image, took = manylights.render(scene, "prb", spp=5, pass_spp=4, seed=3)
+    assert (took.spp, took.passes) == (5, 2)
+    prb = mi.load_dict({"type": "prb"})
+    parts = [
+        spp * mi.render(scene, integrator=prb, spp=spp, seed=rendering.pass_seed(3, k)).numpy()
+        for k, spp in enumerate((4, 1))
+    ]
+    np.testing.assert_allclose(image.numpy(), sum(parts) / 5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("integrator", ["path", "prb"])
+def test_samples_that_strata_round_up_are_counted(integrator):
+    box = closed_box({"lamp": area_light()}) | {"sensor": sensor(8, sampler={"type": "stratified"})}
+    scene = mi.load_dict(box)
+    assert manylights.render(scene, integrator, spp=5, pass_spp=5)[1].spp == 9
+
+
+def test_a_render_leaves_the_scenes_samples_as_they_were(scene):
+    wanted = scene.sensors()[0].sampler().sample_count()
+    manylights.render(scene, spp=3)
+    assert manylights.render(scene)[1].spp == wanted
 
 
 def test_later_passes_compile_nothing(scene):
@@ -111,6 +135,11 @@ def test_a_render_ends_between_passes_when_its_time_is_over(scene, monkeypatch):
 def test_there_is_one_pass_however_short_the_time(scene):
     _, took = manylights.render(scene, time=1e-9, spp=100)
     assert took.passes == 1 and took.ended_by == "time"
+
+
+def test_an_error_that_looks_like_a_percentage_is_doubted(scene, capfd):
+    manylights.render(scene, error=2.0, spp=1)
+    assert "error is a fraction, 2 means 200%; 2% would be 0.02" in "".join(capfd.readouterr())
 
 
 @pytest.mark.parametrize(("limits", "ended_by"), [({"spp": 8}, "spp"), ({"spp": 10**6}, "error")])

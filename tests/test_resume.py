@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -9,10 +10,11 @@ import time
 from pathlib import Path
 
 import jsonschema
+import numpy as np
 import pytest
 
 import compare
-from comparison import worker
+from comparison import images, runs, worker
 
 from .conftest import CORNELL
 from .test_report import ROOT, SCHEMA
@@ -108,3 +110,42 @@ def test_two_comparisons_do_not_share_a_folder(tmp_path, capsys):
     finally:
         process.kill()
         process.communicate()
+
+
+# Files that grow beyond a limit fail as on a full disk, after as many bytes
+LIMITED = """
+import resource, runpy, sys
+limit = int(sys.argv.pop(1))
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+sys.argv.pop(0)
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize(
+    ("limit", "printed", "unwritten"),
+    [(100, r"^path: FAILED: .*cornell\.path\.", "results.json"), (12_000, r"^path +1 ", "report.html")],
+)
+def test_a_full_disk_is_reported_with_the_name_of_the_file(tmp_path, limit, printed, unwritten):
+    reference = tmp_path / "reference.exr"
+    images.write_exr(reference, np.ones((16, 16, 3)), ["R", "G", "B"])
+    arguments = [CORNELL, "-i", "path", "--spp", "1", "--reference", str(reference), "-o", str(tmp_path / "out")]
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, str(limit), str(ROOT / "compare.py"), *arguments],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert re.search(printed, done.stdout, re.MULTILINE)
+    assert done.stderr.splitlines()[-1] == f"compare: [Errno 27] File too large: '{tmp_path / 'out' / unwritten}'"
+    assert not list((tmp_path / "out").glob(".*.*"))
+
+
+def test_a_run_that_cannot_be_kept_is_a_failure(tmp_path, monkeypatch):
+    def save(self, result):
+        raise OSError(28, "No space left on device", "run.json")
+
+    monkeypatch.setattr(runs.Runs, "save", save)
+    arguments = [CORNELL, "-i", "path", "--width", "16", "--spp", "1", "--reference", "vpl"]
+    assert compare.main([*arguments, "-o", str(tmp_path)]) == 1
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["scenes"][0]["renders"][0]["error"] == "[Errno 28] No space left on device: 'run.json'"

@@ -1,4 +1,8 @@
-"""Integrators that are cancelled while they render: they do not go on to the end."""
+"""Integrators that are cancelled while they render: they do not go on to the end.  Ctrl-C."""
+
+import subprocess
+import sys
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -43,3 +47,38 @@ def test_sizes_of_kernels_do_not_change_the_image(monkeypatch, scene, name):
     expected = render(scene, create(name))
     small_kernels(monkeypatch)
     np.testing.assert_allclose(render(scene, create(name)), expected, rtol=1e-4, atol=1e-6)
+
+
+# In a process of its own, which a handler that was left behind would end
+INTERRUPTED = """
+import signal, sys
+import mitsuba as mi
+import manylights
+
+mi.set_variant("llvm_ad_rgb")
+signal.signal(signal.SIGINT, signal.default_int_handler)
+bulb = {"type": "point"}
+scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "bulb": bulb, "ball": {"type": "sphere"}})
+plugin = mi.load_dict({"type": sys.argv[1]})
+if sys.argv[2] == "during":
+    original = type(plugin)._sample
+    type(plugin)._sample = lambda *given: (signal.raise_signal(signal.SIGINT), original(*given))[1]
+try:
+    plugin.render(scene, spp=1)
+    if sys.argv[2] == "after":
+        del plugin
+        signal.raise_signal(signal.SIGINT)
+    print("went on")
+except KeyboardInterrupt:
+    print("ended")
+"""
+
+
+@pytest.mark.parametrize("name", ["adaptivedirect", "lightcuts", "manylights"])
+@pytest.mark.parametrize("when", ["during", "after"])
+def test_ctrl_c_is_heard_during_and_after_a_render(name, when):
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, name, when], cwd=Path(__file__).resolve().parent.parent,
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0 and done.stdout.endswith("ended\n"), done.stdout + done.stderr

@@ -9,6 +9,7 @@ import pytest
 
 from vpl.core.arrays import download, upload
 from vpl.core.sampling import Choice, derived_seed
+from vpl.lights import tracing
 from vpl.lights.emission import bounding_box, emission_groups
 from vpl.lights.emitters import read_emitters
 from vpl.lights.tracing import PathLimits, trace_lights
@@ -50,6 +51,14 @@ def test_depths_are_counted_in_edges_and_limited():
     lights = traced(furnace(0.7), deepest=3).lights
     assert set(np.unique(lights.depth)) == {1, 2, 3}
     assert traced(furnace(0.7), deepest=0).lights.count == 0
+
+
+def test_edges_are_replayed_instead_of_being_recorded_one_by_one(monkeypatch):
+    """Recording goes through every shape and material of the scene."""
+    recorded, original = [], tracing.spectrum_to_rgb
+    monkeypatch.setattr(tracing, "spectrum_to_rgb", lambda value: recorded.append(1) or original(value))
+    found = traced(furnace(0.9)).lights
+    assert found.depth.max() > 20 and len(recorded) < 6
 
 
 def test_lights_lie_on_the_surface_and_face_the_inside():

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NO_LIMIT, chunks, download, upload, upload_limit
+from ..core.arrays import NO_LIMIT, add_at, chunks, download, upload, upload_limit
 from ..lights.light_set import LightGroup, LightSet
 from ..points.surfaces import Batch
 from ..transport.bounds import contribution_bound
@@ -162,7 +162,7 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
     dr.scatter(threshold, upload_thresholds(high), index)
     for target, count in zip(sizes.count, fitting, strict=True):
         dr.scatter(target, count, index)
-    dr.scatter_add(visits, spent, index)
+    add_at(visits, spent, index)
     dr.eval(threshold, sizes.count, visits)
     return threshold, sizes, visits
 
@@ -222,9 +222,9 @@ def evaluate_cuts(
         light, intensity = tree.representative(chunk.nodes, second=second), tree.summed_intensity(chunk.nodes)
         value, traced = evaluate_representatives(transport, chunk.group, chunk.batch, chunk.rows, light, intensity)
         traced = dr.select(traced, mi.UInt32(1), mi.UInt32(0))
-        dr.scatter_add(radiance, _sum_segments(value, chunk.offset, chunk.length), chunk.points)
-        dr.scatter_add(rays, _sum_segments(traced, chunk.offset, chunk.length), chunk.points)
-        dr.scatter_add(visits, chunk.visits, chunk.points)
+        add_at(radiance, _sum_segments(value, chunk.offset, chunk.length), chunk.points)
+        add_at(rays, _sum_segments(traced, chunk.offset, chunk.length), chunk.points)
+        add_at(visits, chunk.visits, chunk.points)
     dr.eval(radiance, rays, visits)
     return radiance, rays, visits
 

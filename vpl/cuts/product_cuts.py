@@ -183,7 +183,7 @@ def find_pairs(
     ``accept``: see ``_judge``; pairs of two leaves are always accepted.  ``points_first``: which pairs are refined by
     splitting points whatever their sizes (None: none).  ``counter``: told of every bound.
     """
-    clamp = dr.opaque(mi.Float, lights.smallest_distance)
+    clamp = lights.clamp
     root = dr.opaque(mi.UInt32, 0, 1)
     waiting = [Pairs(root, root)]
     while waiting:

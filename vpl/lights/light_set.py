@@ -6,7 +6,7 @@ Emitters that have an extent become virtual lights here where that is asked for 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from time import perf_counter
 
 import drjit as dr
@@ -76,7 +76,8 @@ class LightGroup:
 
 @dataclass
 class LightSet:
-    """Groups that hold at least one light; ``smallest_distance``: the clamp on distances to oriented lights.
+    """Groups that hold at least one light; ``smallest_distance``: the clamp on distances to oriented lights, ``clamp``:
+    the same on the device, where it is part of no kernel.
 
     ``max_depth``: edges of the longest path from camera to emitter; ``paths``: light paths emitted; ``dropped``: lights
     with values that were not finite; ``seconds``: time by stage.
@@ -88,6 +89,10 @@ class LightSet:
     paths: int
     dropped: int
     seconds: dict
+    clamp: object = field(init=False)
+
+    def __post_init__(self):
+        self.clamp = dr.opaque(mi.Float, self.smallest_distance)
 
     @property
     def count(self) -> int:

@@ -32,11 +32,17 @@ def perturbed_shapes(scene) -> tuple:
     return tuple(index for index, shape in registered_shapes(scene) if any(name in str(shape.bsdf()) for name in _MAPS))
 
 
+@dataclass(init=False)
 class Perturbed:
     """Shapes whose material shades with a normal of its own.
 
     ``exist``: whether there are any; ``everywhere``: whether they cannot be told from others, as in shape groups.
+    The fields of a dataclass, unlike those of other classes, may be given to functions that Dr.Jit freezes.
     """
+
+    exist: bool
+    everywhere: bool
+    _table: object
 
     def __init__(self, scene):
         shapes = perturbed_shapes(scene)

@@ -11,7 +11,9 @@ its knob.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -58,12 +60,20 @@ class TracedLights:
 @dataclass(frozen=True)
 class _Walk:
     """What all light paths of a render have in common; ``perturbed``: the shapes with bump or normal maps;
-    ``focus``: where the camera looks, if that is a small part of the scene."""
+    ``focus``: where the camera looks, if that is a small part of the scene; ``bounce``: one edge of them all, see
+    :func:`_bounce`."""
 
-    scene: object
     perturbed: Perturbed
     focus: Focus | None
     limits: PathLimits
+    bounce: Callable
+
+    @classmethod
+    def of(cls, scene, focus: Focus | None, limits: PathLimits) -> _Walk:
+        """Paths in a scene, which may not be edited before all of them are traced: an edge is recorded once and
+        replayed, for where there are many shapes and materials, recording takes longer than tracing."""
+        perturbed = Perturbed(scene)
+        return cls(perturbed, focus, limits, partial(dr.freeze(_bounce), scene, perturbed, limits))
 
 
 def _scatter(si, sampler, throughput, limits: PathLimits) -> Scattered:
@@ -88,18 +98,18 @@ def _scatter(si, sampler, throughput, limits: PathLimits) -> Scattered:
     return Scattered(stored, leaving, normal, normal, valid, direction, following, delta)
 
 
-def _bounce(walk: _Walk, sampler, ray, throughput, power, depth, refuses_delta):
+def _bounce(scene, perturbed, limits: PathLimits, sampler, ray, throughput, power, depth, refuses_delta):
     """One edge of all paths, in one kernel that is the same at every depth.
 
     ``throughput`` starts at 1 and ``power`` stays what the emitter gave: Russian roulette sees relative values only.
     ``refuses_delta``: whether paths end where they are scattered by a lobe without an extent.  Returns (stored mask,
-    position, normal, flux / pi, facing), (alive mask, origin, direction, throughput), all evaluated.
+    position, normal, flux / pi, facing), (alive mask, origin, direction, throughput), mask of values that are not
+    finite, all evaluated.
     """
-    limits = walk.limits
-    si = walk.scene.ray_intersect(ray)
+    si = scene.ray_intersect(ray)
     scattered = _scatter(si, sampler, throughput, limits)
-    if walk.perturbed.exist:
-        here = si.is_valid() & walk.perturbed.at(si, si.is_valid())
+    if perturbed.exist:
+        here = si.is_valid() & perturbed.at(si, si.is_valid())
         turned = scatter_perturbed(si, sampler, throughput, limits.lobe_limit, here)
         scattered = select_record(here, turned, scattered)
     leaving, following = scattered.leaving, scattered.following
@@ -118,7 +128,7 @@ def _bounce(walk: _Walk, sampler, ray, throughput, power, depth, refuses_delta):
     onward = (alive, next_ray.o, next_ray.d, following)
     # One kernel for everything; a count before would be a kernel of its own that does all the work twice
     dr.eval(light, onward, bad)
-    return light, onward, int(dr.count(bad)[0])
+    return light, onward, bad
 
 
 def _paths_of_group(walk: _Walk, group, first: int, count: int, total: int, seed: int):
@@ -140,8 +150,8 @@ def _paths_of_group(walk: _Walk, group, first: int, count: int, total: int, seed
         ray = mi.Ray3f(origin, direction)
         refuses_delta = dr.opaque(mi.Bool, group.delta and depth == 1)
         edges = dr.opaque(mi.UInt32, depth)
-        stored, alive, bad = _bounce(walk, sampler, ray, throughput, power, edges, refuses_delta)
-        dropped += bad
+        stored, alive, bad = walk.bounce(sampler, ray, throughput, power, edges, refuses_delta)
+        dropped += int(dr.count(bad)[0])
         kept = dr.compress(stored[0])
         if len(kept):
             *columns, facing = (download(dr.gather(type(column), column, kept)) for column in stored[1:])
@@ -221,7 +231,7 @@ def trace_lights(
     traced = TracedLights(VirtualLights.of("oriented", [], [], []), 0, 0)
     if not groups or limits.deepest < 1:
         return traced
-    walk = _Walk(scene, Perturbed(scene), focus, limits)
+    walk = _Walk.of(scene, focus, limits)
     shares = _shares(walk, groups, count, seed)
     parts = [traced.lights]
     for number, (group, paths) in enumerate(zip(groups, shares, strict=True)):

@@ -197,7 +197,7 @@ class ColumnWeights:
 
     def _bounds(self, clusters: PointClusters, nodes, scale):
         """The most that each column can send to a point of each group, in the units of the rows."""
-        clamp = dr.opaque(mi.Float, self._forest.lights.smallest_distance)
+        clamp = self._forest.lights.clamp
 
         def entry(group, node, row):
             receiver = clusters.gather(dr.gather(mi.UInt32, nodes, row)).receiver

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, download, finite_or_zero, ones, upload, upload_limit
+from ..core.arrays import add_at, channel_mean, download, finite_or_zero, ones, upload, upload_limit
 from ..core.morton import morton_order
 from ..core.sampling import derived_seed, independent_sampler
 from ..lights.emitters import Emitters, registered_shapes
@@ -236,7 +236,7 @@ def follow_camera_rays(
             found = (mask, si, weight, dr.full(mi.UInt32, 1, count))
             dr.eval(found)
         else:
-            dr.scatter_add(emission, emitted, lane)
+            add_at(emission, emitted, lane)
             # Rays that went on beside a gather point find no other
             for target, value in zip(found, (*gathered, mi.UInt32(depth)), strict=True):
                 dr.scatter(target, value, lane, gathered[0])

@@ -100,7 +100,7 @@ def probe_visibility(transport: Transport, group: LightGroup, surface: Surface, 
 def unoccluded(lights: LightSet, group: LightGroup, surface: Surface, light):
     """Unoccluded contribution of lights to surfaces, pair by pair."""
     allowed = lights.allowed(surface.depth, light.depth)
-    return contribution(group.kind, surface, light, lights.smallest_distance, allowed)
+    return contribution(group.kind, surface, light, lights.clamp, allowed)
 
 
 def _visibility(transport: Transport, group: LightGroup, surface: Surface, light, active):

@@ -1,0 +1,47 @@
+"""Kernels: another size of the image, number of samples or seed compiles none but Mitsuba's own."""
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+import integrators
+
+from .conftest import area_light, closed_box
+
+MITSUBAS = 2  # one makes the camera's rays, one puts samples on the film; both hold the image's width
+SETTINGS = {"manylights": {}, "adaptivedirect": {}, "unoccludeddirect": {}}
+
+
+@pytest.fixture
+def compiled():
+    """A function that says how many kernels were launched since it was last called that never were before."""
+    seen = set()
+
+    def count():
+        launched = {one["hash"] for one in dr.kernel_history() if one["type"] == dr.KernelType.JIT}
+        new = launched - seen
+        seen.update(launched)
+        return len(new)
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        yield count
+
+
+@pytest.mark.parametrize("name", integrators.PLUGINS)
+def test_sizes_and_samples_are_in_no_kernel(name, compiled):
+    views = {f"view_{size}": closed_box({}, size)["sensor"] for size in (32, 40, 48)}
+    scene = mi.load_dict(closed_box({"lamp": area_light()}) | views)
+    settings = SETTINGS.get(name, {"vpl_count": 3000})
+    plugin = mi.load_dict({"type": name, "max_depth": 4, **settings})
+
+    def new(camera=1, spp=4, seed=0):
+        mi.render(scene, sensor=camera, integrator=plugin, spp=spp, seed=seed).numpy()
+        return compiled()
+
+    # What is a single number in one image may be several in the next, which makes a few other kernels
+    assert sum(new(camera, seed=seed) for camera in (1, 2) for seed in range(3)) > 2 * MITSUBAS
+    assert new(seed=3) == 0
+    if name != "matrixrecovery":  # which solves larger problems otherwise
+        assert new(camera=3) <= MITSUBAS
+    assert new(spp=6) <= MITSUBAS
