@@ -4,7 +4,7 @@
     python -m comparison.strip output/strip --scene hall --output docs/equal_time.png
 
 One picture for every integrator (of the first seed), the reference if all share one, and the relative errors in false
-colours, with names and numbers below.
+colours, with names and numbers below; a row for every scene that is named.
 """
 
 import argparse
@@ -73,13 +73,21 @@ def draw(pictures, captions):
     return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
+def below(strips):
+    """Return strips of pixels below each other, the narrower ones filled up with white."""
+    width = max(strip.shape[1] for strip in strips)
+    return np.concatenate(
+        [np.pad(strip, ((0, 0), (0, width - strip.shape[1]), (0, 0)), constant_values=255) for strip in strips]
+    )
+
+
 def main(arguments=None):
     """Run the command; return its exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m comparison.strip", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path, help="output folder of compare.py")
-    parser.add_argument("--scene", help="name of the scene (default: the only one)")
+    parser.add_argument("--scene", nargs="+", help="names of scenes (default: the only one)")
     parser.add_argument("--output", type=Path, required=True, help="PNG file")
     options = parser.parse_args(arguments)
     return command_line.exit_status("strip", lambda: _run(options), "nothing was written", verbose=False)
@@ -93,10 +101,13 @@ def _run(options):
     if not options.output.absolute().parent.is_dir():
         raise UsageError(f"no folder '{options.output.absolute().parent}' for the output")
     command_line.set_variant(results["variant"])
-    found = panels(results, options.scene)
-    pictures = [images.read_png(options.folder / f"{file}.png") for file, _ in found]
+    strips = []
+    for name in options.scene or [None]:
+        found = panels(results, name)
+        pictures = [images.read_png(options.folder / f"{file}.png") for file, _ in found]
+        strips.append(draw(pictures, [caption for _, caption in found]))
     made = {key: results[key] for key in ("command", "created")}
-    images.write_png(options.output, draw(pictures, [caption for _, caption in found]), made)
+    images.write_png(options.output, below(strips), made)
     print(f"{options.output} ({options.output.stat().st_size / 1000:.0f} kB), made by: {results['command']}")
     return 0
 

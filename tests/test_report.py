@@ -256,6 +256,15 @@ def test_strip_of_pictures(swept, tmp_path, capsys):
     assert "compare.py" in mi.Bitmap(str(output)).metadata()["command"]
 
 
+def test_a_row_for_every_scene_that_is_named(swept, tmp_path):
+    one, two = tmp_path / "one.png", tmp_path / "two.png"
+    assert strip.main([str(swept), "--output", str(one)]) == 0
+    assert strip.main([str(swept), "--scene", "cornell", "cornell", "--output", str(two)]) == 0
+    row, rows = images.read_png(one), images.read_png(two)
+    np.testing.assert_array_equal(rows, np.concatenate([row, row]))
+    np.testing.assert_array_equal(strip.below([row, row[:, :50]])[len(row) :, 50:], 255)
+
+
 def test_strips_without_a_common_reference(swept):
     results = results_of(swept)
     (scene,) = results["scenes"]
