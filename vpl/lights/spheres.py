@@ -35,10 +35,12 @@ class Sphere:
 
     @classmethod
     def of(cls, shape) -> Sphere:
-        """The sphere that a shape of Mitsuba is; its transformation must not be singular."""
+        """The sphere that a shape of Mitsuba is."""
         matrix = matrix_of(parameters_of(shape, below=False)["to_world"])
         linear = matrix[:3, :3]
-        across, axis = (linear[:, k] / np.linalg.norm(linear[:, k]) for k in (0, 2))
+        # A sphere of no size has no axes
+        lengths = np.maximum(np.linalg.norm(linear, axis=0), np.finfo(np.float64).tiny)
+        across, axis = (linear[:, k] / lengths[k] for k in (0, 2))
         side = -1.0 if shape.has_flipped_normals() else 1.0
         radius = float(np.linalg.norm(linear[:, 0]))
         return cls(matrix[:3, 3], radius, across, axis, float(np.sign(np.linalg.det(linear))), side)
