@@ -169,3 +169,17 @@ def test_a_sky_without_surfaces():
     found, statistics = render_with_statistics("manylights", scene, 16)
     assert statistics["dropped"] == 0
     np.testing.assert_allclose(found, render(scene, "path", 16), rtol=0.2, atol=0.02)
+
+
+def test_no_kernel_is_compiled_anew_for_another_seed(monkeypatch):
+    """What depends on the pilot must not be a constant in them: c of the split, numbers of vertices and of lights."""
+    for name, value in (("_FIXED_COST", 0), ("_LIGHT_PATH_COST", 0), ("_FEWEST", 4000)):
+        monkeypatch.setattr(balance, name, value)
+    scene = mi.load_dict(closed_box(bulbs(), 16))
+    for seed in range(3):
+        render(scene, "manylights", 16, seed, max_depth=4)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        render(scene, "manylights", 16, 3, max_depth=4)
+        kernels = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
+    assert [kernel["size"] for kernel in kernels if not kernel["cache_hit"]] == []
