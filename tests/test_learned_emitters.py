@@ -1,0 +1,189 @@
+"""What `manylights` learns, and what must not mislead it: odd emitters, sensors of one ray, and bad values."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from vpl.core.arrays import upload_vectors
+from vpl.split import balance
+from vpl.split.learned_emitters import LearnedEmitters, Sites
+
+from .catalogue import EMITTERS, SENSORS, film, image, rgb
+from .conftest import closed_box, render, render_with_statistics, sensor, unit_vectors
+
+
+def bulbs(**second):
+    """Two point emitters inside of the closed box; `second`: more properties of the second."""
+    return {
+        "bulb": {"type": "point", "position": [0.3, 0.4, 0.6], "intensity": rgb(1.0)},
+        "other": {"type": "point", "position": [-0.5, 0.4, 0.2], "intensity": rgb(0.3), **second},
+    }
+
+
+def learned(scene, seed=0):
+    """The choice of emitters learned from vertices all over the closed box, and these vertices."""
+    rng, count = np.random.default_rng(seed), 4000
+    normal = unit_vectors(rng, count)
+    position = rng.uniform(-0.9, 0.9, (count, 3)).astype(np.float32)
+    emission = LearnedEmitters(scene)
+    emission.learn(position, normal, 1 << 18, seed)
+    return emission, position, normal
+
+
+# ---------------------- Densities ----------------------
+
+
+@pytest.mark.parametrize("emitter", ["rectangle", "envmap", "constant", "sunsky"])
+def test_what_is_drawn_has_the_density_with_which_it_is_met(emitter):
+    """A ray along the drawn direction finds the same radiance and the same density, wherever it arrives."""
+    box = closed_box(EMITTERS[emitter]() | bulbs())
+    del box["left"], box["ceiling"]
+    scene = mi.load_dict(box)
+    emission, position, normal = learned(scene)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(position))
+    si.p, si.n = upload_vectors(mi.Point3f, position), upload_vectors(mi.Normal3f, normal)
+    si.sh_frame = mi.Frame3f(si.n)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(1, len(position))
+    site = emission.site(si, mi.Float(1))
+    direction, weight, density, is_point = emission.sample(
+        si, site, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), mi.Bool(True)
+    )
+    ray = si.spawn_ray(direction)
+    found = scene.ray_intersect(ray)
+    emitted, met = emission.met(si.p, site, ray, found, mi.Bool(True), mi.Bool(True))
+    lit = np.array((dr.max(weight) > 0) & ~is_point)
+    assert lit.sum() > 100
+    # Directions at the very edge of a cell may be found in the next one
+    close = np.isclose(np.array(met), np.array(density), rtol=1e-2)[lit]
+    assert close.mean() > 0.99
+    same = np.isclose(np.array(emitted), np.array(weight * density), rtol=2e-2)[:, lit].all(0)
+    assert same.mean() > 0.98
+
+
+@pytest.mark.parametrize("emitter", ["envmap", "rectangle"])
+def test_rows_of_probabilities_are_positive_for_every_emitter_and_sum_to_one(emitter):
+    emission, _, _ = learned(mi.load_dict(closed_box(EMITTERS[emitter]() | bulbs())))
+    rows = np.array(emission._probability).reshape(-1, emission._sources)
+    np.testing.assert_allclose(rows.sum(1), 1, atol=1e-5)
+    assert (rows >= 0).all() and (rows[:, : emission._count] > 0).all()
+
+
+def test_all_vertices_at_one_place_are_a_site_that_is_found_again():
+    position, normal = np.full((20, 3), 0.3, np.float32), np.tile(np.float32([[0, 0, 1]]), (20, 1))
+    sites, number = Sites.around(position, normal, 100)
+    found = sites.at(upload_vectors(mi.Point3f, position), upload_vectors(mi.Normal3f, normal))
+    assert (np.array(found) == number).all()
+
+
+def test_a_place_that_is_no_number_leads_to_no_entry_beyond_the_table():
+    rng = np.random.default_rng(0)
+    position, normal = rng.random((500, 3)).astype(np.float32), unit_vectors(rng, 500)
+    sites, number = Sites.around(position, normal, 10_000)
+    bad = np.array([[np.nan, 0.5, 0.5], [0.5, np.inf, 0.5], [-np.inf, np.nan, 1e30]], np.float32)
+    found = sites.at(upload_vectors(mi.Point3f, bad), upload_vectors(mi.Normal3f, normal[:3]))
+    assert np.array(found).max() <= number.max()
+
+
+# ---------------------- Changes between renders ----------------------
+
+
+def test_changes_of_emitters_are_seen():
+    """As many times as bright, from the other side: the image is that of a scene that was made so."""
+    box = closed_box(EMITTERS["envmap"]() | bulbs(), 8)
+    del box["left"]
+    scene, images = mi.load_dict(box), []
+    render(scene, "manylights", 64, max_depth=3)
+    parameters = mi.traverse(scene)
+    parameters["sky.data"] = 3 * mi.TensorXf(np.array(parameters["sky.data"])[::-1].copy())
+    parameters["other.position"] = mi.Point3f(0.5, -0.3, -0.2)
+    parameters.update()
+    images = [[render(scene, name, 256, seed, max_depth=3).mean() for seed in range(4)]
+              for name in ("manylights", "path")]  # fmt: skip
+    np.testing.assert_allclose(*np.mean(images, 1), rtol=0.03)
+
+
+# ---------------------- Emitters that `path` never samples ----------------------
+
+
+def test_a_point_emitter_that_is_never_sampled_is_black_as_in_path():
+    scene = mi.load_dict(closed_box(bulbs(sampling_weight=0.0), 8))
+    found, expected = (render(scene, name, 256, max_depth=3).mean() for name in ("manylights", "path"))
+    np.testing.assert_allclose(found, expected, rtol=0.05)
+
+
+# ---------------------- Sensors and values ----------------------
+
+
+def test_all_samples_of_a_sensor_of_one_ray_are_used():
+    """A radiancemeter's rays are all the same, so that their directions are an array of one entry."""
+    camera = SENSORS["radiancemeter"](film(1, 1))
+    camera["to_world"] = mi.ScalarTransform4f().look_at([0, 0, 0.9], [0.1, 0.2, -1], [0, 1, 0])
+    scene = mi.load_dict(closed_box(bulbs(), 16) | {"sensor": camera})
+    found = [render(scene, "manylights", 4096, seed, max_depth=2).mean() for seed in range(4)]
+    assert np.std(found) < 0.1 * np.mean(found)
+
+
+def test_the_weights_of_gather_vertices_are_finite():
+    """An infinite one among the sums over all vertices would leave nothing of the others."""
+    texels = np.full((8, 8, 3), 0.9)
+    texels[0, 3] = np.inf
+    mirror = {"type": "conductor", "specular_reflectance": image(texels) | {"filter_type": "nearest"}}
+    box = closed_box(bulbs(), 16)
+    box["back"]["bsdf"] = mirror
+    scene = mi.load_dict(box)
+    plugin, seen = mi.load_dict({"type": "manylights", "max_depth": 4}), []
+    original = plugin._pilot
+
+    def look(view):
+        lane = dr.arange(mi.UInt32, view.count)
+        _, first, later, _ = view.follow(lane, plugin._limits(view, 0.1, plugin.max_depth), 9)
+        seen.extend(np.isfinite(np.array(x.weight)).all() for x in (first, later))
+        return original(view)
+
+    plugin._pilot = look
+    plugin.virtual_lights = False
+    render(scene, plugin, 16)
+    assert seen == [True, True]
+
+
+def test_later_vertices_are_lit_where_no_first_one_is(monkeypatch):
+    """As in an image of one pixel, of which few samples are lit, and meet nothing."""
+    for name, value in (("_FIXED_COST", 0), ("_LIGHT_PATH_COST", 0), ("_FEWEST", 4000)):
+        monkeypatch.setattr(balance, name, value)
+    plugin, scene = mi.load_dict({"type": "manylights", "max_depth": 5}), mi.load_dict(closed_box(bulbs(), 8))
+    gather = plugin._gather
+
+    def without_first(view, lights, chosen, vertices, *more):
+        vertices[0].weight *= 0
+        return gather(view, lights, chosen, vertices, *more)
+
+    plugin._gather = without_first
+    render(scene, plugin, 16)
+    assert plugin.statistics["light_paths"] > 0 and plugin.statistics.get("later", 0) > 0
+
+
+def test_a_sky_without_surfaces():
+    scene = mi.load_dict({"type": "scene", "sensor": sensor(8), **EMITTERS["envmap"]()})
+    found, statistics = render_with_statistics("manylights", scene, 16)
+    assert statistics["dropped"] == 0
+    np.testing.assert_allclose(found, render(scene, "path", 16), rtol=0.2, atol=0.02)
+
+
+def test_no_kernel_is_compiled_anew_for_another_seed(monkeypatch):
+    """What depends on the pilot must not be a constant in them: c of the split, numbers of vertices and of lights."""
+    for name, value in (("_FIXED_COST", 0), ("_LIGHT_PATH_COST", 0), ("_FEWEST", 4000)):
+        monkeypatch.setattr(balance, name, value)
+    box = closed_box(bulbs(), 16)
+    # Some rays leave it, and something is left at second vertices, so that light is gathered at later ones, too
+    del box["left"]
+    box["back"]["bsdf"] = {"type": "roughplastic"}
+    scene = mi.load_dict(box)
+    for seed in range(3):
+        render(scene, "manylights", 16, seed, max_depth=4)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        render(scene, "manylights", 16, 3, max_depth=4)
+        kernels = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
+    assert [kernel["size"] for kernel in kernels if not kernel["cache_hit"]] == []
