@@ -15,12 +15,12 @@ from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.points.camera_paths import SceneTraits
 from vpl.split.balance import Balance, balance, without_lights
-from vpl.split.gather_vertices import drawn_later
+from vpl.split.gather_vertices import drawn_later, joined
 from vpl.split.next_event import emitters_of
 from vpl.split.numbers import spread_numbers
 from vpl.split.pilot import Pilot
 from vpl.split.pixel_clusters import PixelClusters, light_clusters
-from vpl.split.remainder import FirstEdge, Limits, follow
+from vpl.split.remainder import AT_FIRST, EVERYWHERE, NOWHERE, FirstEdge, Limits, follow
 from vpl.split.surface_lights import surface_lights
 from vpl.transport.evaluation import Transport
 
@@ -135,9 +135,12 @@ class ManyLightsIntegrator(GatheringIntegrator):
         return mi.Spectrum(radiance), valid, []
 
     def _view(self, scene, sampler, ray, active) -> View:
-        seed = int(dr.reinterpret_array(mi.UInt32, dr.detach(sampler.next_1d()))[0])
-        grid, count = self.pixel_grid(scene, sampler), dr.width(ray.d)
-        ray.time += dr.zeros(mi.Float, count)
+        number = dr.detach(sampler.next_1d())
+        seed = int(dr.reinterpret_array(mi.UInt32, number)[0])
+        # Of some sensors all rays are the same one
+        grid, count = self.pixel_grid(scene, sampler), max(dr.width(ray), dr.width(number))
+        wide = dr.zeros(mi.Float, count)
+        ray.o, ray.d, ray.time = ray.o + wide, ray.d + wide, ray.time + wide
         active = mi.Bool(active) & dr.full(mi.Bool, True, count)
         dr.make_opaque(ray, active)
         return View(scene, emitters_of(scene), Perturbed(scene), ray, active, grid.width, grid.samples, seed)
@@ -150,7 +153,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
         mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
         clock.lap(Stage.PILOT)
         lights = self._lights(view, pilot, chosen, clock)
-        limits = self._limits(view, lights.smallest_distance if lights else _WHOLE, self.max_depth)
+        gathering, c = (EVERYWHERE, lights.smallest_distance) if lights else (NOWHERE, _WHOLE)
+        limits = self._limits(view, c, self.max_depth, gathering)
         pixels = np.arange(-(-view.count // view.samples))
         expected = pilot.nearby(pilot.indirect, view.width, pixels) if lights else None
         radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
@@ -179,18 +183,18 @@ class ManyLightsIntegrator(GatheringIntegrator):
         self.statistics |= {"balance": chosen.reason, "dropped": dropped, "seconds": clock.seconds}
         return dr.select(finite & (self.max_depth > 0), radiance, 0), valid & (self.max_depth > 0)
 
-    def _limits(self, view: View, c: float, max_depth: float, rr_depth: int | None = None) -> Limits:
+    def _limits(self, view: View, c: float, max_depth: float, gathering: int, rr_depth: int | None = None) -> Limits:
         longest = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF)))
         roulette = dr.opaque(mi.UInt32, rr_depth or self.rr_depth)
-        again = dr.opaque(mi.Bool, c < _WHOLE)
-        return Limits(longest, roulette, dr.opaque(mi.Float, c**2), again, view.perturbed, self.hide_emitters)
+        gathers = dr.opaque(mi.UInt32, gathering)
+        return Limits(longest, roulette, dr.opaque(mi.Float, c**2), gathers, view.perturbed, self.hide_emitters)
 
     def _pilot(self, view: View) -> Pilot:
         """The pilot, from which emitters are learned."""
         pairs = max(min(_PILOT, view.count // 4) // 2, 1)
         apart = max(view.count // pairs // 2 * 2, 2)
         lane = np.minimum(np.arange(pairs)[:, None] * apart + [0, 1], view.count - 1).reshape(-1)
-        lanes, limits = upload(mi.UInt32, lane), self._limits(view, _WHOLE, self.max_depth)
+        lanes, limits = upload(mi.UInt32, lane), self._limits(view, _WHOLE, self.max_depth, AT_FIRST)
         found, vertices, _, arrival = view.follow(lanes, limits, 1)
         pilot = Pilot.of(found, vertices, arrival, lane // view.samples)
         view.emission.learn(*pilot.vertices, int(_LEARNING_SHARE * view.count), derived_seed(view.seed, 6))
@@ -212,7 +216,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         if chosen.light_paths == 0:
             return None
         # The path from a light is shorter by the two edges between camera and light
-        limits = self._limits(view, _WHOLE, self.max_depth - 2, rr_depth=1)
+        limits = self._limits(view, _WHOLE, self.max_depth - 2, NOWHERE, rr_depth=1)
         limits.hide_emitters = False
         made = surface_lights(
             view.scene, view.emission, pilot.arrivals, chosen.light_paths, limits, derived_seed(view.seed, 2)
@@ -239,20 +243,17 @@ class ManyLightsIntegrator(GatheringIntegrator):
         turn = dr.arange(mi.UInt32, count) % dr.opaque(mi.UInt32, samples) % dr.opaque(mi.UInt32, step)
         first, later = vertices
         rays = dr.compress((turn == 0) & (dr.max(first.weight) > 0))
-        if len(rays) == 0:
-            return lit
-        picked, (later_rays, factor) = (
-            first.select(rays),
-            drawn_later(first, later, samples, kept, derived_seed(seed, 0)),
-        )
+        later_rays, factor = drawn_later(first, later, samples, kept, derived_seed(seed, 0))
         alone = len(later_rays)
-        if alone:
-            # As many as there would be among the first vertices that are lit
-            factor *= dr.opaque(mi.Float, kept / samples)
-            picked, rays = picked.and_then(later.select(later_rays, factor)), dr.concat((rays, later_rays))
+        if len(rays) + alone == 0:
+            return lit
+        # As many as there would be among the first vertices that are lit
+        share = dr.opaque(mi.Float, kept / samples)
+        picked = first.select(rays).and_then(later.select(later_rays, factor, share))
+        rays = joined(rays, later_rays)
         clusters = PixelClusters(picked, rays, samples, alone)
         clock.lap(Stage.CLUSTERS)
-        traced = np.nan_to_num(download(channel_mean(found.radiance)))
+        traced = np.nan_to_num(download(channel_mean(found.radiance)), posinf=0, neginf=0)
         level = np.add.reduceat(np.maximum(traced, 0), np.arange(0, count, samples)) / samples + expected
         level = np.maximum(level, _DARK_FLOOR * level.mean())[clusters.pixel] * kept
         transport = Transport(view.scene, _OPAQUE, lights)

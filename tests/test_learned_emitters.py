@@ -8,6 +8,7 @@ import pytest
 from vpl.core.arrays import upload_vectors
 from vpl.split import balance
 from vpl.split.learned_emitters import LearnedEmitters, Sites
+from vpl.split.remainder import EVERYWHERE
 
 from .catalogue import EMITTERS, SENSORS, film, image, rgb
 from .conftest import closed_box, render, render_with_statistics, sensor, unit_vectors
@@ -138,7 +139,7 @@ def test_the_weights_of_gather_vertices_are_finite():
 
     def look(view):
         lane = dr.arange(mi.UInt32, view.count)
-        _, first, later, _ = view.follow(lane, plugin._limits(view, 0.1, plugin.max_depth), 9)
+        _, first, later, _ = view.follow(lane, plugin._limits(view, 0.1, plugin.max_depth, EVERYWHERE), 9)
         seen.extend(np.isfinite(np.array(x.weight)).all() for x in (first, later))
         return original(view)
 

@@ -32,24 +32,34 @@ class GatherVertices:
         weight = dr.zeros(mi.UnpolarizedSpectrum, count)
         return cls(mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0), weight, mi.UInt32(0))
 
-    def select(self, index, factor=1) -> GatherVertices:
-        """Those picked by an index array, with their weights times ``factor``, evaluated."""
+    def select(self, index, *factors) -> GatherVertices:
+        """Those picked by an index array, with their weights times some factors, evaluated."""
         picked = GatherVertices(*(dr.gather(type(x), x, index) for x in vars(self).values()))
-        picked.weight *= factor
+        for factor in factors if len(index) else ():
+            picked.weight *= factor
         dr.eval(picked)
         return picked
 
     def and_then(self, more: GatherVertices) -> GatherVertices:
         """These, and others after them, evaluated."""
-        both = GatherVertices(*(_joined(x, y) for x, y in zip(vars(self).values(), vars(more).values(), strict=True)))
+        both = GatherVertices(*(joined(x, y) for x, y in zip(vars(self).values(), vars(more).values(), strict=True)))
         dr.eval(both)
         return both
 
 
-def _joined(first, second):
-    if dr.depth_v(first) == 1:
-        return dr.concat((first, second))
-    return type(first)(*(dr.concat(channels) for channels in zip(first, second, strict=True)))
+def joined(first, second):
+    """The lanes of one array and then those of another; to be evaluated by the caller.
+
+    ``dr.concat`` holds the number of lanes in its kernel, which is then compiled anew for every one.
+    """
+    if dr.depth_v(first) > 1:
+        return type(first)(*(joined(x, y) for x, y in zip(first, second, strict=True)))
+    before, after = dr.width(first), dr.width(second)
+    both = dr.zeros(type(first), before + after)
+    for part, count, start in ((first, before, 0), (second, after, before)):
+        if count:
+            dr.scatter(both, part, dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start))
+    return both
 
 
 @dataclass

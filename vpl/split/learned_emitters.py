@@ -21,7 +21,7 @@ from .facing import WAYS, facing, facing_of
 
 # Regions of the environment, and columns of the table that they are made from
 _REGIONS, _COLUMNS = 256, 512
-# Share of the samples for which every emitter has the same probability
+# Share of the samples for which emitters have the probability that they have in Mitsuba
 _UNIFORM_SHARE = 0.3
 # Rays from a site to each emitter and region; how many of them all sites may have together
 _RAYS_EACH, _MOST_RAYS = 2, 1 << 20
@@ -59,7 +59,8 @@ class Sites:
     def around(cls, position: np.ndarray, normal: np.ndarray, most: int) -> tuple[Sites, np.ndarray]:
         """(Sites of vertices (n, 3), the site of each): at most ``most``, numbered from 1."""
         low, high = np.quantile(position, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
-        longest = max(float((high - low).max()), np.finfo(np.float32).tiny)
+        # Not so small that cubes have no size in single precision
+        longest = max(float((high - low).max()), 1e-6 * float(np.abs([low, high]).max()), 1e-30)
         for cubes in range(_FINEST_GRID, 0, -1):
             size = longest / cubes
             resolution = np.maximum(np.ceil((high - low) / size), 1).astype(np.int64)
@@ -75,7 +76,7 @@ class Sites:
     def at(self, position, normal):
         """The site of each position, for vertices that face ``normal``."""
         cell = [
-            mi.UInt32(dr.clip((x - low) / self.size, 0, mi.Float(count - 1)))
+            mi.UInt32(dr.fmin(dr.fmax((x - low) / self.size, 0), mi.Float(count - 1)))
             for x, low, count in zip(position, self.low, self.resolution, strict=True)
         ]
         cube = (cell[2] * self.resolution.y + cell[1]) * self.resolution.x + cell[0]
@@ -83,7 +84,8 @@ class Sites:
 
 
 class LearnedEmitters:
-    """The choice of emitters by site; before :meth:`learn`, every emitter has the same probability everywhere."""
+    """The choice of emitters by site; before :meth:`learn`, every emitter has the same probability everywhere, or
+    that of its ``sampling_weight``."""
 
     def __init__(self, scene):
         self._scene, self._emitters = scene, scene.emitters_dr()
@@ -98,10 +100,13 @@ class LearnedEmitters:
         numbers[registry] = np.arange(self._count)
         self._number_of = upload(mi.UInt32, numbers)
         self._sites = Sites.none()
-        alike = np.zeros(self._sources)
-        alike[: self._count] = 1 / self._count
+        # Emitters with a weight of 0 are never sampled, as in Mitsuba
+        weight = np.array([emitter.sampling_weight() for emitter in scene.emitters()])
+        self._alike = np.zeros(self._sources)
+        self._alike[: self._count] = weight / weight.sum()
+        self._never = np.flatnonzero(weight == 0)
         # Twice, because arrays of one entry make other kernels
-        self._use(np.stack([alike, alike]))
+        self._use(np.stack([self._alike, self._alike]))
 
     def _use(self, probability: np.ndarray) -> None:
         """``probability`` (sites, sources) float64 of each source; rows sum to 1."""
@@ -148,6 +153,7 @@ class LearnedEmitters:
     def _shares(self, unoccluded: np.ndarray, seen: np.ndarray) -> np.ndarray:
         """Probabilities (sites + 1, sources) by root mean squares of what arrived; first where nothing is known."""
         possible = np.nan_to_num(unoccluded, posinf=0) ** 2
+        possible[:, self._never] = 0
         if self._regions:
             # Its regions stand for the environment
             possible[:, self._environment_number] = 0
@@ -155,10 +161,8 @@ class LearnedEmitters:
         visible = found.sum((1, 2)) / np.maximum(possible.sum((1, 2)), np.finfo(np.float64).tiny)
         power = (found + _PRIOR / _RAYS_EACH * visible[:, None, None] * possible).mean(2) ** 0.5
         total = power.sum(1, keepdims=True)
-        alike = np.zeros(self._sources)
-        alike[: self._count] = 1 / self._count
-        learned = np.where(total > 0, power / np.maximum(total, np.finfo(np.float64).tiny), alike)
-        return np.concatenate([alike[None], (1 - _UNIFORM_SHARE) * learned + _UNIFORM_SHARE * alike])
+        learned = np.where(total > 0, power / np.maximum(total, np.finfo(np.float64).tiny), self._alike)
+        return np.concatenate([self._alike[None], (1 - _UNIFORM_SHARE) * learned + _UNIFORM_SHARE * self._alike])
 
     # ---------------------- Sampling ----------------------
 

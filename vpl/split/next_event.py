@@ -93,14 +93,15 @@ class TreeEmitters:
         self._directional = DeviceLights(emitters.directional) if emitters.directional.count else None
         self._distant = emitters.directional.count + (self._environment is not None)
         sphere = bounding_sphere(scene)
-        self._share = 1.0
+        self._share = mi.Float(1)
         if self._distant:
             # By what would arrive if nothing was between, from half way to the edge of the scene
             near = float(intensity.sum(dtype=np.float64)) / (0.5 * float(sphere.radius)) ** 2
             distant = float(emitters.directional.intensity.mean(1).sum(dtype=np.float64))
             if self._environment is not None:
                 distant += solid_angle_radiance(self._environment, sphere.center)
-            self._share = float(np.clip(near / max(near + distant, 1e-30), _LEAST_SHARE, 1 - _LEAST_SHARE))
+            share = float(np.clip(near / max(near + distant, 1e-30), _LEAST_SHARE, 1 - _LEAST_SHARE))
+            self._share = dr.opaque(mi.Float, share)
 
     @staticmethod
     def located(emitters: Emitters) -> int:
@@ -156,7 +157,7 @@ class TreeEmitters:
             density = dr.select(facing, ds.pdf * probability, density)
         if self._distant:
             one = (1 - self._share) / self._distant
-            index = mi.UInt32((chosen - self._share) / one)
+            index = mi.UInt32(dr.maximum(chosen - self._share, 0) / one)
             last = mi.UInt32(self._distant - 1)
             index = dr.minimum(index, last)
             if self._environment is not None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import channel_mean, ones, select_record
+from ..core.arrays import LARGEST_VALUE, channel_mean, ones, select_record
 from ..direct.emitter_sampling import power_heuristic
 from ..lights.perturbed import Perturbed
 from .floors import agrees, carried_share, floor_of, side_of
@@ -24,7 +24,9 @@ from .gather_vertices import Arrival, GatherVertices
 
 # Where a path is: before its first vertex with a floor; on its way from one where lights are gathered to the next
 # vertex; and anywhere else
-SEEKING, CONNECTING, PAST = range(3)
+SEEKING, CONNECTING, PAST = range(1, 4)
+# Where lights are gathered: the last state in which floors are looked at
+NOWHERE, AT_FIRST, EVERYWHERE = 0, CONNECTING, PAST
 # No path is ended with more than this probability because little is left of it: what is left is known only roughly
 _LEAST_SURVIVAL = 0.02
 
@@ -32,7 +34,7 @@ _LEAST_SURVIVAL = 0.02
 @dataclass
 class Limits:
     """``max_depth`` (edges), ``rr_depth``: as in ``path``, UInt32; ``squared_c``: of the split, world units²;
-    ``again``: whether lights are gathered after the first vertex, too; all opaque.
+    ``gathering``: where lights are gathered, NOWHERE, AT_FIRST or EVERYWHERE; all opaque.
 
     ``perturbed``: shapes without a floor; ``hide_emitters``: of Python.
     """
@@ -40,7 +42,7 @@ class Limits:
     max_depth: object
     rr_depth: object
     squared_c: object
-    again: object
+    gathering: object
     perturbed: Perturbed
     hide_emitters: bool
 
@@ -153,7 +155,7 @@ def _follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits)
         goes_on = active & si.is_valid() & (depth + 1 < limits.max_depth) & ~hidden
         flags, side = bsdf.flags(), side_of(si)
         smooth = goes_on & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-        floor = floor_of(si, bsdf, side, limits.perturbed, smooth & (limits.again | (state <= CONNECTING)))
+        floor = floor_of(si, bsdf, side, limits.perturbed, smooth & (limits.gathering >= state))
         w = carried_share(limits.squared_c, cosine, dr.abs(dr.dot(si.n, ray.d)), dr.square(si.t))
         # Lights at x2 shine to where its shading normal faces, too
         connects = smooth & (state == CONNECTING) & agrees(si, side)
@@ -174,9 +176,11 @@ def _follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits)
 
         # ---------------------- A vertex where lights are gathered ----------------------
         seeks = smooth & (state == SEEKING)
-        gathers = (seeks | (smooth & limits.again)) & agrees(si, side) & (dr.max(floor) > 0)
+        gathers = (seeks | (smooth & (limits.gathering == EVERYWHERE))) & agrees(si, side) & (dr.max(floor) > 0)
         gathers &= depth + 2 < limits.max_depth
-        weight = dr.select(gathers, throughput * floor - carried, 0)
+        weight = throughput * floor - carried
+        gathers &= dr.all(dr.abs(weight) <= LARGEST_VALUE)
+        weight = dr.select(gathers, weight, 0)
         here = GatherVertices(si.p, si.sh_frame.n * side, si.n, weight, depth + 1)
         vertices = select_record(seeks, here, vertices)
         amount = dr.select(gathers & ~seeks, channel_mean(dr.abs(weight)), 0)
@@ -221,9 +225,11 @@ def _follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits)
         depth += dr.select(goes_on, 1, 0)
 
         # ---------------------- Russian roulette: as in `path`, and by what is left ----------------------
-        survival = dr.minimum(dr.max(dr.abs(throughput)) * dr.square(eta), 0.95)
+        # Where a BSDF is 0 its floor may still have to be taken off
+        most = dr.maximum(dr.max(dr.abs(throughput)), dr.max(dr.abs(carried)))
+        survival = dr.minimum(most * dr.square(eta), 0.95)
         survival = kept * dr.select(depth >= limits.rr_depth, survival, 1)
-        active = goes_on & (dr.max(dr.abs(throughput)) > 0) & (sampler.next_1d() < survival)
+        active = goes_on & (most > 0) & (sampler.next_1d() < survival)
         throughput /= survival
         carried /= survival
         if dr.hint(limits.hide_emitters, mode="scalar"):
