@@ -14,7 +14,7 @@ from vpl.core.stages import Stage
 from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.points.camera_paths import SceneTraits
-from vpl.split.balance import Balance, balance, without_lights
+from vpl.split.balance import Balance, balance, noise, without_lights
 from vpl.split.gather_vertices import drawn_later, joined
 from vpl.split.next_event import emitters_of
 from vpl.split.numbers import spread_numbers
@@ -195,9 +195,20 @@ class ManyLightsIntegrator(GatheringIntegrator):
         apart = max(view.count // pairs // 2 * 2, 2)
         lane = np.minimum(np.arange(pairs)[:, None] * apart + [0, 1], view.count - 1).reshape(-1)
         lanes, limits = upload(mi.UInt32, lane), self._limits(view, _WHOLE, self.max_depth, AT_FIRST)
-        found, vertices, _, arrival = view.follow(lanes, limits, 1)
-        pilot = Pilot.of(found, vertices, arrival, lane // view.samples)
-        view.emission.learn(*pilot.vertices, int(_LEARNING_SHARE * view.count), derived_seed(view.seed, 6))
+
+        def followed() -> Pilot:
+            found, vertices, _, arrival = view.follow(lanes, limits, 1)
+            return Pilot.of(found, vertices, arrival, lane // view.samples)
+
+        pilot = followed()
+        rays = int(_LEARNING_SHARE * view.count)
+        if not view.emission.learn(*pilot.vertices, rays, derived_seed(view.seed, 6)):
+            return pilot
+        brightness, again = pilot.nearby(pilot.radiance, view.width, pilot.pixel), followed()
+        if noise(again.radiance, brightness) < noise(pilot.radiance, brightness):
+            return again
+        # Where shadows are small, or gloss is what is noisy, sites may mislead
+        view.emission.forget()
         return pilot
 
     def _balance(self, view: View, pilot: Pilot) -> Balance:

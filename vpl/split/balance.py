@@ -50,8 +50,8 @@ def balance(radiance: np.ndarray, indirect: np.ndarray, brightness: np.ndarray, 
     """
     if not indirect.any():
         return without_lights("no light comes by way of surfaces that virtual lights could stand for")
-    noise, direct = _noise(radiance, brightness), _noise(radiance - indirect, brightness)
-    share = max(1 - direct / max(noise, np.finfo(np.float64).tiny), 0.0)
+    whole, direct = noise(radiance, brightness), noise(radiance - indirect, brightness)
+    share = max(1 - direct / max(whole, np.finfo(np.float64).tiny), 0.0)
     # Relative variance of what a path from the camera brings by way of lights
     spread = len(indirect) * np.sum(indirect**2) / np.sum(indirect) ** 2
     wanted = np.clip(spread / _SET_ERROR**2, _SHARES[0] * paths, _SHARES[1] * paths)
@@ -62,7 +62,7 @@ def balance(radiance: np.ndarray, indirect: np.ndarray, brightness: np.ndarray, 
             f"virtual lights would cost as much as {cost / paths:.2g} of the paths and save {share:.0%} of them"
         )
     # The least of (noise of paths / samples + noise of cuts / rays) × (samples + rays × their cost)
-    rest = noise * (1 - _GAIN * share)
+    rest = whole * (1 - _GAIN * share)
     rays = samples * np.clip((_CUT_NOISE / (_RAY_COST * max(rest, 1e-9))) ** 0.5, *_RAYS)
     error = float(np.clip(_ERROR * (rays / _RAYS_AT_ERROR) ** -_SLOPE, _FINEST, _COARSEST))
     vertices = int(np.clip(samples // _SAMPLES_A_VERTEX, 1, _MOST_VERTICES))
@@ -74,9 +74,9 @@ def without_lights(reason: str) -> Balance:
     return Balance(0, 0.0, 0, reason)
 
 
-def _noise(values: np.ndarray, brightness: np.ndarray) -> float:
-    """Variance of a path, from the two of each pixel, relative to brightness, as images are judged: without the worst,
-    and as if no place was black."""
+def noise(values: np.ndarray, brightness: np.ndarray) -> float:
+    """Variance of a path, from the ``values`` (n,) of two in each pixel, relative to ``brightness`` (n,), as images are
+    judged: without the worst, and as if no place was black."""
     count = len(values) // 2
     first, second = values[: 2 * count].astype(np.float64).reshape(-1, 2).T
     level = brightness[: 2 * count : 2] ** 2 + _BLACK * np.mean(brightness) ** 2

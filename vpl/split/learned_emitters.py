@@ -99,14 +99,12 @@ class LearnedEmitters:
         numbers = np.zeros(registry.max() + 2, np.int64)
         numbers[registry] = np.arange(self._count)
         self._number_of = upload(mi.UInt32, numbers)
-        self._sites = Sites.none()
         # Emitters with a weight of 0 are never sampled, as in Mitsuba
         weight = np.array([emitter.sampling_weight() for emitter in scene.emitters()])
         self._alike = np.zeros(self._sources)
         self._alike[: self._count] = weight / weight.sum()
         self._never = np.flatnonzero(weight == 0)
-        # Twice, because arrays of one entry make other kernels
-        self._use(np.stack([self._alike, self._alike]))
+        self.forget()
 
     def _use(self, probability: np.ndarray) -> None:
         """``probability`` (sites, sources) float64 of each source; rows sum to 1."""
@@ -116,12 +114,18 @@ class LearnedEmitters:
 
     # ---------------------- Learning ----------------------
 
-    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> None:
-        """Learn from vertices, (n, 3) each, with about so many rays at most."""
+    def forget(self) -> None:
+        """Know nothing of any place."""
+        self._sites = Sites.none()
+        # Twice, because arrays of one entry make other kernels
+        self._use(np.stack([self._alike, self._alike]))
+
+    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> bool:
+        """Learn from vertices, (n, 3) each, with about so many rays at most: whether anything was learned."""
         each = _RAYS_EACH * self._sources
         most = min(rays, _MOST_RAYS) // each
         if most < 1 or len(position) == 0:
-            return
+            return False
         self._sites, site = Sites.around(position, normal, most)
         size = np.bincount(site)[1:]
         order, sites = np.argsort(site, kind="stable"), len(size)
@@ -138,6 +142,7 @@ class LearnedEmitters:
             download(x).astype(np.float64).reshape(sites, self._sources, _RAYS_EACH) for x in (unoccluded, seen)
         )
         self._use(self._shares(unoccluded, seen))
+        return True
 
     def _looks(self, positions, normals, vertex, source, sampler):
         """(Irradiance that a source would give a vertex by one sample if nothing was between, whether nothing is)."""

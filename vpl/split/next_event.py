@@ -44,8 +44,9 @@ class UniformEmitters:
     def __init__(self, scene):
         self._scene = scene
 
-    def learn(self, position, normal, rays: int, seed: int) -> None:
+    def learn(self, position, normal, rays: int, seed: int) -> bool:
         """There is nothing to learn."""
+        return False
 
     def site(self, si, side):
         """Where the choice is a choice of its own: everywhere the same."""
@@ -120,8 +121,9 @@ class TreeEmitters:
         by_tree = self._tree.probability(row, position, active)
         return self._share * ((1 - _UNIFORM_SHARE) * by_tree + _UNIFORM_SHARE / self._tree.count)
 
-    def learn(self, position, normal, rays: int, seed: int) -> None:
+    def learn(self, position, normal, rays: int, seed: int) -> bool:
         """As :meth:`UniformEmitters.learn`."""
+        return False
 
     def site(self, si, side):
         """As :meth:`UniformEmitters.site`."""
