@@ -144,3 +144,13 @@ class Chromium:
             self._buffer += received
         message, _, self._buffer = self._buffer.partition(b"\0")
         return json.loads(message)
+
+
+def choose(page, selector, value):
+    """Choose as a person would, and wait until it is painted."""
+    before = page.value("document.querySelector('.stage').dataset.painted")
+    page.value(
+        f"(() => {{ const e = document.querySelector('{selector}'); e.value = '{value}'; "
+        "for (const type of ['input', 'change']) e.dispatchEvent(new Event(type)); })()"
+    )
+    page.wait(f"document.querySelector('.stage').dataset.painted > {before}")

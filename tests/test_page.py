@@ -115,16 +115,6 @@ def pixel(page, canvas, x, y):
     return page.value(code)
 
 
-def choose(page, selector, value):
-    """Choose as a person would, and wait until it is painted."""
-    before = page.value("document.querySelector('.stage').dataset.painted")
-    page.value(
-        f"(() => {{ const e = document.querySelector('{selector}'); e.value = '{value}'; "
-        "for (const type of ['input', 'change']) e.dispatchEvent(new Event(type)); })()"
-    )
-    page.wait(f"document.querySelector('.stage').dataset.painted > {before}")
-
-
 def shown(page):
     """The names in the corners, and where the cut between the pictures is, as a share of the stage."""
     names = page.value("['left', 'right'].map((side) => document.querySelector(`.badge.${side} b`).textContent)")
@@ -136,8 +126,8 @@ def shown(page):
 
 
 def test_pictures_are_those_of_the_files(page, swept):
-    choose(page, ".a", 1)
-    choose(page, ".b", 0)
+    chromium.choose(page, ".a", 1)
+    chromium.choose(page, ".b", 0)
     for canvas, name in ((".under", "path.spp=1"), (".over", "reference")):
         expected = images.read_png(swept / f"cornell.{name}.png").astype(int)
         for x, y in ((3, 4), (12, 8), (20, 20)):
@@ -146,8 +136,8 @@ def test_pictures_are_those_of_the_files(page, swept):
 
 def test_exposure_works_on_the_linear_values(page, swept):
     exposure = results_of(swept)["scenes"][0]["pictures"]["exposure"]
-    choose(page, ".a", 1)
-    choose(page, ".exposure", -7)
+    chromium.choose(page, ".a", 1)
+    chromium.choose(page, ".exposure", -7)
     image = images.colour(*images.read_exr(swept / "cornell.path.spp=1.seed0.exr")[:2])
     expected = images.tone_map(image, exposure / 2**7).astype(int)
     lamp = np.unravel_index(image.sum(axis=-1).argmax(), image.shape[:2])
@@ -155,19 +145,19 @@ def test_exposure_works_on_the_linear_values(page, swept):
         np.testing.assert_allclose(pixel(page, ".under", x, y), expected[y, x], atol=2)
     clipped = images.read_png(swept / "cornell.path.spp=1.png")[lamp]
     assert clipped.max() == 255 > expected[lamp].min()
-    choose(page, ".exposure", 0)
+    chromium.choose(page, ".exposure", 0)
 
 
 def test_errors_are_shown(page, swept):
-    choose(page, ".a", 1)
-    choose(page, ".kind", "relative")
+    chromium.choose(page, ".a", 1)
+    chromium.choose(page, ".kind", "relative")
     expected = images.read_png(swept / "cornell.path.spp=1.error.png").astype(int)
     for x, y in ((3, 4), (12, 8), (20, 20)):
         np.testing.assert_allclose(pixel(page, ".under", x, y), expected[y, x], atol=4)
     for kind in ("signed", "distance", "flip"):
-        choose(page, ".kind", kind)
+        chromium.choose(page, ".kind", kind)
         assert shown(page)[0][0] == f"path spp=1: {kind}"
-    choose(page, ".kind", "image")
+    chromium.choose(page, ".kind", "image")
 
 
 def test_the_split_is_dragged(page):
@@ -184,8 +174,8 @@ def test_the_split_is_dragged(page):
 
 
 def test_a_click_flips(page):
-    choose(page, ".a", 1)
-    choose(page, ".b", 0)
+    chromium.choose(page, ".a", 1)
+    chromium.choose(page, ".b", 0)
     page.click(".flip")
     assert shown(page) == (["", "reference"], 0)
     page.click(".flip")

@@ -74,16 +74,6 @@ def texts(page, selector, within=0):
     return page.value(code)
 
 
-def choose(page, selector, value):
-    """Choose as a person would, and wait until it is painted."""
-    before = page.value("document.querySelector('.stage').dataset.painted")
-    page.value(
-        f"(() => {{ const e = document.querySelector('{selector}'); e.value = '{value}'; "
-        "for (const type of ['input', 'change']) e.dispatchEvent(new Event(type)); })()"
-    )
-    page.wait(f"document.querySelector('.stage').dataset.painted > {before}")
-
-
 def place(page, x, y):
     """The place in the window of a pixel of the first scene's pictures, where nothing is zoomed."""
     page.centre(".stage")
@@ -100,8 +90,8 @@ def test_badges_have_the_errors(page):
 
 def test_values_are_shown_under_the_pointer(page, report_page):
     _, reference, bright = report_page
-    choose(page, ".a", 0)
-    choose(page, ".kind", "signed")
+    chromium.choose(page, ".a", 0)
+    chromium.choose(page, ".kind", "signed")
     page.move(*place(page, 3, 5))
     page.wait("/^x 3, y 5/.test(document.querySelector('.readout').textContent)")
     text = texts(page, ".readout")[0]
@@ -125,7 +115,7 @@ def test_numbers_choose_pictures(page):
 
 
 def test_arrows_go_through_scenes_and_keep_what_is_shown(page):
-    choose(page, ".kind", "relative")
+    chromium.choose(page, ".kind", "relative")
     page.press("1")
     wait_for_badges(page, "reference", "")
     page.click(".stage")
@@ -166,8 +156,8 @@ def average(page, index):
 
 
 def test_signed_errors_show_bias(page):
-    choose(page, ".kind", "signed")
-    choose(page, ".exposure", 2)
+    chromium.choose(page, ".kind", "signed")
+    chromium.choose(page, ".exposure", 2)
     page.click("button.all")
     page.wait("document.querySelector('.tiles').dataset.drawn")
     red, _, blue = average(page, 2)
@@ -177,24 +167,24 @@ def test_signed_errors_show_bias(page):
 
 def test_exposure_acts_on_errors_or_is_hidden(page):
     hidden = "document.querySelector('.of-exposure').hidden"
-    choose(page, ".kind", "relative")
+    chromium.choose(page, ".kind", "relative")
     assert texts(page, ".bar output") == ["100%", "", "1%"] and not page.value(hidden)
     colour = "[...document.querySelector('.over').getContext('2d').getImageData(3, 4, 1, 1).data].slice(0, 3)"
     page.press("3")
-    choose(page, ".exposure", 0)
+    chromium.choose(page, ".exposure", 0)
     before = page.value(colour)
     np.testing.assert_allclose(before, images.palette(np.array(np.log(0.1 / 0.01) / np.log(100))), atol=12)
-    choose(page, ".exposure", 2)
+    chromium.choose(page, ".exposure", 2)
     assert sum(page.value(colour)) > sum(before) + 100
     assert texts(page, ".bar output") == ["25%", "", "0.25%"]
-    choose(page, ".kind", "flip")
+    chromium.choose(page, ".kind", "flip")
     assert page.value(hidden) and texts(page, ".bar output") == ["1", "", "0"]
-    choose(page, ".kind", "image")
+    chromium.choose(page, ".kind", "image")
     assert page.value("document.querySelector('.bar').hidden")
 
 
 def test_the_bar_is_as_high_as_the_picture(page):
-    choose(page, ".kind", "relative")
+    chromium.choose(page, ".kind", "relative")
     heights = page.value("['.stage', '.bar'].map((name) => document.querySelector(name).offsetHeight)")
     assert heights[0] == heights[1] > 200
 
