@@ -204,7 +204,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         rays = int(_LEARNING_SHARE * view.count)
         if not view.emission.learn(*pilot.vertices, rays, derived_seed(view.seed, 6)):
             return pilot
-        brightness, again = pilot.nearby(pilot.radiance, view.width, pilot.pixel), followed()
+        brightness, again = pilot.brightness(view.width), followed()
         if noise(again.radiance, brightness) < noise(pilot.radiance, brightness):
             return again
         # Where shadows are small, or gloss is what is noisy, sites may mislead
@@ -219,8 +219,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
             return without_lights("no light is indirect at this max_depth")
         if view.perturbed.everywhere:
             return without_lights("bump or normal maps are in shape groups")
-        brightness = pilot.nearby(pilot.radiance, view.width, pilot.pixel)
-        return balance(pilot.radiance, pilot.indirect, brightness, view.count, view.samples)
+        return balance(pilot.radiance, pilot.indirect, pilot.brightness(view.width), view.count, view.samples)
 
     def _lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> LightSet | None:
         """Virtual lights and their tree; None where there are none."""

@@ -42,7 +42,7 @@ class _Last:
 _last = _Last()
 
 
-def regions_of(environment, count: int, most_columns: int) -> EnvironmentRegions:
+def regions_of(environment, count: int, most_columns: int = _LARGEST_WIDTH) -> EnvironmentRegions:
     """Regions of an environment: those of the last call where nothing has changed since."""
     key = mi.variant(), count, most_columns, _fingerprint(environment)
     if _last.key != key:

@@ -21,7 +21,7 @@ from ..lights.emitters import Emitters
 from ..lights.virtual_lights import DeviceLights, VirtualLights, geometry
 from .emitter_clusters import build_cluster_forest
 from .emitter_pieces import EmitterPieces
-from .environment_regions import EnvironmentRegions
+from .environment_regions import regions_of
 
 # In place of the radius of a node that has no place
 RADIUS_AT_INFINITY = -1.0
@@ -96,7 +96,7 @@ class Sources:
         self.emitters = emitters
         self._reach = 2 * float(bounding_sphere(scene).radius)
         self._pieces = EmitterPieces(scene, emitters.area)
-        self._regions = None if emitters.environment is None else EnvironmentRegions(emitters.environment, regions)
+        self._regions = None if emitters.environment is None else regions_of(emitters.environment, regions)
         self._others = [emitter for _, emitter in emitters.others]
         counts = (
             emitters.points.count, emitters.spots.count, self._pieces.count, emitters.directional.count,

@@ -61,17 +61,18 @@ class Sites:
         low, high = np.quantile(position, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
         # Not so small that cubes have no size in single precision
         longest = max(float((high - low).max()), 1e-6 * float(np.abs([low, high]).max()), 1e-30)
+        way = facing(normal)
         for cubes in range(_FINEST_GRID, 0, -1):
             size = longest / cubes
             resolution = np.maximum(np.ceil((high - low) / size), 1).astype(np.int64)
             cell = np.clip(np.floor((position - low) / size), 0, resolution - 1).astype(np.int64)
-            key = ((cell[:, 2] * resolution[1] + cell[:, 1]) * resolution[0] + cell[:, 0]) * WAYS + facing(normal)
-            known, site = np.unique(key, return_inverse=True)
-            if len(known) <= most or cubes == 1:
+            key = ((cell[:, 2] * resolution[1] + cell[:, 1]) * resolution[0] + cell[:, 0]) * WAYS + way
+            known = np.zeros(WAYS * resolution.prod(), bool)
+            known[key] = True
+            if np.count_nonzero(known) <= most:
                 break
-        table = np.zeros(WAYS * resolution.prod(), np.int64)
-        table[known] = np.arange(1, len(known) + 1)
-        return cls._of(low, size, resolution, table), site + 1
+        table = np.where(known, np.cumsum(known), 0)
+        return cls._of(low, size, resolution, table), table[key]
 
     def at(self, position, normal):
         """The site of each position, for vertices that face ``normal``."""

@@ -55,6 +55,10 @@ class Pilot:
         vertices = tuple(np.concatenate(x) for x in ((first[seen], position[arrived]), (facing[seen], normal[arrived])))
         return cls(arrivals, vertices, pixel, radiance, indirect)
 
+    def brightness(self, width: int) -> np.ndarray:
+        """Mean radiance of the tile of each path, (n,)."""
+        return self.nearby(self.radiance, width, self.pixel)
+
     def nearby(self, values: np.ndarray, width: int, pixels: np.ndarray) -> np.ndarray:
         """Mean of the paths' ``values`` in the tile that each of some pixels is in, in an image so many pixels wide."""
         tiles, of_path = _tile(pixels, width), _tile(self.pixel, width)
