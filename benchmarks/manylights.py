@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -54,35 +55,48 @@ print(time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_m
 """
 
 
-def load(name: str, sampler: str, width: int):
-    """A scene with a sampler of its own kind in place of what its file says."""
+def load(name: str, width: int):
+    """A scene with a sensor for each of SAMPLERS.
+
+    One scene for all: kernels hold the code of all scenes that are alive, and are recorded at every render.
+    """
     file = scenes.scene_file(name)
     mi.file_resolver().prepend(str(file.parent))
-    text = file.read_text().replace('<sampler type="independent"', f'<sampler type="{sampler}"')
+    text = file.read_text()
+    sensor = re.search(r"<sensor.*?</sensor>", text, re.DOTALL).group()
+    other = sensor.replace('<sampler type="independent"', f'<sampler type="{SAMPLERS[1]}"')
+    # Names may be there once
+    other = re.sub(r' id="[^"]*"', "", other)
+    text = text.replace(sensor, f"{sensor}\n{other}")
     return mi.load_string(text, resx=str(width), resy=str(scenes.height(name, width)))
 
 
 class Rival:
     """One integrator with one sampler on one scene: its passes, of about the same time."""
 
-    def __init__(self, name: str, kind: str, sampler: str, width: int, seconds: float):
+    def __init__(self, name: str, scene, kind: str, sampler: str, width: int, seconds: float):
         self.kind, self.sampler, self.images, self.seconds = kind, sampler, [], []
-        self.scene = load(name, sampler, width)
+        self.scene, self.sensor = scene, SAMPLERS.index(sampler)
         self.integrator = mi.load_dict({"type": kind, "max_depth": DEPTH})
-        # Squares, as `multijitter` has them; what a pass costs besides its samples is known from two sizes
+        # What a pass costs besides its samples is known from two sizes
         most = int((LARGEST_PASS / (width * scenes.height(name, width))) ** 0.5)
         side, times = min(8, most), []
         for self.spp in (16, 16, side**2, side**2):
             times.append(self.render(0)[1])
         each = max(times[-1] - times[1], 0.1 * times[-1]) / max(side**2 - 16, 1)
         wanted = side**2 + (seconds - times[-1]) / each
-        self.spp = min(max(round(max(wanted, 16) ** 0.5), 4), most) ** 2
+        if sampler == "multijitter":
+            # Squares, as it has them
+            self.spp = min(max(round(max(wanted, 16) ** 0.5), 4), most) ** 2
+        else:
+            # Powers of two, of which Sobol' numbers fill strata
+            self.spp = 2 ** min(max(round(np.log2(max(wanted, 16))), 4), int(np.log2(most**2)))
         self.render(0)
 
     def render(self, seed: int):
         """(An image, float64, and its seconds)."""
         image, seconds = scenes.timed(
-            lambda: mi.render(self.scene, integrator=self.integrator, spp=self.spp, seed=seed)
+            lambda: mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=self.spp, seed=seed)
         )
         return np.array(image, np.float64)[..., :3], seconds
 
@@ -125,7 +139,8 @@ def product(names, width: int, seconds: float, passes: int) -> None:
     print(f"{'scene':16s} {'path':>22s} {'manylights':>22s}   ratio   bias                sets")
     ratios = []
     for name in names:
-        rivals = [Rival(name, kind, sampler, width, seconds) for kind in KINDS for sampler in SAMPLERS]
+        scene = load(name, width)
+        rivals = [Rival(name, scene, kind, sampler, width, seconds) for kind in KINDS for sampler in SAMPLERS]
         for number in range(passes):
             for rival in rivals:
                 rival.measure(100 + number)
@@ -158,7 +173,8 @@ def denoised(names, width: int, seconds: float, passes: int) -> None:
         if scenes.reference_file(name) is None:
             print(f"skipped {name}: it has no reference")
             continue
-        rivals = [Rival(name, kind, "multijitter", width, seconds) for kind in KINDS]
+        scene = load(name, width)
+        rivals = [Rival(name, scene, kind, "multijitter", width, seconds) for kind in KINDS]
         for number in range(passes):
             for rival in rivals:
                 rival.measure(100 + number)

@@ -51,14 +51,15 @@ NAMES = ("cornell", "kitchen", "sponza_crytek", "dining_room", "bistro_interior"
 VEILS, VEILS_DEPTH = (0, 8, 16, 32), 80
 STEPS = {
     "all": {},
-    "no prediction": {"steps": "separation,correction"},
-    "no separation": {"steps": "nearest,linear,bayes"},
-    "no correction": {"steps": "nearest,linear,bayes,separation"},
+    "no prediction": {"steps": "separation,correction,largest"},
+    "no separation": {"steps": "nearest,linear,bayes,largest"},
+    "no correction": {"steps": "nearest,linear,bayes,separation,largest"},
+    "largest predicted": {"steps": "nearest,linear,bayes,separation,correction"},
     "no columns split": {"alpha": 1.0},
     "light separated": {},
-    "nearest only": {"steps": "nearest,separation,correction"},
-    "linear only": {"steps": "linear,separation,correction"},
-    "bayes only": {"steps": "bayes,separation,correction"},
+    "nearest only": {"steps": "nearest,separation,correction,largest"},
+    "linear only": {"steps": "linear,separation,correction,largest"},
+    "bayes only": {"steps": "bayes,separation,correction,largest"},
 }
 
 

@@ -6,6 +6,10 @@ papers.
 That imports this package, which registers them for the current variant, and again whenever ``mi.set_variant`` changes
 it; and it finds out whether another module of the same name is in the way.  They exist for the vectorised ``*_rgb`` and
 ``*_mono`` variants; elsewhere loading one fails with an error that says so.
+
+Mitsuba 3.10 will do without the import: for each variant it imports or reloads the modules that the entry points of the
+group ``mitsuba`` name, in the order of their names, among all that call ``mi.set_variant``.  Ours are the plugins' own
+modules, each of which registers its plugin.  Whichever of the two is the last, all classes are of the variant then.
 """
 
 from __future__ import annotations
@@ -42,22 +46,10 @@ VARIANTS = (
 )
 
 
-def _refuse(name: str, variant: str):
-    def plugin(props):
-        raise RuntimeError(
-            f'the integrator "{name}" does not support the variant "{variant}": choose one of {", ".join(VARIANTS)}'
-        )
-
-    return plugin
-
-
 def _register(_old: str | None, variant: str) -> None:
     """Register all plugins for ``variant``; classes are made anew because their base class belongs to the variant."""
-    if variant not in VARIANTS:
-        for name in PLUGINS:
-            mi.register_integrator(name, _refuse(name, variant))
-        return
-    check_backend(variant)
+    if variant in VARIANTS:
+        check_backend(variant)
     for name in ("gathering", "bands", "common", "direct", *PLUGINS):
         full_name = f"{__name__}.{name}"
         if full_name in sys.modules:

@@ -17,6 +17,7 @@ from vpl.core.stages import Stage
 from vpl.lights.emitters import Emitters, read_emitters
 from vpl.points.camera_paths import CameraPaths, PixelGrid, SceneTraits, follow_camera_rays, refuse_media, scene_traits
 
+from . import VARIANTS
 from .knobs import PATH_KNOBS, Integer, read_knobs, show_knobs
 
 # Of Mitsuba, whose own constructor does not show what it has read
@@ -103,6 +104,11 @@ class GatheringIntegrator(mi.SamplingIntegrator):
     knobs = PATH_KNOBS
 
     def __init__(self, props):
+        if mi.variant() not in VARIANTS:
+            raise RuntimeError(
+                f'the integrator "{props.plugin_name()}" does not support the variant "{mi.variant()}": choose one of '
+                f"{', '.join(VARIANTS)}"
+            )
         super().__init__(props)
         read_knobs(self, props)
         self.samples_per_pass = _SAMPLES_PER_PASS.read(self, props)

@@ -14,14 +14,15 @@ from vpl.core.stages import Stage
 from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.points.camera_paths import SceneTraits
-from vpl.split.balance import Balance, balance, noise, without_lights
+from vpl.split.balance import Balance, balance, importance, judged_by, noise, without_lights
 from vpl.split.gather_vertices import drawn_later, joined
 from vpl.split.next_event import emitters_of
-from vpl.split.numbers import spread_numbers
+from vpl.split.numbers import SpreadNumbers
 from vpl.split.pilot import Pilot
 from vpl.split.pixel_clusters import PixelClusters, light_clusters
 from vpl.split.remainder import AT_FIRST, EVERYWHERE, NOWHERE, FirstEdge, Limits, follow
 from vpl.split.surface_lights import surface_lights
+from vpl.split.worth import Worth
 from vpl.transport.evaluation import Transport
 
 from .gathering import Clock, GatheringIntegrator, add_statistics
@@ -48,7 +49,8 @@ _OPAQUE = SceneTraits(False, False, True, False, False, (), (), None)
 class View:
     """One call of ``sample``: the ``scene`` and how its emitters are sampled (``emission``), its shapes without a
     floor (``perturbed``); the camera's ``ray`` and which of them are ``active``, evaluated; ``width`` of the image and
-    ``samples`` of a pixel, which lie next to each other; ``seed``."""
+    ``samples`` of a pixel, which lie next to each other; ``seed``; ``importance`` of radiance in each pixel, and the
+    ``worth`` of paths (:mod:`vpl.split.worth`), once they are known."""
 
     scene: object
     emission: object
@@ -58,6 +60,8 @@ class View:
     width: int
     samples: int
     seed: int
+    importance: object
+    worth: Worth
 
     @property
     def count(self) -> int:
@@ -67,8 +71,9 @@ class View:
         """Follow the camera rays ``lane`` (UInt32): see :func:`vpl.split.remainder.follow`."""
         seed, ray = derived_seed(self.seed, *stream), self.ray
         part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
-        edge = FirstEdge.of_camera(part, dr.gather(mi.Bool, self.active, lane))
-        numbers = spread_numbers(lane, self.samples, derived_seed(seed, 0))
+        importance = dr.gather(mi.Float, self.importance, lane // dr.opaque(mi.UInt32, self.samples))
+        edge = FirstEdge.of_camera(part, importance, dr.gather(mi.Bool, self.active, lane))
+        numbers = SpreadNumbers(lane, self.samples, derived_seed(seed, 0))
         sampler = independent_sampler(derived_seed(seed, 1), dr.width(lane))
         return follow(self.scene, self.emission, edge, numbers, sampler, limits)
 
@@ -143,13 +148,16 @@ class ManyLightsIntegrator(GatheringIntegrator):
         ray.o, ray.d, ray.time = ray.o + wide, ray.d + wide, ray.time + wide
         active = mi.Bool(active) & dr.full(mi.Bool, True, count)
         dr.make_opaque(ray, active)
-        return View(scene, emitters_of(scene), Perturbed(scene), ray, active, grid.width, grid.samples, seed)
+        emission, alike = emitters_of(scene), dr.opaque(mi.Float, 1.0, -(-count // grid.samples))
+        size = grid.width, grid.samples
+        return View(scene, emission, Perturbed(scene), ray, active, *size, seed, alike, Worth.unknown())
 
     def _trace(self, view: View):
         """(Radiance of each camera ray, whether it is opaque in the film's alpha)."""
         clock, self.statistics = Clock(), {}
         pilot = self._pilot(view)
         chosen = self._balance(view, pilot)
+        self._judge(view, pilot, chosen)
         mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
         clock.lap(Stage.PILOT)
         lights = self._lights(view, pilot, chosen, clock)
@@ -187,7 +195,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
         longest = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF)))
         roulette = dr.opaque(mi.UInt32, rr_depth or self.rr_depth)
         gathers = dr.opaque(mi.UInt32, gathering)
-        return Limits(longest, roulette, dr.opaque(mi.Float, c**2), gathers, view.perturbed, self.hide_emitters)
+        return Limits(
+            longest, roulette, dr.opaque(mi.Float, c**2), gathers, view.worth, view.perturbed, self.hide_emitters
+        )
 
     def _pilot(self, view: View) -> Pilot:
         """The pilot, from which emitters are learned."""
@@ -221,13 +231,33 @@ class ManyLightsIntegrator(GatheringIntegrator):
             return without_lights("bump or normal maps are in shape groups")
         return balance(pilot.radiance, pilot.indirect, pilot.brightness(view.width), view.count, view.samples)
 
+    def _judge(self, view: View, pilot: Pilot, chosen: Balance) -> None:
+        """What it is worth to follow paths of a view."""
+        onward = pilot.onward
+        if len(onward.path) == 0:
+            return
+        worth, expected = Worth.of(onward.position, onward.normal, onward.sent)
+        brightness = pilot.brightness(view.width)
+        relative = onward.throughput / judged_by(brightness)[onward.path]
+        whole = noise(pilot.radiance, brightness)
+        multiple = importance(relative * expected, relative * onward.sent, onward.edges, len(pilot.radiance), whole)
+        if not np.isfinite(multiple):
+            return
+        if chosen.light_paths:
+            # The less noise there is besides, the more they are worth
+            multiple *= (whole / max(chosen.noise, 1e-9)) ** 0.5
+        self.statistics["worth"] = multiple
+        pixels = np.arange(-(-view.count // view.samples))
+        view.worth = worth
+        view.importance = upload(mi.Float, multiple / judged_by(pilot.nearby(pilot.radiance, view.width, pixels)))
+
     def _lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> LightSet | None:
         """Virtual lights and their tree; None where there are none."""
         if chosen.light_paths == 0:
             return None
         # The path from a light is shorter by the two edges between camera and light
         limits = self._limits(view, _WHOLE, self.max_depth - 2, NOWHERE, rr_depth=1)
-        limits.hide_emitters = False
+        limits.hide_emitters, limits.worth = False, Worth.unknown()
         made = surface_lights(
             view.scene, view.emission, pilot.arrivals, chosen.light_paths, limits, derived_seed(view.seed, 2)
         )  # fmt: skip

@@ -54,24 +54,27 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
 
     There is no bound on the error. One light stands for each cluster in a whole slice, which ``alpha`` holds small and
     averages out over seeds; slices show as blotches where ``alpha`` is large. What is predicted wrongly does not
-    average out, and most of it is light that is taken to be blocked. Beside all the same virtual lights, images of 64
-    to 256 pixels' width are darker by 0.2 to 0.5% in the Cornell box and a kitchen (blocks of 8 x 8 pixels by up to
-    11%, and brighter by up to 10%), by 2 to 4% in the scenes ``arcade``, ``banquet`` and ``kitchen_lamps``, and where
-    many small lamps each light a little of the scene far more: ``corridor`` and ``hall`` by 15 and 23% at 64 pixels,
-    by 7 and 8% at 256 (blocks by up to 65%). It is less the larger ``sampling`` is and the more points slices have.
-    Penumbrae are noisy, since predictors answer at random where they are not sure. The visibility of a light is one
-    number for all channels: what masks and thin glass tint arrives grey.
+    average out, and most of it is light that is taken to be blocked: where it arrives, near a lamp, are fewer of the
+    traced rows than where it does not. Beside all the same virtual lights, images of 64 pixels' width are brighter by
+    0.8% in the Cornell box, darker by 1 to 5% in the scenes ``arcade``, ``banquet`` and ``kitchen_lamps``, and where
+    many small lamps each light a little of the scene by more: ``hall`` by 6%, ``corridor`` by 12%, with
+    ``direct="vpl"`` by 20% (blocks of 8 x 8 pixels by up to 40%). What a pixel has most of its light from is traced
+    (step ``largest``), so what is lost is light of hundreds of clusters, each of them less than 3% of it. It is less
+    the larger ``sampling`` is and the more points slices have. Penumbrae are noisy, since predictors answer at random
+    where they are not sure. The visibility of a light is one number for all channels: what masks and thin glass tint
+    arrives grey.
 
     **Departures from the paper.** Visibility is separated, not light (see :mod:`vpl.matrix.recovery`), once for all
     channels, and every gather point is shaded exactly. Slices are halved at medians by the number of points
     (:mod:`vpl.points.slice_rows`). Clusters are split in rounds, and lend their samples to those beside them along the
     light tree (:mod:`vpl.matrix.reduced_columns`); ``alpha`` is a tenth of the paper's, with which slices have 200
     columns here rather than its 700; entries are traced where 65% of those around them are wrong instead of 20%, for
-    errors lie denser here. Rows that are traced follow each other by golden sections instead of being drawn at random
-    (:mod:`vpl.matrix.visibility_samples`). Nearest rows are found by looking at all samples of a column, and the line
-    of the linear predictor lies in the slice's plane (:mod:`vpl.matrix.visibility_prediction`). Where the separation of
-    a slice fails, all entries of the columns in question are traced, and the slice is counted. Lambertian points and
-    all others are in slices of their own.
+    errors lie denser here, and at last, which the paper does not do, where they may be more than 3% of the light of
+    their pixel. Clusters of whose samples none is lit may be split all the same. Rows that are traced follow
+    each other by golden sections instead of being drawn at random (:mod:`vpl.matrix.visibility_samples`). Nearest rows
+    are found by looking at all samples of a column, and the line of the linear predictor lies in the slice's plane
+    (:mod:`vpl.matrix.visibility_prediction`). Where the separation of a slice fails, all entries of the columns in
+    question are traced, and the slice is counted. Lambertian points and all others are in slices of their own.
 
     .. tabs::
         .. code-tab:: xml
@@ -128,7 +131,8 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
             "by a line between light and shadow, by the same row in nearby columns, each column by the best of those "
             "named; where none is, all that was not traced is taken to arrive. ``separation``: errors of the "
             "prediction are found by separating the matrix into a part of low rank and sparse errors. ``correction``: "
-            "entries are traced where these lie dense.",
+            "entries are traced where these lie dense. ``largest``: entries are traced that may be more than 3% of the "
+            "light of their pixel.",
             words=STEPS,
         ),
     )  # fmt: skip

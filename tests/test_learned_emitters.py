@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from vpl.core.arrays import upload_vectors
-from vpl.split import balance
-from vpl.split.learned_emitters import LearnedEmitters, Sites
+from vpl.split.learned_emitters import LearnedEmitters
 from vpl.split.remainder import EVERYWHERE
+from vpl.split.sites import Sites
 
 from .catalogue import EMITTERS, SENSORS, film, image, rgb
 from .conftest import closed_box, render, render_with_statistics, sensor, unit_vectors
@@ -63,12 +63,14 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(emitter):
     assert same.mean() > 0.98
 
 
-@pytest.mark.parametrize("emitter", ["envmap", "rectangle"])
+@pytest.mark.parametrize("emitter", ["envmap", "sunsky", "rectangle"])
 def test_rows_of_probabilities_are_positive_for_every_emitter_and_sum_to_one(emitter):
+    """The regions of an image stand for it; what may be finer than they are is drawn by itself, too."""
     emission, _, _ = learned(mi.load_dict(closed_box(EMITTERS[emitter]() | bulbs())))
     rows = np.array(emission._probability).reshape(-1, emission._sources)
     np.testing.assert_allclose(rows.sum(1), 1, atol=1e-5)
-    assert (rows >= 0).all() and (rows[:, : emission._count] > 0).all()
+    by_itself = [not e.is_environment() or emitter == "sunsky" for e in emission._scene.emitters()]
+    assert (rows >= 0).all() and ((rows[:, : emission._count] > 0) == by_itself).all()
 
 
 def test_all_vertices_at_one_place_are_a_site_that_is_found_again():
@@ -149,10 +151,8 @@ def test_the_weights_of_gather_vertices_are_finite():
     assert seen == [True, True]
 
 
-def test_later_vertices_are_lit_where_no_first_one_is(monkeypatch):
+def test_later_vertices_are_lit_where_no_first_one_is(monkeypatch, lights_cost_nothing):
     """As in an image of one pixel, of which few samples are lit, and meet nothing."""
-    for name, value in (("_FIXED_COST", 0), ("_LIGHT_PATH_COST", 0), ("_FEWEST", 4000)):
-        monkeypatch.setattr(balance, name, value)
     plugin, scene = mi.load_dict({"type": "manylights", "max_depth": 5}), mi.load_dict(closed_box(bulbs(), 8))
     gather = plugin._gather
 
@@ -172,10 +172,8 @@ def test_a_sky_without_surfaces():
     np.testing.assert_allclose(found, render(scene, "path", 16), rtol=0.2, atol=0.02)
 
 
-def test_no_kernel_is_compiled_anew_for_another_seed(monkeypatch):
+def test_no_kernel_is_compiled_anew_for_another_seed(lights_cost_nothing):
     """What depends on the pilot must not be a constant in them: c of the split, numbers of vertices and of lights."""
-    for name, value in (("_FIXED_COST", 0), ("_LIGHT_PATH_COST", 0), ("_FEWEST", 4000)):
-        monkeypatch.setattr(balance, name, value)
     box = closed_box(bulbs(), 16)
     # Some rays leave it, and something is left at second vertices, so that light is gathered at later ones, too
     del box["left"]

@@ -6,8 +6,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.split import balance
-
 from .catalogue import EMITTERS, MATERIALS, ONE_PIXEL, SENSORS, film, image, one_of, rgb, stage
 from .conftest import (
     area_light,
@@ -27,12 +25,7 @@ QUICK_EMITTERS = ("point", "spot", "directional", "rectangle", "envmap", "consta
 QUICK_MATERIALS = ("roughplastic", "principled", "mask", "blendbsdf", "twosided")
 
 
-@pytest.fixture(autouse=True)
-def lights_cost_nothing(monkeypatch):
-    """So that there are virtual lights wherever there is any use for them."""
-    monkeypatch.setattr(balance, "_FIXED_COST", 0)
-    monkeypatch.setattr(balance, "_LIGHT_PATH_COST", 0)
-    monkeypatch.setattr(balance, "_FEWEST", 4000)
+pytestmark = pytest.mark.usefixtures("lights_cost_nothing")
 
 
 def assert_image_of_path(description, spp=32, seeds=16, reference="path", lights=True, **more):

@@ -1,6 +1,7 @@
 """The integrator ``matrixrecovery``: slices, columns, predictors, separation, and images against ``vpl``."""
 
 from functools import partial
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -10,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.separated_light import light_of_entries
+from comparison.scene_files import SceneFile
 from vpl.core.arrays import download, upload
 from vpl.matrix import recovery as matrix_recovery
-from vpl.matrix.reduced_columns import _nearby_largest
+from vpl.matrix.reduced_columns import _nearby
 from vpl.matrix.reduced_matrix import MatrixRows
 from vpl.matrix.separation import Separation, SeparationLimits, separate, sketch
 from vpl.points.point_clusters import PointClusters
@@ -35,6 +37,7 @@ from .test_lightcuts import many_kinds
 from .test_pairs import batch_of, glossy_room
 
 NAME = "matrixrecovery"
+ROOT = Path(__file__).resolve().parent.parent
 PREDICTED = "nearest,linear,bayes"
 SMALL = {"max_depth": 4, "vpl_count": 3000, "direct": "vpl"}
 # Every light a column of its own, every row traced
@@ -112,7 +115,8 @@ def test_steps_of_samples_visit_every_row_once():
 def test_neighbours_lend_each_other_only_within_their_segment():
     values = np.array([1.0, 5, 2, 0, 0, 7, 0, 3])
     segment = np.array([0, 0, 0, 0, 0, 1, 1, 2])
-    assert _nearby_largest(values, segment).tolist() == [5, 5, 5, 5, 2, 7, 7, 3]
+    assert _nearby(np.maximum, values, segment).tolist() == [5, 5, 5, 5, 2, 7, 7, 3]
+    assert _nearby(np.add, values, segment).tolist() == [8, 8, 8, 7, 2, 7, 7, 3]
 
 
 # ---- Separation
@@ -248,8 +252,9 @@ def test_most_entries_are_predicted_and_the_image_is_that_of_all_lights(shadows)
 
 
 def test_the_error_falls_with_alpha(shadows):
-    expected = render(shadows, "vpl", 1, **SMALL)
-    errors = [dark_error(rendered(shadows, 1, **SMALL, alpha=alpha)[0], expected) for alpha in (0.05, 0.005, 0.0005)]
+    """Of clusters: the larger they are, the more of them are so large that they are traced."""
+    expected, settings = render(shadows, "vpl", 1, **SMALL), SMALL | {"steps": f"{PREDICTED},separation,correction"}
+    errors = [dark_error(rendered(shadows, 1, **settings, alpha=alpha)[0], expected) for alpha in (0.05, 0.005, 0.0005)]
     assert errors[2] < 0.7 * errors[0] and errors[1] < errors[0]
 
 
@@ -264,6 +269,20 @@ def test_the_bias_of_prediction_is_small_and_falls_with_sampling(shadows):
 
     assert abs(bias()) < 0.05
     assert abs(bias(sampling=9.0, steps=PREDICTED)) < 0.01
+
+
+def test_small_lamps_do_not_lose_their_light():
+    """Each of the 900 lamps of the hall lights what is next to it, where few of the rows that are traced are."""
+    file = SceneFile(str(ROOT / "scenes" / "hall.xml"), {"integrator": "path"})
+    file.set_width(48)
+    scene, settings, found, expected = file.load(), {"max_depth": 2, "emitter_samples": 1}, 0, 0
+    for seed in range(3):
+        image, statistics = rendered(scene, 1, seed, **settings, alpha=0.0)
+        expected += render(scene, "vpl", 1, seed, **settings).sum()
+        found += image.sum()
+        # As nothing is known of lamps none of whose samples are lit, none of them shares a column
+        assert statistics["cut_size"] > 700 * image[..., 0].size
+    assert abs(found / expected - 1) < 0.02
 
 
 def test_each_step_does_its_part(shadows, monkeypatch):

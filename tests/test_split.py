@@ -19,7 +19,7 @@ from vpl.split.balance import balance
 from vpl.split.cells import Cells
 from vpl.split.floors import agrees, carried_share, floor_of, side_of
 from vpl.split.gather_vertices import GatherVertices, drawn_later
-from vpl.split.numbers import spread_numbers
+from vpl.split.numbers import SpreadNumbers
 from vpl.split.pixel_clusters import PixelClusters, Receivers
 from vpl.split.remainder import power_heuristic
 from vpl.transport.bounds import contribution_bound
@@ -100,7 +100,7 @@ def test_rough_metal_has_next_to_no_floor_and_diffuse_walls_all_of_it():
 @pytest.mark.parametrize("samples", [1, 4, 16, 64, 6])
 def test_numbers_are_uniform_and_stratified_in_every_pixel(samples):
     pixels = 4096
-    numbers = spread_numbers(dr.arange(mi.UInt32, pixels * samples), samples, 7)
+    numbers = SpreadNumbers(dr.arange(mi.UInt32, pixels * samples), samples, 7).at(mi.UInt32(3))
     columns = [np.array(x).reshape(-1, pixels, samples) for x in numbers]
     for column in columns:
         for dimension in column:
@@ -117,9 +117,13 @@ def test_numbers_are_uniform_and_stratified_in_every_pixel(samples):
             assert (cell == np.arange(samples)).all()
 
 
-def test_numbers_of_other_dimensions_pixels_and_seeds_are_independent():
+def test_numbers_of_other_dimensions_vertices_pixels_and_seeds_are_independent():
     lane = dr.arange(mi.UInt32, 4 * 4096)
-    columns = [np.array(x).reshape(-1, 4 * 4096) for seed in (1, 2) for x in spread_numbers(lane, 4, seed)]
+    columns = [
+        np.array(x).reshape(-1, 4 * 4096)
+        for seed, vertex in ((1, 0), (1, 1), (2, 0))
+        for x in SpreadNumbers(lane, 4, seed).at(mi.UInt32(vertex))
+    ]
     correlation = np.corrcoef(np.concatenate(columns))
     assert np.abs(correlation - np.eye(len(correlation))).max() < 0.05
     pixels = np.concatenate(columns).reshape(-1, 4096, 4)

@@ -20,6 +20,7 @@ from ..core.parameters import parameters_of
 from ..core.sampling import find_interval, independent_sampler
 from .environment_strata import cones, stratify
 
+_CONSTANT = "ConstantBackgroundEmitter"
 _EVALUATIONS = 2  # along each of both axes of a cell, at least
 # The same in cells next to others so many times as bright: the sun has an edge, and may be a single texel
 _EDGE_EVALUATIONS, _EDGE_CONTRAST = 16, 2.0
@@ -61,11 +62,14 @@ def _fingerprint(environment) -> str:
 
 class EnvironmentRegions:
     """``count`` regions: ``axis`` (count, 3), ``cone_cos`` (count,) contain their directions; ``irradiance`` (count,):
-    radiance (mean over channels) integrated over solid angle; all float64.  ``most_columns``: of the table."""
+    radiance (mean over channels) integrated over solid angle; all float64.  ``fine``: whether the table is as fine as
+    the environment itself.  ``most_columns``: of the table."""
 
     def __init__(self, environment, count: int, most_columns: int = _LARGEST_WIDTH):
         self._environment = environment
         width = min(_table_width(environment), most_columns)
+        constant, image_width = environment.class_name() == _CONSTANT, _image_width(environment)
+        self.fine = constant or 0 < image_width <= width
         radiance = _read(environment, width)
         height = len(radiance)
         edges = np.cos(np.linspace(0, np.pi, height + 1))
@@ -94,8 +98,9 @@ class EnvironmentRegions:
         ends = np.cumsum(np.bincount(labels, minlength=self.count))
         self._first = upload(mi.UInt32, np.concatenate([[0], ends]))
         self._cells = upload(mi.UInt32, order)
-        self._labels = upload(mi.UInt32, labels)
-        self._density = upload(mi.Float, share / solid_angle)
+        # Side by side, so that one access to memory fetches both
+        self._found = upload(mi.UInt32, np.stack([labels.astype(np.uint32), (share / solid_angle).astype(np.float32)
+                                                  .view(np.uint32)], 1).ravel())  # fmt: skip
         self._width, self._height = (dr.opaque(mi.UInt32, size) for size in (width, height))
 
     def sample(self, region, member, sample, active):
@@ -113,7 +118,7 @@ class EnvironmentRegions:
         azimuth = dr.two_pi * (mi.Float(column) + sample.y) / mi.Float(self._width)
         sine = dr.safe_sqrt(1 - dr.square(cosine))
         direction = mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), cosine)
-        density = dr.gather(mi.Float, self._density, cell, active)
+        density = self._of_cell(cell, active)[1]
         radiance = self.radiance(direction, active)
         return direction, finite_or_zero(radiance / density) & active, density
 
@@ -131,12 +136,17 @@ class EnvironmentRegions:
         row = dr.minimum(mi.UInt32(polar), self._height - 1)
         column = dr.minimum(mi.UInt32(azimuth), self._width - 1)
         cell = row * self._width + column
-        return dr.gather(mi.UInt32, self._labels, cell, active), dr.gather(mi.Float, self._density, cell, active)
+        return self._of_cell(cell, active)
+
+    def _of_cell(self, cell, active):
+        """(Region, density of :meth:`sample`) of cells."""
+        region, density = dr.gather(mi.Vector2u, self._found, cell, active)
+        return region, dr.reinterpret_array(mi.Float, density)
 
 
 def _table_width(environment) -> int:
     """Columns of the table: those of an image, as far as that pays, a power of two."""
-    if environment.class_name() == "ConstantBackgroundEmitter":
+    if environment.class_name() == _CONSTANT:
         return 64
     columns = _image_width(environment) or _DEFAULT_WIDTH
     return int(np.clip(2 ** np.ceil(np.log2(columns)), 64, _LARGEST_WIDTH))

@@ -1,11 +1,14 @@
 """Recovering the visibility of reduced matrices from the few entries that were traced [MSR 5, 6].
 
 First every entry that was not traced is predicted, column by column; then the matrix is separated into a part of low
-rank and sparse errors; and where errors lie dense, entries are traced after all.
+rank and sparse errors; and where errors lie dense, entries are traced after all.  So are, at last, those that may be
+much of the light of their row.
 
 Departure from the paper: what is separated is visibility, V, rather than light, E V.  E needs no recovering, and makes
 the rank higher: separated light errs more than predictions (benchmarks/matrixrecovery.py).  And what is recovered is
-D − Z, not XY, so that entries in which no error was found stay what they are.
+D − Z, not XY, so that entries in which no error was found stay what they are.  And the paper knows no last step: a
+small lamp lights what is next to it, where few of the rows of its column are, so that prediction, which goes by the
+number of rows, loses most of its light.
 """
 
 from __future__ import annotations
@@ -18,17 +21,20 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import download, upload
-from ..core.sampling import HASH_ROUNDS
+from ..core.sampling import HASH_ROUNDS, derived_seed
 from ..core.stages import Stage
 from .matrix_block import MatrixBlock
 from .separation import Separation, SeparationLimits, separate
 from .visibility_prediction import PREDICTORS, Predictors
 
 # What may be done [MSR 7.1]: the predictors to choose from, and what follows prediction
-STEPS = (*PREDICTORS, "separation", "correction")
+STEPS = (*PREDICTORS, "separation", "correction", "largest")
 # Share of errors around an entry from which on it is traced; 0.2 in the paper, but errors lie denser here
 DENSITY = 0.65
 LIMITS = SeparationLimits()
+# Share of the light of a row from which on an entry is traced; the least share of its unoccluded light that a row is
+# taken to have
+LARGE_SHARE, _LEAST_LIGHT = 0.03, 0.1
 # The Gaussian of the density of errors: 7 × 7 entries [MSR 6.2]
 _TAPS, _SIGMA = 7, 1.5
 # An error counts from this fraction of the whole entry on
@@ -39,7 +45,7 @@ _LEAST_ERROR = 0.01
 class Recovered:
     """One block: arrays as :class:`vpl.matrix.matrix_block.MatrixBlock` lays them out, Float but for ``traced`` (Bool).
 
-    ``unoccluded``: E; ``predicted``: V̄; ``traced``: entries whose V a ray found; ``visibility``: V, recovered.
+    ``unoccluded``: E; ``predicted``: V̄; ``traced``: entries whose V a ray found before; ``visibility``: V, recovered.
     Where columns were separated: ``part``, the block that these make, and in its layout ``error``, Z in units
     of whole entries, and ``density`` of errors (None without correction); ``separation``.
     """
@@ -78,10 +84,46 @@ def recover(
     if len(mixed):
         wanted = _separate(found, block, mixed, "correction" in steps, seed)
         lap(Stage.SEPARATION)
-        if len(wanted):
-            block.trace(found.visibility, wanted, dr.opaque(mi.UInt32, seed))
+        _trace(found, block, wanted, seed)
+        lap(Stage.CORRECTION)
+    if "largest" in steps:
+        _trace(found, block, _largest(found, block), derived_seed(seed, 1))
         lap(Stage.CORRECTION)
     return found
+
+
+def _trace(found: Recovered, block: MatrixBlock, wanted, seed: int) -> None:
+    """Trace the entries at some places, UInt32."""
+    if len(wanted):
+        block.trace(found.visibility, wanted, dr.opaque(mi.UInt32, seed))
+
+
+def _largest(found: Recovered, block: MatrixBlock):
+    """Places of entries that were predicted, and may be a large share of the light of their row: UInt32."""
+    _, width, height = block.shape
+    light, whole = _light_of_rows(found.unoccluded, found.visibility, block.shape)
+    enough = LARGE_SHARE * dr.maximum(light, _LEAST_LIGHT * whole)
+    lane, rows = dr.arange(mi.UInt32, block.size), dr.opaque(mi.UInt32, height)
+    row = lane // dr.opaque(mi.UInt32, width * height) * rows + lane % rows
+    return dr.compress(~found.traced & (found.unoccluded > dr.gather(mi.Float, enough, row)))
+
+
+@dr.syntax
+def _light_of_rows(unoccluded, visibility, shape: tuple[int, int, int]):
+    """Sums of E V and of E over the columns, Float, evaluated: the rows of one slice after another."""
+    slices, width, height = shape
+    lane, rows = dr.arange(mi.UInt32, slices * height), dr.opaque(mi.UInt32, height)
+    place = lane // rows * dr.opaque(mi.UInt32, width * height) + lane % rows
+    j, columns = mi.UInt32(0), dr.opaque(mi.UInt32, width)
+    light, whole = (dr.zeros(mi.Float, slices * height) for _ in range(2))
+    while dr.hint(j < columns, exclude=[unoccluded, visibility, rows, columns]):
+        entry = dr.gather(mi.Float, unoccluded, place)
+        whole += entry
+        light += entry * dr.gather(mi.Float, visibility, place)
+        place += rows
+        j += 1
+    dr.eval(light, whole)
+    return light, whole
 
 
 def _mixed_columns(predictors: Predictors, first: int, count: int) -> np.ndarray:

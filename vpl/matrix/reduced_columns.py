@@ -6,7 +6,8 @@ is (algorithm 1): no column is to dominate its matrix.  Few rows of each column 
 
 Departures from the paper: all clusters that are too large are split at once, in rounds, instead of one by one; and the
 clusters that lend their samples to one another are those next to each other along the light tree.  (Its search by
-intensity is in a supplement that is not at hand.)
+intensity is in a supplement that is not at hand.)  And a cluster none of whose few samples is lit may be split all the
+same: had it to be lit, those whose light that stands for all happens to be in shadow would stay whole, and dark.
 """
 
 from __future__ import annotations
@@ -121,22 +122,20 @@ def _children(entries: MatrixEntries, columns: Columns, split: np.ndarray):
 
 def _largest_contributions(columns: Columns, intensity: np.ndarray, largest: np.ndarray, values: np.ndarray):
     """Γ of every column [MSR equation 7], (c,) float64."""
-    known = values >= 0
-    seen = np.where(known, values, 0).max(1).astype(np.float64)
-    segment = columns.segment
-    near_seen = _nearby_largest(seen, segment)
-    # Where no sample says anything, all may arrive
-    near_seen[_nearby_largest(known.any(1).astype(np.float64), segment) == 0] = 1
-    return _nearby_largest(largest, segment) * near_seen * intensity
+    known, segment = values >= 0, columns.segment
+    seen = _nearby(np.maximum, np.where(known, values, 0).max(1).astype(np.float64), segment)
+    # After n samples in shadow, the next one is lit with a probability of at most 1 / (n + 1)
+    doubt = 1 / (1 + _nearby(np.add, known.sum(1).astype(np.float64), segment))
+    return _nearby(np.maximum, largest, segment) * np.maximum(seen, doubt) * intensity
 
 
-def _nearby_largest(values: np.ndarray, segment: np.ndarray) -> np.ndarray:
-    """The largest value among the neighbours of each within its segment, its own among them."""
+def _nearby(combine: np.ufunc, values: np.ndarray, segment: np.ndarray) -> np.ndarray:
+    """The values of the neighbours of each within its segment, its own among them, combined."""
     result = values.copy()
     for shift in range(1, min(_NEARBY, len(values) - 1) + 1):
         same = segment[shift:] == segment[:-shift]
-        np.maximum(result[shift:], np.where(same, values[:-shift], 0), out=result[shift:])
-        np.maximum(result[:-shift], np.where(same, values[shift:], 0), out=result[:-shift])
+        combine(result[shift:], values[:-shift], out=result[shift:], where=same)
+        combine(result[:-shift], values[shift:], out=result[:-shift], where=same)
     return result
 
 

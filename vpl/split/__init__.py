@@ -9,9 +9,11 @@ In the order to read in:
 
 - ``facing``: which of six ways a surface faces
 - ``floors``: the split: floors of BSDFs, and the share w of virtual lights
+- ``sites``: cubes of space, each for six ways to face, for which something is learned
+- ``worth``: what it is worth to follow a path
 - ``remainder``: paths as ``path`` follows them, less what virtual lights carry; ``follow``
 - ``next_event``: next-event estimation: how emitters are chosen
-- ``learned_emitters``: emitters, and regions of the environment, chosen by what a pilot's vertices see of them
+- ``learned_emitters``: emitters, and regions of the environment, chosen by what vertices of a pilot see, site by site
 - ``emitter_tree``: a tree over emitters with a place, by which one is drawn for a vertex
 - ``numbers``: random numbers that are spread well over the samples of a pixel
 - ``gather_vertices``: vertices where virtual lights are gathered, and which of the later ones are

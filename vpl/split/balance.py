@@ -10,23 +10,33 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .worth import survival_of
+
 # What making lights and clusters costs besides (kernels that are traced and started, trees), and a path from a light
 _FIXED_COST, _LIGHT_PATH_COST = 200_000, 4.0
 # Share of the indirect light's variance that lights take away where they carry it
 _GAIN = 0.9
+# Variance of what is left that samples of a pixel, spread well, leave at best, next to that of the pilot's
+_SPREAD = 0.5
 # Relative standard error that one set of lights leaves in the mean of the image
 _SET_ERROR = 0.03
 # Light paths as a share of the paths from the camera, and how few and how many there may be
 _SHARES, _FEWEST, _MOST = (1 / 64, 1 / 8), 20_000, 500_000
 # Relative variance that cuts leave, times shadow rays a pixel; and the cost of one of these rays
-_CUT_NOISE, _RAY_COST = 0.1, 0.5
+_CUT_NOISE, _RAY_COST = 0.2, 0.2
 # Shadow rays for each sample of a pixel, at least and at most
 _RAYS = (0.25, 8.0)
 # Bound on a pair of clusters, relative to its pixel, with which a cut has so many rays, and how the two go together
-_ERROR, _RAYS_AT_ERROR, _SLOPE = 0.05, 70, 1.6
-_FINEST, _COARSEST = 0.003, 0.2
+_ERROR, _RAYS_AT_ERROR, _SLOPE = 0.05, 110, 1.6
+_FINEST, _COARSEST = 0.003, 0.5
 # Squared brightness of the image that black places are taken to have, and share of the worst that is left out
 _BLACK, _WORST = 0.01, 0.001
+# Cost of a path up to its second vertex, in edges of those after it
+_FIRST_EDGES = 4.0
+# Variance × cost of paths that may end, next to that of whole paths, at most: what is expected of a few is rough
+_LARGEST_PRODUCT = 0.8
+# Variance × cost with lights, next to that without, below which they are used
+_PAYS_BELOW = 1.0
 # Gather vertices of a pixel: one of so many samples, and at most so many
 _SAMPLES_A_VERTEX, _MOST_VERTICES = 4, 16
 
@@ -34,11 +44,12 @@ _SAMPLES_A_VERTEX, _MOST_VERTICES = 4, 16
 @dataclass(frozen=True)
 class Balance:
     """``light_paths``: 0 where lights do not pay; ``error`` of cuts; ``vertices`` of a pixel that are lit;
-    ``reason``, in words."""
+    ``noise`` that is left of a path from the camera, relative variance; ``reason``, in words."""
 
     light_paths: int
     error: float
     vertices: int
+    noise: float
     reason: str
 
 
@@ -51,27 +62,31 @@ def balance(radiance: np.ndarray, indirect: np.ndarray, brightness: np.ndarray, 
     if not indirect.any():
         return without_lights("no light comes by way of surfaces that virtual lights could stand for")
     whole, direct = noise(radiance, brightness), noise(radiance - indirect, brightness)
-    share = max(1 - direct / max(whole, np.finfo(np.float64).tiny), 0.0)
+    whole -= (1 - max(_SPREAD, samples**-0.5)) * min(direct, whole)
+    direct = min(max(_SPREAD, samples**-0.5) * direct, whole)
+    share = 1 - direct / max(whole, np.finfo(np.float64).tiny)
     # Relative variance of what a path from the camera brings by way of lights
     spread = len(indirect) * np.sum(indirect**2) / np.sum(indirect) ** 2
     wanted = np.clip(spread / _SET_ERROR**2, _SHARES[0] * paths, _SHARES[1] * paths)
     light_paths = int(np.clip(wanted, _FEWEST, _MOST))
-    cost = _FIXED_COST + _LIGHT_PATH_COST * light_paths
-    if _GAIN * share * paths < cost * (1 - _GAIN * share):
-        return without_lights(
-            f"virtual lights would cost as much as {cost / paths:.2g} of the paths and save {share:.0%} of them"
-        )
-    # The least of (noise of paths / samples + noise of cuts / rays) × (samples + rays × their cost)
+    # The least of (noise of paths / samples + noise of cuts / rays) × (samples + rays × their cost), rays of a pixel
     rest = whole * (1 - _GAIN * share)
     rays = samples * np.clip((_CUT_NOISE / (_RAY_COST * max(rest, 1e-9))) ** 0.5, *_RAYS)
     error = float(np.clip(_ERROR * (rays / _RAYS_AT_ERROR) ** -_SLOPE, _FINEST, _COARSEST))
+    # A cut has some nodes, however few rays are wanted
+    rays = _RAYS_AT_ERROR * (error / _ERROR) ** (-1 / _SLOPE)
+    fixed = (_FIXED_COST + _LIGHT_PATH_COST * light_paths) / paths
+    cost = 1 + _RAY_COST * rays / samples + fixed
+    if cost * (rest + _CUT_NOISE * samples / rays) > _PAYS_BELOW * whole:
+        price = f"virtual lights would cost {cost - 1:.2g} times as much as the paths"
+        return without_lights(f"{price} and leave {rest / whole:.0%} of the noise")
     vertices = int(np.clip(samples // _SAMPLES_A_VERTEX, 1, _MOST_VERTICES))
-    return Balance(light_paths, error, vertices, f"{share:.0%} of the noise is that of indirect light")
+    return Balance(light_paths, error, vertices, rest, f"{share:.0%} of the noise is that of indirect light")
 
 
 def without_lights(reason: str) -> Balance:
     """The balance of scenes in which virtual lights do not pay."""
-    return Balance(0, 0.0, 0, reason)
+    return Balance(0, 0.0, 0, 0.0, reason)
 
 
 def noise(values: np.ndarray, brightness: np.ndarray) -> float:
@@ -79,6 +94,28 @@ def noise(values: np.ndarray, brightness: np.ndarray) -> float:
     judged: without the worst, and as if no place was black."""
     count = len(values) // 2
     first, second = values[: 2 * count].astype(np.float64).reshape(-1, 2).T
-    level = brightness[: 2 * count : 2] ** 2 + _BLACK * np.mean(brightness) ** 2
-    error = np.sort(0.5 * (first - second) ** 2 / np.maximum(level, np.finfo(np.float64).tiny))
+    error = np.sort(0.5 * (first - second) ** 2 / judged_by(brightness)[: 2 * count : 2] ** 2)
     return float(np.mean(error[: count - int(_WORST * count)])) if count else 0.0
+
+
+def judged_by(brightness: np.ndarray) -> np.ndarray:
+    """What errors are relative to, (n,), where an image has a ``brightness`` (n,)."""
+    level = np.sqrt(brightness**2 + _BLACK * np.mean(brightness) ** 2)
+    return np.maximum(level, np.finfo(np.float64).tiny ** 0.5)
+
+
+def importance(worth: np.ndarray, brought: np.ndarray, edges: np.ndarray, paths: int, whole: float) -> float:
+    """The multiple of ``worth`` with which paths should go on from their second vertices, so that variance × cost is
+    least; infinite where none should end, as that would hardly pay.
+
+    ``worth`` (m,) and ``brought`` (m,): what goes on is expected to bring, and what it brought, relative to the image;
+    ``edges`` (m,) that it cost; ``paths``: number of all paths, with a relative variance of ``whole`` each.
+    """
+    best, least = np.inf, _LARGEST_PRODUCT * whole * (_FIRST_EDGES + edges.sum() / paths)
+    for multiple in 2.0 ** np.arange(-3, 5.5, 0.5):
+        survival = survival_of(multiple * worth)
+        variance = whole + np.sum(brought**2 * (1 / survival - 1)) / paths
+        product = variance * (_FIRST_EDGES + np.sum(edges * survival) / paths)
+        if product < least:
+            best, least = multiple, product
+    return float(best)

@@ -64,22 +64,23 @@ def joined(first, second):
 
 @dataclass
 class Arrival:
-    """Second vertices of paths, met by an edge from a first one where lights are gathered, one per lane.
+    """Second vertices of paths: after the first that scatters, or the first where lights are gathered; one per lane.
 
     ``position``; ``normal`` of the side that was met; ``weight``: what irradiance there would contribute if virtual
-    lights carried all of it (w = 1), 0 where there is no such vertex or it has no floor; ``before``: the radiance that
-    the path found before it; means over channels.
+    lights carried all of it (w = 1), 0 where they carry none; ``throughput`` of the path, and ``before``: the radiance
+    that it had found before; means over channels.
     """
 
     position: object
     normal: object
     weight: object
+    throughput: object
     before: object
 
     @classmethod
     def none(cls) -> Arrival:
         """No arrivals."""
-        return cls(mi.Point3f(0), mi.Normal3f(0), mi.Float(0), mi.Float(0))
+        return cls(mi.Point3f(0), mi.Normal3f(0), mi.Float(0), mi.Float(0), mi.Float(0))
 
 
 def drawn_later(first: GatherVertices, later: GatherVertices, samples: int, most: int, seed: int):

@@ -8,8 +8,6 @@ window aims there.  A share of the samples is kept for Mitsuba's own choice, whi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -17,7 +15,7 @@ import numpy as np
 from ..core.arrays import channel_mean, download, finite_or_zero, upload, upload_vectors
 from ..core.sampling import find_interval, independent_sampler
 from ..direct.environment_regions import regions_of
-from .facing import WAYS, facing, facing_of
+from .sites import Sites
 
 # Regions of the environment, and columns of the table that they are made from
 _REGIONS, _COLUMNS = 256, 512
@@ -27,61 +25,6 @@ _UNIFORM_SHARE = 0.3
 _RAYS_EACH, _MOST_RAYS = 2, 1 << 20
 # Rays that a site's average visibility counts for
 _PRIOR = 0.5
-# Cubes along the longest side of where vertices are, at most; a share of them at its ends that may lie outside
-_FINEST_GRID, _OUTLIERS = 32, 0.005
-
-
-@dataclass
-class Sites:
-    """Numbers of sites: ``low`` and ``size`` of the cubes' grid, ``resolution`` along its axes, all opaque;
-    ``table``: the site of each cube and facing, 0 where nothing is known."""
-
-    low: object
-    size: object
-    resolution: object
-    table: object
-
-    @classmethod
-    def none(cls) -> Sites:
-        """Nothing is known anywhere."""
-        return cls._of(np.zeros(3), 1.0, np.ones(3, np.int64), np.zeros(WAYS, np.int64))
-
-    @classmethod
-    def _of(cls, low, size, resolution, table) -> Sites:
-        return cls(
-            mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in low)),
-            dr.opaque(mi.Float, float(size)),
-            mi.Vector3u(*(dr.opaque(mi.UInt32, int(x)) for x in resolution)),
-            upload(mi.UInt32, table),
-        )
-
-    @classmethod
-    def around(cls, position: np.ndarray, normal: np.ndarray, most: int) -> tuple[Sites, np.ndarray]:
-        """(Sites of vertices (n, 3), the site of each): at most ``most``, numbered from 1."""
-        low, high = np.quantile(position, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
-        # Not so small that cubes have no size in single precision
-        longest = max(float((high - low).max()), 1e-6 * float(np.abs([low, high]).max()), 1e-30)
-        way = facing(normal)
-        for cubes in range(_FINEST_GRID, 0, -1):
-            size = longest / cubes
-            resolution = np.maximum(np.ceil((high - low) / size), 1).astype(np.int64)
-            cell = np.clip(np.floor((position - low) / size), 0, resolution - 1).astype(np.int64)
-            key = ((cell[:, 2] * resolution[1] + cell[:, 1]) * resolution[0] + cell[:, 0]) * WAYS + way
-            known = np.zeros(WAYS * resolution.prod(), bool)
-            known[key] = True
-            if np.count_nonzero(known) <= most:
-                break
-        table = np.where(known, np.cumsum(known), 0)
-        return cls._of(low, size, resolution, table), table[key]
-
-    def at(self, position, normal):
-        """The site of each position, for vertices that face ``normal``."""
-        cell = [
-            mi.UInt32(dr.fmin(dr.fmax((x - low) / self.size, 0), mi.Float(count - 1)))
-            for x, low, count in zip(position, self.low, self.resolution, strict=True)
-        ]
-        cube = (cell[2] * self.resolution.y + cell[1]) * self.resolution.x + cell[0]
-        return dr.gather(mi.UInt32, self.table, cube * WAYS + facing_of(normal))
 
 
 class LearnedEmitters:
@@ -89,22 +32,30 @@ class LearnedEmitters:
     that of its ``sampling_weight``."""
 
     def __init__(self, scene):
-        self._scene, self._emitters = scene, scene.emitters_dr()
-        self._environment, self._count = scene.environment(), len(scene.emitters())
-        self._regions, self._environment_number = None, -1
-        if self._environment is not None:
+        self._scene, self._emitters, self._count = scene, scene.emitters_dr(), len(scene.emitters())
+        # Emitters with a weight of 0 are never sampled, as in Mitsuba
+        weight = np.array([emitter.sampling_weight() for emitter in scene.emitters()])
+        self._environment = scene.environment()
+        of_environment = np.array([emitter.is_environment() for emitter in scene.emitters()])
+        self._environment_number = int(of_environment.argmax()) if self._environment is not None else -1
+        self._regions = None
+        if weight[of_environment].any():
             self._regions = regions_of(self._environment, _REGIONS, _COLUMNS)
-            self._environment_number = [e.is_environment() for e in scene.emitters()].index(True)
         self._sources = self._count + (self._regions.count if self._regions else 0)
         registry = download(dr.reinterpret_array(mi.UInt32, self._emitters))
         numbers = np.zeros(registry.max() + 2, np.int64)
         numbers[registry] = np.arange(self._count)
         self._number_of = upload(mi.UInt32, numbers)
-        # Emitters with a weight of 0 are never sampled, as in Mitsuba
-        weight = np.array([emitter.sampling_weight() for emitter in scene.emitters()])
         self._alike = np.zeros(self._sources)
         self._alike[: self._count] = weight / weight.sum()
-        self._never = np.flatnonzero(weight == 0)
+        # What regions cannot tell apart, the environment's own sampling may
+        self._both = self._regions is not None and not self._regions.fine
+        if self._regions and not self._both:
+            light = np.maximum(self._regions.irradiance, 0)
+            light = light / light.sum() if light.sum() > 0 else np.full(len(light), 1 / len(light))
+            self._alike[self._count :] = self._alike[self._environment_number] * light
+            self._alike[self._environment_number] = 0
+        self._never = np.flatnonzero(self._alike[: self._count] == 0)
         self.forget()
 
     def _use(self, probability: np.ndarray) -> None:
@@ -160,7 +111,7 @@ class LearnedEmitters:
         """Probabilities (sites + 1, sources) by root mean squares of what arrived; first where nothing is known."""
         possible = np.nan_to_num(unoccluded, posinf=0) ** 2
         possible[:, self._never] = 0
-        if self._regions:
+        if self._both:
             # Its regions stand for the environment
             possible[:, self._environment_number] = 0
         found = possible * seen
@@ -206,7 +157,7 @@ class LearnedEmitters:
         source, probability = row - first, dr.gather(mi.Float, self._probability, row, active)
         direction, weight, density, delta, ray = self._draw(si, source, member, place, active)
         whole = density * probability
-        if self._regions:
+        if self._both:
             # What both the emitter and its regions may draw has the sum of their densities
             of_environment = active & ((source >= self._count) | (source == self._environment_number))
             both = self._environment_density(si, site, direction, of_environment)
@@ -220,11 +171,13 @@ class LearnedEmitters:
         """Density with which a direction to the environment is drawn."""
         region, density = self._regions.find(direction, active)
         first = site * self._sources
-        ds = dr.zeros(mi.DirectionSample3f)
-        ds.d = direction
-        own = self._environment.pdf_direction(si, ds, active)
-        by_emitter = dr.gather(mi.Float, self._probability, first + self._environment_number, active)
-        return own * by_emitter + density * dr.gather(mi.Float, self._probability, first + self._count + region, active)
+        density *= dr.gather(mi.Float, self._probability, first + self._count + region, active)
+        if self._both:
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.d = direction
+            by_emitter = dr.gather(mi.Float, self._probability, first + self._environment_number, active)
+            density += self._environment.pdf_direction(si, ds, active) * by_emitter
+        return density
 
     def met(self, vertex, site, ray, si, has_density, active):
         """Radiance that a ray from ``vertex`` met at ``si``, and the density with which :meth:`sample` would have drawn
@@ -240,7 +193,11 @@ class LearnedEmitters:
         probability = dr.gather(mi.Float, self._probability, site * self._sources + number, near)
         density = emitter.pdf_direction(origin, ds, near) * probability
         if self._regions:
-            density = dr.select(
-                si.is_valid(), density, self._environment_density(origin, site, ray.d, wanted & ~si.is_valid())
+            # A branch: few packets of paths hold one that has left the scene
+            density = dr.if_stmt(
+                (origin, site, ray.d, density),
+                wanted & ~si.is_valid(),
+                lambda origin, site, direction, density: self._environment_density(origin, site, direction, True),
+                lambda origin, site, direction, density: density,
             )
         return emitted, density

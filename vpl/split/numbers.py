@@ -1,4 +1,4 @@
-"""Well spread random numbers for the first vertex that scatters: one point set for all samples of a pixel.
+"""Well spread random numbers for vertices that scatter: a point set for all samples of a pixel at each.
 
 Sobol' points, shuffled and scrambled by hashes that keep their strata [Burley 2020, "Practical hash-based Owen
 scrambling"]: any power of two of a pixel's samples falls into as many strata of every shape, other dimensions take the
@@ -29,29 +29,38 @@ def _nested_scramble(bits, seed):
 
 
 def _second_sobol(index):
-    """The second Sobol' dimension as a 32-bit fraction."""
-    # As a float it has 24 bits, more than there are samples of a pixel
-    return mi.UInt32(mi.sobol_2(index, mi.UInt32(0)) * 2**24) << 8
+    """The second Sobol' dimension as a 32-bit fraction: Pascal's triangle modulo 2 times the index, back to front."""
+    # Bit i is the parity of the bits whose number has all bits of i [Lucas 1878]. Not ``mi.sobol_2``, which only knows
+    # the types of the variant that was set first.
+    for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF)):
+        index = index ^ ((index >> shift) & mask)
+    # To the 24 bits of a float, which are more than there are samples of a pixel
+    return mi.UInt32(mi.Float(dr.brev(index)) * 2**-8) << 8
 
 
 def _fraction(bits):
     return mi.Float(bits >> 8) * 2**-24
 
 
-def spread_numbers(lane, samples: int, seed: int):
-    """Numbers for each lane (UInt32), of which ``samples`` consecutive ones are a pixel: (number, pair, number, pair),
-    evaluated, from [0, 1)."""
-    count = dr.opaque(mi.UInt32, samples)
-    pixel, number = lane // count, lane % count
-    found = []
-    for stream in range(4):
-        order, first = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, derived_seed(seed, stream)), HASH_ROUNDS)
-        # The low bits count the samples of a pixel: what has to stay together are those with equal higher bits
-        index = _nested_scramble(number, order)
-        numbers = [_fraction(_nested_scramble(dr.brev(index), first))]
-        if stream % 2:
-            second, _ = mi.sample_tea_32(first, order, HASH_ROUNDS)
-            numbers.append(_fraction(_nested_scramble(_second_sobol(index), second)))
-        found.append(mi.Point2f(*numbers) if stream % 2 else numbers[0])
-    dr.make_opaque(found)
-    return tuple(found)
+class SpreadNumbers:
+    """Numbers for paths, of which ``samples`` (UInt32, opaque) consecutive ones are those of a pixel; ``lane``: of each
+    path."""
+
+    def __init__(self, lane, samples: int, seed: int):
+        count = dr.opaque(mi.UInt32, samples)
+        self._pixel, self._number = lane // count, lane % count
+        self._streams = [dr.opaque(mi.UInt32, derived_seed(seed, stream)) for stream in range(4)]
+
+    def at(self, vertex):
+        """Numbers that a path uses at its vertex of a number (UInt32): (number, pair, number, pair), from [0, 1)."""
+        found = []
+        for stream, seed in enumerate(self._streams):
+            order, first = mi.sample_tea_32(self._pixel, seed + vertex, HASH_ROUNDS)
+            # The low bits count the samples of a pixel: what has to stay together are those with equal higher bits
+            index = _nested_scramble(self._number, order)
+            numbers = [_fraction(_nested_scramble(dr.brev(index), first))]
+            if stream % 2:
+                second, _ = mi.sample_tea_32(first, order, HASH_ROUNDS)
+                numbers.append(_fraction(_nested_scramble(_second_sobol(index), second)))
+            found.append(mi.Point2f(*numbers) if stream % 2 else numbers[0])
+        return tuple(found)

@@ -26,15 +26,29 @@ class Arrivals:
 
 
 @dataclass
+class Onward:
+    """Second vertices of paths, with a floor or without, (m, 3) each: ``position``, ``normal``; (m,): ``path`` that
+    each is of, ``throughput`` with which it arrived, ``sent``: the radiance that it sent back, ``edges`` beyond."""
+
+    position: np.ndarray
+    normal: np.ndarray
+    path: np.ndarray
+    throughput: np.ndarray
+    sent: np.ndarray
+    edges: np.ndarray
+
+
+@dataclass
 class Pilot:
     """Paths of which nothing was left to virtual lights, two next to each other from one pixel.
 
     ``arrivals``: their second vertices, where they have a floor, as their first ones have; ``pixel``, ``radiance``,
     ``indirect`` (n,): the pixel of each path, what it found, and the part that came by way of its second vertex.
-    ``vertices``: positions and normals, (m, 3) each, of both.
+    ``vertices``: positions and normals, (m, 3) each, of both; ``onward``: what came by way of all second vertices.
     """
 
     arrivals: Arrivals
+    onward: Onward
     vertices: tuple[np.ndarray, np.ndarray]
     pixel: np.ndarray
     radiance: np.ndarray
@@ -44,16 +58,18 @@ class Pilot:
     def of(cls, found: Found, vertices: GatherVertices, arrival: Arrival, pixel: np.ndarray) -> Pilot:
         """The pilot of some paths of the pixels ``pixel``."""
         radiance = np.nan_to_num(download(channel_mean(found.radiance)).astype(np.float64), posinf=0, neginf=0)
-        position, normal, weight, before = (
-            download(x) for x in (arrival.position, arrival.normal, arrival.weight, arrival.before)
-        )
+        position, normal, weight, throughput, before = (download(x) for x in vars(arrival).values())
+        beyond, edges = np.maximum(radiance - np.nan_to_num(before), 0), download(found.edges).astype(np.int64)
+        onward = (throughput > 0) & np.isfinite(throughput) & np.isfinite(position).all(1)
+        path, throughput = np.flatnonzero(onward), throughput[onward].astype(np.float64)
+        onward = Onward(position[onward], normal[onward], path, throughput, beyond[path] / throughput, edges[path] - 1)
         arrived = (weight > 0) & np.isfinite(weight) & np.isfinite(position).all(1)
-        indirect = np.where(arrived, np.maximum(radiance - np.nan_to_num(before), 0), 0)
+        indirect = np.where(arrived, beyond, 0)
         arrivals = Arrivals(position[arrived], normal[arrived], weight[arrived].astype(np.float64), indirect[arrived])
         first, facing, depth = (download(x) for x in (vertices.position, vertices.normal, vertices.depth))
         seen = (depth > 0) & np.isfinite(first).all(1)
         vertices = tuple(np.concatenate(x) for x in ((first[seen], position[arrived]), (facing[seen], normal[arrived])))
-        return cls(arrivals, vertices, pixel, radiance, indirect)
+        return cls(arrivals, onward, vertices, pixel, radiance, indirect)
 
     def brightness(self, width: int) -> np.ndarray:
         """Mean radiance of the tile of each path, (n,)."""

@@ -21,6 +21,7 @@ from ..direct.emitter_sampling import power_heuristic
 from ..lights.perturbed import Perturbed
 from .floors import agrees, carried_share, floor_of, side_of
 from .gather_vertices import Arrival, GatherVertices
+from .worth import Worth
 
 # Where a path is: before its first vertex with a floor; on its way from one where lights are gathered to the next
 # vertex; and anywhere else
@@ -36,13 +37,14 @@ class Limits:
     """``max_depth`` (edges), ``rr_depth``: as in ``path``, UInt32; ``squared_c``: of the split, world units²;
     ``gathering``: where lights are gathered, NOWHERE, AT_FIRST or EVERYWHERE; all opaque.
 
-    ``perturbed``: shapes without a floor; ``hide_emitters``: of Python.
+    ``worth`` of following paths; ``perturbed``: shapes without a floor; ``hide_emitters``: of Python.
     """
 
     max_depth: object
     rr_depth: object
     squared_c: object
     gathering: object
+    worth: Worth
     perturbed: Perturbed
     hide_emitters: bool
 
@@ -53,7 +55,7 @@ class FirstEdge:
 
     ``vertex``: where they begin; ``ray``; ``throughput``: unpolarized spectrum; ``density``: of the direction, per
     solid angle; ``delta``: whether it was drawn from none; ``state``: see above; ``site``: of the vertex,
-    :mod:`vpl.split.next_event`; ``active``.
+    :mod:`vpl.split.next_event`; ``importance``: of radiance, :mod:`vpl.split.worth`; ``active``.
     """
 
     vertex: object
@@ -63,16 +65,17 @@ class FirstEdge:
     delta: object
     state: object
     site: object
+    importance: object
     active: object
 
     @classmethod
-    def of_camera(cls, ray, active) -> FirstEdge:
+    def of_camera(cls, ray, importance, active) -> FirstEdge:
         """Camera rays."""
-        count = dr.width(ray.d)
-        return cls.of(ray.o, ray, ones(count), dr.opaque(mi.Float, 1.0, count), True, SEEKING, mi.UInt32(0), active)
+        density = dr.opaque(mi.Float, 1.0, dr.width(ray.d))
+        return cls.of(ray.o, ray, ones(len(density)), density, True, SEEKING, mi.UInt32(0), importance, active)
 
     @classmethod
-    def of(cls, vertex, ray, throughput, density, delta: bool, state: int, site, active) -> FirstEdge:
+    def of(cls, vertex, ray, throughput, density, delta: bool, state: int, site, importance, active) -> FirstEdge:
         """Rays in directions of a density."""
         count = dr.width(ray.d)
         # Opaque and of full width, so that all paths are followed by one kernel
@@ -88,6 +91,7 @@ class FirstEdge:
             wide == (0 if delta else 1),
             dr.full(mi.UInt32, state, count),
             site + dr.opaque(mi.UInt32, 0, count),
+            importance + wide,
             active,
         )
         dr.make_opaque(edge)
@@ -98,21 +102,22 @@ class FirstEdge:
 class Found:
     """What a path found: ``radiance``; ``drawn``: one of the contributions that it is the sum of, drawn by its share
     and divided by the probability of that; ``length``: edges of the path that brought this one; ``valid``: whether a
-    surface was met that the film's alpha shows."""
+    surface was met that the film's alpha shows; ``edges``: of the path, but the last."""
 
     radiance: object
     drawn: object
     length: object
     valid: object
+    edges: object
 
 
 def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
     """Follow paths to their ends: (:class:`Found`, first gather vertices, one of the later ones, drawn by weight, and
     :class:`Arrival`), evaluated.
 
-    ``emission``: how emitters are sampled, see :mod:`vpl.split.next_event`; ``numbers``: (number, pair, number, pair)
-    for the first vertex that scatters, which choose an emitter, a place on it, a lobe, and a direction; ``sampler``:
-    for all others.
+    ``emission``: how emitters are sampled, see :mod:`vpl.split.next_event`; ``numbers``
+    (:class:`vpl.split.numbers.SpreadNumbers`): choose an emitter, a place on it, a lobe, and a direction at vertices
+    that scatter; ``sampler``: for all else.
     """
     # Looking for what a loop does not change records its body, all materials of the scene, twice
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
@@ -129,8 +134,8 @@ def _follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits)
     vertex, ray = mi.Point3f(first.vertex), mi.Ray3f(first.ray)
     throughput, active = mi.UnpolarizedSpectrum(first.throughput), mi.Bool(first.active)
     density, delta, state = mi.Float(first.density), mi.Bool(first.delta), mi.UInt32(first.state)
-    depth, eta, valid, spread = mi.UInt32(0), mi.Float(1), mi.Bool(False), state == SEEKING
-    site = mi.UInt32(first.site)
+    depth, eta, valid, scattered = mi.UInt32(0), mi.Float(1), mi.Bool(False), mi.UInt32(0)
+    site, importance = mi.UInt32(first.site), mi.Float(first.importance)
     # Of what x1 sends on, the part that virtual lights carry but for w and the floor of x2; and the cosine there
     carried, cosine = dr.zeros(mi.UnpolarizedSpectrum, count), mi.Float(1)
     vertices = GatherVertices.none(count)
@@ -161,18 +166,21 @@ def _follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits)
         connects = smooth & (state == CONNECTING) & agrees(si, side)
         carried = dr.select(connects, carried * floor, 0)
         met = si.n * dr.mulsign(mi.Float(1), -dr.dot(si.n, ray.d))
-        arrival = select_record(connects, Arrival(si.p, met, channel_mean(carried), channel_mean(radiance)), arrival)
+        means = (channel_mean(x) for x in (carried, throughput, radiance))
+        arrival = select_record(connects | (smooth & (scattered == 1)), Arrival(si.p, met, *means), arrival)
         carried *= w
 
-        # ---------------------- The path ends at a Lambertian x2, unless something is left of it ----------------------
+        # ---------------------- Russian roulette by what is left, and by what that may bring ----------------------
         reflected = throughput * floor
         left = dr.max(dr.abs(reflected - carried)) / dr.max(dr.abs(reflected))
         left = dr.select(connects & ((flags & other_lobes) == 0), dr.clip(left, _LEAST_SURVIVAL, 1), 1)
         left = dr.select(dr.isfinite(left), left, 1)
-        goes_on &= sampler.next_1d() < left
+        survival = limits.worth.survival(si, side, throughput, importance, left)
+        survival = dr.select(smooth & (scattered == 1), survival, left)
+        goes_on &= sampler.next_1d() < survival
         smooth &= goes_on
-        throughput /= left
-        carried /= left
+        throughput /= survival
+        carried /= survival
 
         # ---------------------- A vertex where lights are gathered ----------------------
         seeks = smooth & (state == SEEKING)
@@ -189,11 +197,9 @@ def _follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits)
         later = select_record(taken, here, later)
 
         # ---------------------- Emission, by next-event estimation ----------------------
-        first_numbers = spread & smooth
-        spread &= ~smooth
+        chosen, place, lobe, turn = numbers.at(scattered)
+        scattered += dr.select(smooth, 1, 0)
         site, member = emission.site(si, side), sampler.next_1d()
-        chosen = dr.select(first_numbers, numbers[0], sampler.next_1d())
-        place = dr.select(first_numbers, numbers[1], sampler.next_2d())
         toward, incident, density_there, is_point = emission.sample(si, site, chosen, member, place, smooth)
         local = si.to_local(toward)
         value, density_here = bsdf.eval_pdf(context, si, local, smooth)
@@ -205,8 +211,8 @@ def _follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits)
         drawn, length, level = _draw(drawn, length, level, contribution, depth + 2, sampler)
 
         # ---------------------- Next direction ----------------------
-        lobe = dr.select(first_numbers, numbers[2], sampler.next_1d())
-        turn = dr.select(first_numbers, numbers[3], sampler.next_2d())
+        lobe = dr.select(smooth, lobe, sampler.next_1d())
+        turn = dr.select(smooth, turn, sampler.next_2d())
         bs, share = bsdf.sample(context, si, lobe, turn, active & ~hidden)
         full = throughput * mi.unpolarized_spectrum(share)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -239,7 +245,7 @@ def _follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits)
             delta, eta = delta | passes, dr.select(passes, 1, eta)
             state = dr.select(passes, mi.UInt32(SEEKING), state)
 
-    found = Found(radiance, drawn * dr.select(level > 0, level / dr.sum(dr.abs(drawn)), 0), length, valid)
+    found = Found(radiance, drawn * dr.select(level > 0, level / dr.sum(dr.abs(drawn)), 0), length, valid, depth)
     later.weight *= dr.select(all_later > 0, all_later / channel_mean(dr.abs(later.weight)), 0)
     dr.eval(found, vertices, later, arrival)
     return found, vertices, later, arrival

@@ -23,7 +23,7 @@ from ..lights.emission import bounding_box
 from ..lights.virtual_lights import VirtualLights
 from .cells import Cells, Lines
 from .floors import floor_of, side_of
-from .numbers import spread_numbers
+from .numbers import SpreadNumbers
 from .pilot import Arrivals
 from .remainder import PAST, FirstEdge, Limits, follow
 
@@ -142,8 +142,8 @@ def _irradiance(scene, emission, rays, limits: Limits, seed: int):
     local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
     ray, density, draw = si.spawn_ray(mi.Frame3f(facing).to_world(local)), local.z * dr.inv_pi, sampler.next_1d()
     dr.eval(si.p, nearest, ray, density, draw, site)
-    edge = FirstEdge.of(si.p, ray, ones(count) * dr.pi, density, False, PAST, site, True)
-    numbers = spread_numbers(dr.arange(mi.UInt32, count), 1, seed)
+    edge = FirstEdge.of(si.p, ray, ones(count) * dr.pi, density, False, PAST, site, 1.0, True)
+    numbers = SpreadNumbers(dr.arange(mi.UInt32, count), 1, seed)
     found, *_ = follow(scene, emission, edge, numbers, independent_sampler(derived_seed(seed, 1), count), limits)
     # Gather points further from the camera may use shorter paths only: a light stands for paths of one length, and has
     # the colour of none but these
