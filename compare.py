@@ -29,10 +29,12 @@ import re
 import shlex
 import signal
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 try:
-    from comparison import baseline, command_line, machine, metrics, references, report, sweeps, tables
+    from comparison import baseline, command_line, machine, metrics, references, report, sweeps, tables, worker
+    from comparison.cluster.connection import connected, workers
     from comparison.command_line import UsageError, parameter, positive
     from comparison.denoising import import_oidn
     from comparison.pictures import REFERENCE
@@ -44,10 +46,12 @@ except ModuleNotFoundError as missing:
     sys.exit(f"compare: the package '{missing.name}' is missing; pip install 'manylights[compare]' brings it")
 
 ROOT = Path(__file__).resolve().parent
+PACKAGED = ROOT / "comparison" / "scenes"  # where a wheel has those of the demo
+SCENES = PACKAGED if PACKAGED.is_dir() else ROOT / "scenes"
 SWEEP_SEEDS = 3  # the fewest that say something about their spread
 DEMO = [
-    str(ROOT / "scenes" / "hall.xml"), "--integrators", "path,manylights", "--time", "30",
-    "--reference", str(ROOT / "scenes" / "hall_reference.exr"),
+    str(SCENES / "hall.xml"), "--integrators", "path,manylights", "--time", "30",
+    "--reference", str(SCENES / "hall_reference.exr"),
 ]  # fmt: skip
 
 
@@ -142,6 +146,10 @@ def _add_output(parser):
         help="a results.json: fail if a speed-up at equal error has fallen since, and say which")  # fmt: skip
     add("--check-share", type=_share, default=0.2, metavar="FRACTION",
         help="by how much a speed-up may fall (default: 0.2)")  # fmt: skip
+    add("--workers", type=workers, metavar="N|ADDRESS",
+        help="make the runs on N processes, or on the workers of the Dask scheduler at an address such as "
+             "tcp://HOST:8786: errors are what they are elsewhere, times of different machines are not to be compared "
+             "(docs/cluster.md)")  # fmt: skip
     add("--demo", action="store_true", help="path and manylights on scenes/hall.xml, in less than three minutes")
 
 
@@ -232,11 +240,14 @@ def run(options, command):
     command_line.set_variant(options.mode)
     settings = chosen_settings(options)
     check_scenes(options.scenes, options.reference)
+    if options.workers and options.reference.kind == "vpl":
+        raise UsageError("--reference vpl shares files between runs, which --workers cannot; choose another reference")
     names = map(short_name, options.scenes)
     earlier = baseline.read(options.check, options.metric, names) if options.check else None
     command_line.make_folder(options.out)
-    with locked(options.out / ".lock", f"another comparison is writing to '{options.out}'"):
-        results = _compare(options, settings, command)
+    lock = locked(options.out / ".lock", f"another comparison is writing to '{options.out}'")
+    with lock, _runner(options) as runner:
+        results = _compare(options, settings, command, runner)
     print(tables.EXPLANATION, end="\n\n")
     print(*results["summary"]["sentences"], sep="\n", end="\n\n")
     print(f"report: {options.out / 'report.html'}")
@@ -248,20 +259,36 @@ def run(options, command):
     return 3 if worse else 0
 
 
-def _compare(options, settings, command):
+@contextmanager
+def _runner(options):
+    """Give what makes the runs in the block: processes of this machine, or workers."""
+    if not options.workers:
+        yield worker
+        return
+    with connected(options.workers, options.threads) as pool:
+        from comparison.cluster.runs import DistributedRuns
+
+        yield DistributedRuns(pool)
+
+
+def _compare(options, settings, command, runner):
     """Make all runs, and write the report after each scene; return the content of `results.json`."""
-    store = Runs(options.out, {"versions": machine.versions(), "machine": machine.identity()})
+    made_by = {"versions": machine.versions(), "machine": machine.identity()}
+    store = Runs(options.out, made_by | ({"workers": True} if options.workers else {}))
     progress = Progress(options.scenes, sweeps.order(settings, options.seeds))
     done = []
+    comparisons = [SceneComparison(path, settings, options, store, progress, runner) for path in options.scenes]
     try:
-        for path in options.scenes:
-            comparison = SceneComparison(path, settings, options, store, progress)
+        for comparison in comparisons:
             complete = False
             try:
+                # Workers go on with the next scenes while the last runs on one are made
+                for one in comparisons if options.workers and not done else [comparison]:
+                    one.prepare()
                 comparison.run()
                 complete = len(done) + 1 == len(options.scenes)
             finally:  # an interruption, too, leaves a report of what there is
-                progress.skip(path)
+                progress.skip(comparison.path)
                 store.forget_kernels()  # of this scene; room for pictures and report
                 comparison.finish()
                 done.append(comparison)
@@ -287,6 +314,11 @@ def main(arguments=None):
     )
 
 
-if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
+def start():
+    """Run the command as the process that it has to itself: SIGTERM ends it as Ctrl-C does."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(main())
+
+
+if __name__ == "__main__":
+    start()

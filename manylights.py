@@ -15,6 +15,10 @@ that and k; see comparison/rendering.py. An EXR file gets all channels, and how 
 tone-mapped. With --denoise an EXR file FILE.exr gets a denoised one, FILE.denoised.exr, beside it; a PNG file shows the
 denoised image.
 
+With --workers passes are rendered by several processes or machines, see docs/cluster.md. Several scenes, --frames with
+{frame} in the values of -D, and --sensor all make many images, one after the other; what fails is told, the others are
+rendered. --resume goes on from the checkpoint of an image that was not finished.
+
 In Python, `manylights.render(scene, error=0.02)` does the same, and `import manylights` registers the plugins, for the
 variant that is set and each that will be.
 
@@ -24,7 +28,7 @@ Exit status: 0; 1 if rendering failed; 2 for a command that makes no sense; 130 
 
 import argparse
 import sys
-import time
+from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -44,19 +48,17 @@ def require_own(*packages):
 require_own("comparison", "integrators", "vpl")
 
 import mitsuba as mi
-import numpy as np
-from tqdm import tqdm
 
 import integrators  # noqa: F401 (registers the plugins)
-from comparison import command_line, images
+from comparison import batch, command_line
+from comparison.cluster.connection import connected, workers
 from comparison.command_line import UsageError, parameter, positive
 from comparison.denoising import import_oidn
-from comparison.interruption import Deadline
+from comparison.one_image import INTERRUPTED, Failed, Image, LazyScene
 from comparison.render import Took, render
 from comparison.scene_files import SceneFile
 
 __all__ = ["Took", "main", "render"]
-CHECKPOINT_SECONDS = 10.0
 DEFAULT, OWN = "manylights", "scene"  # the integrator to render with, and what stands for the scene's own
 SAME_IMAGE = ("path", "prb", "volpath", "volpathmis")  # without participating media, all of them estimate what it does
 
@@ -67,9 +69,13 @@ def parse(arguments):
         prog="manylights", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    add("scene", metavar="SCENE", type=Path, help="scene file (XML)")
-    add("-o", "--output", type=Path, metavar="FILE", help=".exr or .png (default: the scene's name, with .exr)")
-    add("--sensor", type=int, default=0, metavar="INDEX", help="sensor to render with (default: 0)")
+    add("scenes", metavar="SCENE", nargs="+", type=Path, help="scene files (XML)")
+    add("-o", "--output", type=Path, metavar="FILE",
+        help=".exr or .png, in which {scene}, {frame} and {sensor} are replaced where there are several images, or a "
+             "folder (default: the scene's name, with .exr)")  # fmt: skip
+    add("--sensor", type=batch.sensor, default=0, metavar="INDEX", help="sensor to render with, or 'all' (default: 0)")
+    add("--frames", type=batch.frames, metavar="FIRST..LAST",
+        help="render an image for each number, which replaces {frame} in the values of -D and in --output")  # fmt: skip
     add("-i", "--integrator", metavar="NAME",
         help="integrator that replaces the scene's, keeping its max_depth, rr_depth and hide_emitters; 'scene' is the "
              "scene's own (default: manylights where the scene has path, or one that estimates the same, or none; "
@@ -87,23 +93,29 @@ def parse(arguments):
     add("--denoise", action="store_true", help="denoise by Open Image Denoise (pip install 'manylights[denoise]')")
     add("-s", "--seed", type=command_line.seed, default=0, metavar="N", help="seed (default: 0)")
     add("--pass-spp", type=positive(int), metavar="N",
-        help="samples per pixel of one pass (default: as many as take two seconds)")  # fmt: skip
+        help="samples per pixel of one pass (default: as many as take two seconds; with --workers, what the image "
+             "alone decides)")  # fmt: skip
+    add("--workers", type=workers, metavar="N|ADDRESS",
+        help="render passes on N processes, or on the workers of the Dask scheduler at an address such as "
+             "tcp://HOST:8786 (pip install 'manylights[cluster]'; docs/cluster.md)")  # fmt: skip
+    add("--resume", action="store_true",
+        help="go on from FILE.checkpoint.npz, if it is there, which this option and --workers leave beside an image "
+             "that is not finished")  # fmt: skip
     add("--exposure", type=float, metavar="STOPS",
         help="scale PNG images by 2^STOPS (default: bring the 95th percentile of the brightness to 0.8)")  # fmt: skip
     command_line.add_common_options(parser)
     options = parser.parse_args(arguments)
-    options.output = options.output or options.scene.with_suffix(".exr")
-    if options.output.suffix not in (".exr", ".png"):
+    if options.output and not options.output.is_dir() and options.output.suffix not in (".exr", ".png"):
         parser.error(f"cannot write '{options.output}': the output must be an .exr or a .png file")
     return options
 
 
-def load(options):
-    """Return the scene, and which integrator it is rendered with, for metadata: its name, its parameters, and the name
-    of the one of the scene that it replaces by default (None if it does not). Raises UsageError for what does not
+def parse_scene(options):
+    """Return the `SceneFile`, and which integrator it is rendered with, for metadata: its name, its parameters, and the
+    name of the one of the scene that it replaces by default (None if it does not). Raises UsageError for what does not
     exist."""
     command_line.check_scene(options.scene)
-    folder = options.output.absolute().parent
+    folder = batch.output(options, 0).absolute().parent
     if not folder.is_dir():
         raise UsageError(f"no folder '{folder}' for the output")
     command_line.set_variant(options.mode)
@@ -115,11 +127,9 @@ def load(options):
     elif options.param:
         file.set_integrator(name, dict(options.param), keep=None)
     replaced = None if options.integrator or name == own else own
-    described = {"integrator": name, "parameters": file.integrator[1], "replaced": replaced}
-    scene = file.load(options.threads)
-    if not 0 <= options.sensor < len(scene.sensors()):
-        raise UsageError(f"no sensor {options.sensor}: the scene has {len(scene.sensors())}")
-    return scene, described
+    if options.sensor != batch.ALL and options.sensor >= file.sensors:
+        raise UsageError(f"no sensor {options.sensor}: the scene has {file.sensors}")
+    return file, {"integrator": name, "parameters": file.integrator[1], "replaced": replaced}
 
 
 def chosen_integrator(asked, file):
@@ -136,101 +146,46 @@ def chosen_integrator(asked, file):
     return own
 
 
-class Output:
-    """The file that an image is written to, with what is known of it before it is rendered (`metadata`, a dict)."""
-
-    def __init__(self, options, metadata):
-        self._options, self._metadata = options, metadata
-        self._image, self._took, self._written = None, None, time.monotonic()
-
-    def keep(self, took, image):
-        """Take an image, and write it if that was not done for some time."""
-        self._image, self._took = np.array(image), took
-        if time.monotonic() - self._written > CHECKPOINT_SECONDS:
-            self.write()
-            self._written = time.monotonic()
-
-    def end_early(self):
-        """Write the last image that was taken, say so, and return the exit status."""
-        if self._took is None:
-            print("manylights: interrupted before the first pass was finished; nothing was written", file=sys.stderr)
-        else:
-            self.write()
-            done = f"{self._took.spp} samples per pixel to {self._options.output}"
-            print(f"manylights: interrupted; wrote {done}", file=sys.stderr)
-        return 130
-
-    def write(self):
-        """Write the last image that was taken."""
-        path, took, image = self._options.output, self._took, self._image
-        if path.suffix == ".png":
-            rgb = images.colour(image, took.channels)
-            exposure = images.automatic_exposure(rgb) if self._options.exposure is None else 2.0**self._options.exposure
-            images.write_png(path, images.tone_map(rgb, exposure))
-            return
-        metadata = self._metadata | {
-            "spp": took.spp,
-            "passes": took.passes,
-            "render_seconds": took.seconds,
-            "estimated_error": took.error,
-            "ended_by": took.ended_by,
-            "statistics": took.statistics,
-        }
-        if took.raw is not None:
-            described = metadata | {"denoise_seconds": took.denoise_seconds}
-            images.write_exr(path.with_suffix(".denoised.exr"), image, took.channels, described)
-            image = np.array(took.raw)
-        images.write_exr(path, image, took.channels, metadata)
-
-
 def run(options):
-    """Load, render and write; return the exit status."""
-    begin = time.perf_counter()
+    """Render and write all images; return the worst of their exit statuses. Of several, one that fails is told, and the
+    others are rendered."""
     if options.denoise:
         import_oidn()
-    scene, integrator = load(options)
-    if options.verbose:
-        mi.set_log_level(mi.LogLevel.Info)
-    name = integrator["integrator"]
-    if integrator["replaced"]:
-        name += f" in place of {integrator['replaced']}"
-        mi.Log(mi.LogLevel.Info, f"The integrator is {name}; with -i {OWN} it would be the scene's.")
-    output = Output(options, {
-        "scene": str(options.scene),
-        **integrator,
-        "variant": options.mode,
-        "seed": options.seed,
-        "load_seconds": time.perf_counter() - begin,
-        **command_line.versions(),
-    })  # fmt: skip
-    try:
-        image, took = _render(scene, options, output)
-    except KeyboardInterrupt:
-        return output.end_early()
-    output.keep(took, image)
-    if took.ended_by == "interruption":
-        return output.end_early()
-    output.write()
-    error = "" if took.error is None else f", error {took.error:.2%}"
-    print(f"{options.output}: {name}, {took.spp} samples per pixel, {took.seconds:.2f} s{error}")
-    return 0
+    wanted = batch.images(options)
+    several, status = len(wanted) > 1 or options.sensor == batch.ALL, 0
+    with ExitStack() as stack:
+        images = _images(wanted, options, stack)
+        # A time is that of one image after the other
+        for image in batch.ahead(images) if options.workers and not options.time else images:
+            try:
+                found = image.run()
+            except Exception as error:
+                if options.verbose or not several:
+                    raise
+                print(f"manylights: {image.path}: {command_line.explain(error)}", file=sys.stderr)
+                found = 1
+            status = max(status, found)
+            if found == INTERRUPTED:
+                break
+    return status
 
 
-def _render(scene, options, output):
-    """Render with a bar, and write now and then."""
-    limited = options.spp or not (options.time or options.error)
-    spp = options.spp or (scene.sensors()[options.sensor].sampler().sample_count() if limited else None)
-    with tqdm(total=spp, unit="spp", disable=None) as bar, Deadline(output.end_early):
-
-        def progress(took, image):
-            bar.set_postfix({} if took.error is None else {"error": f"{took.error:.2%}"}, refresh=False)
-            bar.update(took.spp - bar.n)
-            output.keep(took, image)
-
-        return render(
-            scene, sensor=options.sensor, error=options.error, time=options.time, spp=spp, seed=options.seed,
-            denoise=options.denoise, progress=progress, pass_spp=options.pass_spp,
-        )  # fmt: skip
+def _images(wanted, options, stack):
+    """Yield the `Image` of each sensor of the scenes of `wanted`, a list of options; workers are let go with the
+    `stack`."""
+    pool = None
+    for one in wanted:
+        try:
+            file, described = parse_scene(one)
+            if options.verbose:
+                mi.set_log_level(mi.LogLevel.Info)
+            if options.workers and pool is None:  # not before it is known that there is something to render
+                pool = stack.enter_context(connected(options.workers, options.threads))
+            scene = LazyScene(file, options.threads)
+            for sensor in range(file.sensors) if options.sensor == batch.ALL else [options.sensor]:
+                yield Image(one, scene, described, sensor, pool)
+        except Exception as error:
+            yield Failed(batch.output(one, 0), error)
 
 
 def main(arguments=None):

@@ -4,6 +4,11 @@
 `rendering`     average passes of different seeds, within samples or seconds
 `render`, `pass_sizes`, `convergence`, `interruption`
                 an image that ends by itself: passes of about two seconds, the error that is left, Ctrl-C
+`checkpoint`    what a render goes on from that was not finished
+`one_image`, `batch`
+                an image of the command, rendered here or by workers; which images, of frames, scenes and sensors
+`occasional`    files that are written every now and then
+`cluster/`      passes and runs on several processes or machines
 `denoising`     Open Image Denoise, and the albedo and normals that guide it
 `images`        EXR files with metadata, tone mapping, false colours
 `metrics`       how far an image is from a reference

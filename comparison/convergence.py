@@ -5,6 +5,8 @@ film's filter are (a filter wider than a pixel makes neighbours alike, but not p
 them says how far their average is from that expectation.
 """
 
+from itertools import accumulate
+
 import numpy as np
 
 SHARE = 0.95  # of the pixels whose error is to be below the one that is asked for
@@ -40,6 +42,15 @@ class ErrorEstimate:
         self._sum = self._sum + weight * level
         self._first_moment = self._first_moment + weight**2 * level
         self._second_moment = self._second_moment + weight**2 * level**2
+
+    @property
+    def state(self):
+        """What it holds, name -> number or array: all that another one needs to go on (settable)."""
+        return dict(vars(self))
+
+    @state.setter
+    def state(self, values):
+        vars(self).update(values)
 
     @property
     def standard_error(self):
@@ -97,9 +108,17 @@ class ErrorGoal:
 
     def is_due(self, progressive):
         """Is it time to look at the passes of a `Progressive`?"""
-        if len(progressive.passes) < LEAST_PASSES or progressive.spp < self._next:
+        return self._is_due(len(progressive.passes), progressive.spp)
+
+    def resume(self, passes):
+        """Leave out the looks that were taken at a list of passes (`Pass`) which a render goes on from."""
+        for count, spp in enumerate(accumulate(one.spp for one in passes), 1):
+            self._is_due(count, spp)
+
+    def _is_due(self, count, spp):
+        if count < LEAST_PASSES or spp < self._next:
             return False
-        self._next = GROWTH * progressive.spp
+        self._next = GROWTH * spp
         return True
 
     def is_reached(self, found):

@@ -4,6 +4,7 @@ EXR files are OpenEXR's matter rather than Mitsuba's, whose writer waits for eve
 """
 
 import json
+import math
 import os
 import re
 from contextlib import contextmanager
@@ -68,7 +69,7 @@ def _fits_attribute(value):
 
 def read_exr(path):
     """Return the image (height, width, channels) float32, the names of its channels (sorted), and its metadata: a dict
-    of numbers and strings."""
+    of finite numbers and strings."""
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = sorted(file.channels())
         image = np.stack([file.channels()[name].pixels.astype(np.float32) for name in channels], axis=-1)
@@ -82,7 +83,9 @@ def read_exr_metadata(path):
 
 
 def _plain(header):
-    return {key: value for key, value in header.items() if isinstance(value, int | float | str)}
+    # Reports are JSON, which has no number that is not finite
+    kept = {key: value for key, value in header.items() if isinstance(value, int | float | str)}
+    return {key: value for key, value in kept.items() if isinstance(value, str) or math.isfinite(value)}
 
 
 def colour(image, channels, layer=""):

@@ -50,11 +50,12 @@ def load():
 
 def versions():
     """Return the versions (text) of what made a comparison; "sources" is a hash of this project's."""
-    return command_line.versions() | {"python": platform.python_version(), "sources": _sources()}
+    return command_line.versions() | {"python": platform.python_version(), "sources": sources()}
 
 
-def _sources():
+def sources(patterns=SOURCES):
+    """Return a hash (hexadecimal) of those of this project's files that match one of some patterns."""
     digest = hashlib.sha256()
-    for file in sorted(file for pattern in SOURCES for file in ROOT.glob(pattern)):
+    for file in sorted({file for pattern in patterns for file in ROOT.glob(pattern)}):
         digest.update(f"{file.relative_to(ROOT)}\0".encode() + file.read_bytes())
     return digest.hexdigest()[:16]

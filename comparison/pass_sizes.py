@@ -28,12 +28,14 @@ class PassSizes:
         self._spp, self._time, self._fixed, self._many = spp, time, fixed, many
         self._largest = _power_of_two(largest_pass(pixels))
         self._least = USUAL if USUAL * pixels <= FIRST_SAMPLES else 1
-        self._current, self._seconds = fixed or self._least, {}
+        self._current, self._seconds, self._asked = fixed or self._least, {}, None
 
     def next(self, passes, elapsed):
         """Return the samples per pixel of the pass that follows `passes` (list of `Pass`) after `elapsed` seconds, or
         what has ended the render: "spp" or "time"."""
         done = sum(one.spp for one in passes)
+        if passes and self._asked is None:  # it goes on from these
+            self._asked = passes[-1].spp
         if passes:
             self._learn(passes[-1].seconds, done)
         size = self._current

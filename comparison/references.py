@@ -103,7 +103,7 @@ def read(path):
     bad = sum(int((~np.isfinite(layer)).any(axis=-1).sum()) for layer in (colour, error) if layer is not None)
     if bad:
         raise ValueError(f"the reference '{path}' has {bad} pixels that are not finite")
-    return Reference(colour, error, {"file": str(path), **metadata})
+    return Reference(colour, error, {**metadata, "file": str(path)})
 
 
 def write(path, image, standard_error, description, half=False):
@@ -142,7 +142,7 @@ def _read_batches(file):
         return Batches()
     try:
         return Batches.read(file)
-    except (OSError, RuntimeError, KeyError, ValueError) as error:
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"the kept reference '{file}' cannot be read ({error}); delete it to make it anew") from error
 
 

@@ -1,7 +1,11 @@
 """`manylights.render`: an image that ends by itself, when it has the samples, the seconds or the error asked for."""
 
+from __future__ import annotations
+
 import time as clock
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -9,6 +13,8 @@ import numpy as np
 from integrators.knobs import doubt_percentage
 from vpl.core.exclusive import exclusive
 
+from .batch import ALL
+from .checkpoint import Checkpoint
 from .convergence import ErrorGoal
 from .denoising import Denoiser
 from .interruption import Interruption
@@ -33,26 +39,39 @@ class Took:
     passes: int
     seconds: float
     error: float | None
-    statistics: dict = field(repr=False)
+    statistics: dict[str, Any] = field(repr=False)
     ended_by: str | None
-    channels: list
+    channels: list[str]
     denoise_seconds: float = 0.0
-    raw: object = field(default=None, repr=False)
+    raw: mi.TensorXf | None = field(default=None, repr=False)
 
 
 def render(
-    scene, integrator=None, sensor=0, *, error=None, time=None, spp=None, seed=0, denoise=False, progress=None,
-    pass_spp=None,
-):  # fmt: skip
+    scene: mi.Scene,
+    integrator: mi.Integrator | str | None = None,
+    sensor: int | str = 0,
+    *,
+    error: float | None = None,
+    time: float | None = None,
+    spp: int | None = None,
+    seed: int = 0,
+    denoise: bool = False,
+    progress: Callable[[Took, mi.TensorXf], bool | None] | None = None,
+    pass_spp: int | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> tuple[mi.TensorXf, Took]:
     """Render a scene in passes of about two seconds; return the image, a `mi.TensorXf` of shape (height, width,
     channels) as of `mi.render`, and what it took (`Took`).
 
-    `integrator`: a `mi.Integrator` or the name of one, by default the scene's; `sensor`: its index. The render ends as
-    soon as one of these is reached, of which any may be given: `error`, the relative standard error that 95% of the
-    pixels are to be below; `time`, in seconds, compilation included; `spp`, samples per pixel (if none is given, the
-    scene's). There is always one pass. `seed`: of the first pass; the others have hashes of it. `denoise`: return the
-    denoised image, see denoising.py. `progress`: called after each pass with what it took so far and the image so far;
-    if it returns False, the render ends. `pass_spp`: samples per pixel of a pass, instead of two seconds.
+    `integrator`: a `mi.Integrator` or the name of one, by default the scene's; `sensor`: its index, or "all" for a list
+    of what is returned for each sensor, one after the other. The render ends as soon as one of these is reached, of
+    which any may be given: `error`, the relative standard error that 95% of the pixels are to be below; `time`, in
+    seconds, compilation included; `spp`, samples per pixel (if none is given, the scene's). There is always one pass.
+    `seed`: of the first pass; the others have hashes of it. `denoise`: return the denoised image, see denoising.py.
+    `progress`: called after each pass with what it took so far and the image so far; if it returns False, the render
+    ends. `pass_spp`: samples per pixel of a pass, instead of two seconds. `checkpoint`: a `checkpoint.Checkpoint` that
+    the render of one sensor goes on from, counting its samples and seconds; it is kept for another one to go on from,
+    unless this one ends by what was asked for.
 
     After Ctrl-C, or `cancel()` of the integrator, the image of the finished passes is returned. Where there are none,
     KeyboardInterrupt is raised, or RuntimeError after `cancel()`; and KeyboardInterrupt by a second Ctrl-C.
@@ -61,7 +80,12 @@ def render(
     integrator if none is given; ModuleNotFoundError for `denoise` without the package that it needs; RuntimeError where
     another thread renders with the same sensor.
     """
-    _check(error=error, time=time, spp=spp, pass_spp=pass_spp)
+    if sensor == ALL:
+        return _render_all(
+            scene, integrator, error=error, time=time, spp=spp, seed=seed, denoise=denoise, progress=progress,
+            pass_spp=pass_spp,
+        )  # fmt: skip
+    check(error=error, time=time, spp=spp, pass_spp=pass_spp)
     doubt_percentage("error", error or 0)
     if not 0 <= sensor < len(scene.sensors()):
         raise ValueError(f"sensor must be from 0 to {len(scene.sensors()) - 1}, got {sensor!r}")
@@ -69,17 +93,45 @@ def render(
         spp = scene.sensors()[sensor].sampler().sample_count()
     begin = clock.perf_counter()
     denoiser = Denoiser(scene, sensor, seed) if denoise else None
-    running = _Render(Progressive(scene, seed, sensor, _integrator(scene, integrator)), begin, progress)
+    progressive = Progressive(scene, seed, sensor, _integrator(scene, integrator))
     reserved = denoiser.filter_seconds if denoiser else 0.0
-    sizes = PassSizes(running.progressive.pixels, spp, time and time - reserved, pass_spp, many=error is not None)
-    with exclusive(sensor=scene.sensors()[sensor]), Interruption() as interruption:
-        running.run(sizes, error and ErrorGoal(error), interruption)
-    if not running.progressive.passes:
+    sizes = PassSizes(progressive.pixels, spp, time and time - reserved, pass_spp, many=error is not None)
+    if checkpoint:
+        begin -= checkpoint.restore(progressive)
+    with exclusive(sensor=scene.sensors()[sensor]):
+        return render_passes(progressive, sizes, error, begin, progress, denoiser, checkpoint)
+
+
+def _render_all(scene, integrator, **limits):
+    """Return what `render` returns for each sensor; none follows one that somebody ended early."""
+    found = []
+    for sensor in range(len(scene.sensors())):
+        found.append(render(scene, integrator, sensor, **limits))
+        if found[-1][1].ended_by in ("interruption", "progress"):
+            break
+    return found
+
+
+def render_passes(progressive, sizes, error, begin, progress=None, denoiser=None, checkpoint=None):
+    """Render passes until something ends it; return the image and what it took, as `render`.
+
+    `progressive` makes and adds up the passes (`rendering.Progressive`, or `cluster.passes.DistributedPasses`), and may
+    have some from the checkpoint; `sizes` says how large they are (`PassSizes`); `begin` is when the render began (of
+    `perf_counter`), earlier by what the passes of the checkpoint took.
+    """
+    running = _Render(progressive, begin, progress, checkpoint)
+    goal = ErrorGoal(error) if error else None
+    if goal:
+        goal.resume(progressive.passes)
+    with Interruption() as interruption:
+        running.run(sizes, goal, interruption)
+    if not progressive.passes:
         raise KeyboardInterrupt if interruption.asked else RuntimeError("cancelled before the first pass was finished")
     return running.result(denoiser)
 
 
-def _check(**values):
+def check(**values):
+    """Raise ValueError for limits of a render, given by name (None: not given), that are not positive."""
     for name, value in values.items():
         if value is None:
             continue
@@ -103,15 +155,25 @@ def _integrator(scene, integrator):
 class _Render:
     """A render that began at a time (of `perf_counter`): its passes, and what ended it."""
 
-    def __init__(self, progressive, begin, progress):
+    def __init__(self, progressive, begin, progress, checkpoint):
         self.progressive, self._begin, self._progress = progressive, begin, progress
+        self._checkpoint = checkpoint
         self._error, self._ended_by = None, None
 
     def run(self, sizes, goal, interruption):
-        """Render passes until something ends it."""
+        """Render passes until something ends it; leave a checkpoint unless nothing is missing."""
+        try:
+            self._run(sizes, goal, interruption)
+        finally:
+            if self._checkpoint and self._ended_by in (None, "interruption"):
+                self._checkpoint.save()
+            elif self._checkpoint:
+                self._checkpoint.remove()
+
+    def _run(self, sizes, goal, interruption):
 
         def interrupted():
-            return interruption.asked or self.progressive.integrator.should_stop()
+            return interruption.asked or self.progressive.should_stop()
 
         while self._ended_by is None:
             size = sizes.next(self.progressive.passes, clock.perf_counter() - self._begin)
@@ -126,10 +188,12 @@ class _Render:
             if one is not None:
                 self._look(goal)
             if one is None or interrupted():
-                self._ended_by = "interruption"
+                self._ended_by = "time" if self.progressive.is_late() else "interruption"
 
     def _look(self, goal):
         """See whether the last pass was enough, and tell how far it is."""
+        if self._checkpoint:
+            self._checkpoint.keep(clock.perf_counter() - self._begin)
         if goal and goal.is_due(self.progressive):
             self._error = self.progressive.estimate.relative()
             if goal.is_reached(self._error):

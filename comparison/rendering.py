@@ -44,57 +44,59 @@ class Pass:
     statistics: dict = field(default_factory=dict)
 
 
-class Progressive:
-    """The running average of passes of one scene, weighted by their samples per pixel.
+@dataclass
+class PassImage:
+    """Image of one pass: `planes`, (height, width, channels) float32, the average of its samples; the names of its
+    `channels`; and the `Pass` itself, `taken`."""
 
-    `channels` are the names of the image's channels ("R", "G", "B", and those of AOVs), known after the first pass;
-    `integrator` is the scene's unless another one is given; `estimate` is the `ErrorEstimate` of the passes.
+    planes: np.ndarray
+    channels: list
+    taken: Pass
+
+
+def render_pass(scene, sensor, integrator, spp, seed):
+    """Render a pass of `spp` samples per pixel (samplers with strata round them up) and return it, a `PassImage`.
+    `sensor` is its index."""
+    sensor = scene.sensors()[sensor]
+    # Asked before the render: some integrators, such as `prb`, sample with a clone
+    with _sample_count(sensor.sampler(), spp) as spp:
+        begin = time.perf_counter()
+        image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
+        dr.eval(image)
+        dr.sync_thread()
+        seconds = time.perf_counter() - begin
+    # Not the image that `mi.render` returned: it lacks channels of nested integrators, and names.
+    bitmap = sensor.film().bitmap()
+    channels = [entry.name for entry in bitmap.struct_()]
+    planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
+    statistics = dict(getattr(integrator, "statistics", None) or {})
+    return PassImage(planes, channels, Pass(seed, spp, seconds, statistics))
+
+
+class Passes:
+    """The running average of passes with a common seed, weighted by their samples per pixel.
+
+    It depends on the passes and their order alone. `channels` are the names of the image's channels ("R", "G", "B", and
+    those of AOVs), known after the first pass; `passes` is the list of them (`Pass`), `estimate` their `ErrorEstimate`.
     """
 
-    def __init__(self, scene, seed, sensor=0, integrator=None):
-        self._scene, self.seed = scene, seed
-        self._sensor = scene.sensors()[sensor]
-        self.integrator = integrator or scene.integrator()
-        self.channels = []
+    def __init__(self, seed):
+        self.seed = seed
         self.restart()
 
     def restart(self):
         """Forget all passes."""
-        self.passes, self._sum, self.estimate = [], 0.0, ErrorEstimate()
+        self.passes, self.channels, self.sum, self.estimate = [], [], 0.0, ErrorEstimate()
 
-    def render(self, spp, seed=None, accept=lambda: True):
-        """Render one more pass of `spp` samples per pixel and return it (a `Pass`).
-
-        Samplers with strata round the samples up: the pass says how many they were. Its seed is `pass_seed(seed of the
-        render, number of the pass)` unless `seed` is given. A pass that raises leaves the average as it was, and so
-        does one that `accept` refuses when it is finished (None is returned).
-        """
-        seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
-        # Asked before the render: some integrators, such as `prb`, sample with a clone
-        with _sample_count(self._sensor.sampler(), spp) as spp:
-            begin = time.perf_counter()
-            image = mi.render(self._scene, sensor=self._sensor, integrator=self.integrator, seed=seed, spp=spp)
-            dr.eval(image)
-            dr.sync_thread()
-            seconds = time.perf_counter() - begin
-        if not accept():
-            return None
-        # Not the image that `mi.render` returned: it lacks channels of nested integrators, and names.
-        bitmap = self._sensor.film().bitmap()
-        self.channels = [entry.name for entry in bitmap.struct_()]
-        statistics = dict(getattr(self.integrator, "statistics", None) or {})
-        height, width = bitmap.size()[1], bitmap.size()[0]
+    def add(self, image):
+        """Add a `PassImage`, and return its `Pass`."""
         # In double precision, as a long sum of floats would drift.
-        planes = np.array(bitmap, dtype=np.float64).reshape(height, width, -1)
-        self._sum = self._sum + spp * planes
-        self.estimate.add(_shown(planes, self.channels), spp)
-        self.passes.append(Pass(seed, spp, seconds, statistics))
-        return self.passes[-1]
-
-    @property
-    def pixels(self):
-        """Number of pixels of the image."""
-        return int(np.prod(self._sensor.film().crop_size()))
+        planes, one = image.planes.astype(np.float64), image.taken
+        self.channels = image.channels
+        self.sum = self.sum + one.spp * planes
+        self.estimate.add(_shown(planes, self.channels), one.spp)
+        self.passes.append(one)
+        return one
 
     @property
     def spp(self):
@@ -103,13 +105,46 @@ class Progressive:
 
     @property
     def seconds(self):
-        """Wall-clock seconds of all passes."""
+        """Wall-clock seconds of all passes, each by itself."""
         return sum(one.seconds for one in self.passes)
 
     @property
     def image(self):
         """The average, (height, width, channels) float64."""
-        return self._sum / self.spp
+        return self.sum / self.spp
+
+
+class Progressive(Passes):
+    """The running average of passes of one scene that this process renders. `integrator` is the scene's unless another
+    one is given."""
+
+    def __init__(self, scene, seed, sensor=0, integrator=None):
+        super().__init__(seed)
+        self._scene, self._sensor = scene, sensor
+        self.integrator = integrator or scene.integrator()
+
+    def render(self, spp, seed=None, accept=lambda: True):
+        """Render one more pass of `spp` samples per pixel and return it (a `Pass`).
+
+        Its seed is `pass_seed(seed of the render, number of the pass)` unless `seed` is given. A pass that raises
+        leaves the average as it was, and so does one that `accept` refuses when it is finished (None is returned).
+        """
+        seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
+        image = render_pass(self._scene, self._sensor, self.integrator, spp, seed)
+        return self.add(image) if accept() else None
+
+    def should_stop(self):
+        """Was the integrator's `cancel` called?"""
+        return self.integrator.should_stop()
+
+    def is_late(self):
+        """Was there no time for a pass? It is not for this one to know."""
+        return False
+
+    @property
+    def pixels(self):
+        """Number of pixels of the image."""
+        return int(np.prod(self._scene.sensors()[self._sensor].film().crop_size()))
 
 
 @contextmanager

@@ -20,23 +20,39 @@ class SceneComparison:
 
     `options` are those of compare.py's command line, `store` keeps finished runs (`runs.Runs`), `progress` is told what
     is done (`progress.Progress`). `result` is the scene's part of `results.json`, complete after `finish`; `pictures`
-    are then those to show.
+    are then those to show. `runner` makes the runs: `worker`, in processes of this machine, or
+    `cluster.runs.DistributedRuns`.
     """
 
-    def __init__(self, path, settings, options, store, progress):
+    def __init__(self, path, settings, options, store, progress, runner=worker):
         self.path, self.settings, self.options = path, settings, options
-        self._store, self._progress = store, progress
+        self._store, self._progress, self._runner = store, progress, runner
         self._reference, self.pictures = None, None
         self.result = {"scene": str(path), "name": short_name(path), "renders": []}
 
-    def run(self):
-        """Make all runs. What fails is recorded, and the others go on."""
+    def prepare(self):
+        """Read the scene, get the reference that it begins with, and tell a runner that makes several runs at once
+        which are to come. What fails is recorded. What is done already is not done again."""
+        if "hash" in self.result or "error" in self.result:
+            return
         try:
             file = self._parse()
             self.result["hash"] = file.fingerprint()
             self._reference = self._first_reference(file)
+            if self._runner is not worker:
+                self._expect_runs()
         except Exception as error:  # whatever it is, it must not lose the other scenes
             self._fail(error)
+
+    def _expect_runs(self):
+        for setting, seed in order(self.settings, self.options.seeds):
+            job = self._job(setting, seed)
+            if not (self.options.resume and self._store.find(job)):
+                self._runner.expect(job, SceneFile(self.path, dict(self.options.define)))
+
+    def run(self):
+        """Make all runs. What fails is recorded, and the others go on."""
+        if "error" in self.result:
             return
         for setting, seed in order(self.settings, self.options.seeds):
             self._render(setting, seed)
@@ -138,12 +154,11 @@ class SceneComparison:
 
     def _render(self, setting, seed):
         job = self._job(setting, seed)
-        job.run = self._store.key(job, self.result["hash"])
         result = self._store.find(job) if self.options.resume else None
         kept = result is not None
         self._progress.begin(self.path, setting)
         if not kept:
-            result = worker.run(job, self._progress.tick)
+            result = self._runner.run(job, self._progress.tick)
             self._keep(result)
         result |= {"setting": setting.name, "swept": setting.swept, "denoised": False}
         self._progress.end(kept)
@@ -166,7 +181,7 @@ class SceneComparison:
         with_vpl = options.reference.kind == "vpl" and shares
         of_seed = f".seed{seed}" if len(options.seeds) > 1 else ""
         denoised = options.out / f"{name}.{setting.file_name}.denoised{of_seed}.exr"
-        return worker.Job(
+        job = worker.Job(
             label=setting.label,
             integrator=setting.integrator,
             parameters=setting.parameters,
@@ -187,6 +202,8 @@ class SceneComparison:
             kernel_cache=None if options.cold else str(self._store.kernels / f"{name}.{setting.label}"),
             cold=options.cold,
         )
+        job.run = self._store.key(job, self.result["hash"])
+        return job
 
     def _finished(self):
         return [result for result in self.result["renders"] if "error" not in result]

@@ -5,7 +5,6 @@ before any object is created, so a scene may name an integrator that is replaced
 """
 
 import hashlib
-import os
 from contextlib import suppress
 from pathlib import Path
 
@@ -26,16 +25,19 @@ def short_name(path):
 class SceneFile:
     """A parsed scene file. A variant must be set.
 
-    `path` is an XML file and `defines` maps the names of `$parameters` to text. Raises RuntimeError, with Mitsuba's
-    message, for what does not parse, and ValueError for a scene that cannot be rendered as it is.
+    `path` is an XML file and `defines` maps the names of `$parameters` to text; `changes` are those that were made
+    since, a list of the name of a method and its arguments. Raises RuntimeError, with Mitsuba's message, for what does
+    not parse, and ValueError for a scene that cannot be rendered as it is.
     """
 
-    def __init__(self, path, defines=None):
-        self.path = Path(path)
+    def __init__(self, path, defines=None, changes=()):
+        self.path, self.defines, self.changes = Path(path), dict(defines or {}), []
         self._configuration = mi.parser.ParserConfig(mi.variant())
-        self._state = mi.parser.parse_file(self._configuration, str(path), **(defines or {}))
+        self._state = mi.parser.parse_file(self._configuration, str(path), **self.defines)
         if not self._nodes(mi.ObjectType.Sensor):
             raise ValueError(f"{path}: the scene has no sensor")
+        for method, arguments in changes:
+            getattr(self, method)(*arguments)
 
     @property
     def name(self):
@@ -63,6 +65,7 @@ class SceneFile:
         """Replace the scene's integrator. Of the old one's parameters it keeps those named by `keep` (None: all),
         unless given anew, or unknown to the new one; but if all are kept for one of the same name, unknown ones are
         refused. Raises RuntimeError or ValueError if the new one cannot be created."""
+        self.changes.append(("set_integrator", (name, dict(parameters or {}), keep)))
         given, (old_name, old) = dict(parameters or {}), self.integrator
         kept = {key: old[key] for key in old if key not in given and (keep is None or key in keep)}
         if name != old_name or keep is not None:
@@ -88,6 +91,11 @@ class SceneFile:
         self.set_integrator("path", {"max_depth": depth})
 
     @property
+    def sensors(self):
+        """Number of sensors."""
+        return len(self._nodes(mi.ObjectType.Sensor))
+
+    @property
     def size(self):
         """Width and height of the first film in pixels, as Mitsuba defaults them."""
         films = self._nodes(mi.ObjectType.Film)
@@ -96,11 +104,13 @@ class SceneFile:
 
     def set_sampler(self, name):
         """Replace the type of all samplers; they keep their parameters."""
+        self.changes.append(("set_sampler", (name,)))
         for sampler in self._nodes(mi.ObjectType.Sampler):
             sampler.props.set_plugin_name(name)
 
     def set_width(self, width):
         """Render `width` pixels wide, keeping the aspect of the first film."""
+        self.changes.append(("set_width", (width,)))
         old_width, old_height = self.size
         for film in self._nodes(mi.ObjectType.Film):
             film.props["width"] = int(width)
@@ -117,18 +127,44 @@ class SceneFile:
                     if name in properties:
                         del properties[name]
             digest.update(repr(properties).encode())
-            for _, value in properties.items():
-                file = self.path.parent / value if isinstance(value, str) and value else None
-                if file is not None and file.is_file():
-                    digest.update(hashlib.sha256(file.read_bytes()).digest())
+            for _, file in self._named(node):
+                digest.update(hashlib.sha256(file.read_bytes()).digest())
         return digest.hexdigest()
+
+    def files(self):
+        """Return all files that objects of the scene name: a dict from the name, absolute or relative to the scene's
+        folder, to the path."""
+        return {name: file for node in self._state.nodes for name, file in self._named(node)}
+
+    def _named(self, node):
+        """Yield names and paths of the files that an object names."""
+        for _, value in mi.Properties(node.props).items():
+            file = self.path.parent / value if isinstance(value, str) and value else None
+            if file is not None and file.is_file():
+                yield value, file
+
+    def sampling(self, sensor):
+        """Return the number of pixels of the image of a sensor (by index), and its sampler, a `mi.Sampler`, without
+        creating the scene. Raises ValueError for a sensor that does not exist."""
+        sensors = self._nodes(mi.ObjectType.Sensor)
+        if not 0 <= sensor < len(sensors):
+            raise ValueError(f"no sensor {sensor}: the scene has {len(sensors)}")
+        values = [value for _, value in mi.Properties(sensors[sensor].props).items()]
+        parts = [self._state.nodes[one.index()] for one in values if isinstance(one, mi.Properties.ResolvedReference)]
+        film, sampler = (
+            mi.Properties(next((part.props for part in parts if part.type == kind), mi.Properties(default)))
+            for kind, default in ((mi.ObjectType.Film, "hdrfilm"), (mi.ObjectType.Sampler, "independent"))
+        )
+        width, height = film.get("width", 768), film.get("height", 576)
+        pixels = film.get("crop_width", width) * film.get("crop_height", height)
+        return pixels, mi.PluginManager.instance().create_object(sampler)
 
     def load(self, threads=None):
         """Create the scene (a `mi.Scene`), once only, as it consumes what was parsed; `threads`, if given, limits what
         is done from then on."""
-        if threads:
-            # Not yet: with a single thread Mitsuba waits for ever when it reads EXR files.
-            dr.set_thread_count(os.cpu_count() or 2)
+        threads = threads or dr.thread_count()
+        # With a single thread Mitsuba waits for ever when it reads EXR files
+        dr.set_thread_count(max(threads, 2))
         resolver = mi.FileResolver(mi.file_resolver())
         mi.file_resolver().prepend(str(self.path.parent))
         try:
@@ -136,8 +172,7 @@ class SceneFile:
             return mi.parser.instantiate(self._configuration, self._state)
         finally:
             mi.set_file_resolver(resolver)
-            if threads:
-                dr.set_thread_count(threads)
+            dr.set_thread_count(threads)
 
     def _nodes(self, kind):
         return [node for node in self._state.nodes if node.type == kind]

@@ -162,7 +162,18 @@ def busy(renders, cores):
 
 def doubts(scene):
     """Return the sentences of `warnings` that are of the scene, not of the machine."""
-    return _unequal_times(scene) + _hidden(scene)
+    return _machines(scene) + _unequal_times(scene) + _hidden(scene)
+
+
+def _machines(scene):
+    """Return a sentence where times are of several machines, or of several workers on one, in a list."""
+    made_by = [render["machine"] for render in scene["renders"] if "machine" in render]
+    names, workers = (sorted({machine[key] for machine in made_by}) for key in ("name", "worker"))
+    if len(names) > 1:
+        return [f"Runs were made on different machines ({', '.join(names)}): do not compare their times."]
+    if len(workers) > 1:
+        return [f"{len(workers)} workers shared the machine {names[0]}: do not trust the times."]
+    return []
 
 
 def _unequal_times(scene):

@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from comparison.scene_files import SceneFile
+from vpl.split import balance
 
 VARIANT = "llvm_ad_rgb"
 CORNELL = str(Path(__file__).resolve().parent.parent / "scenes" / "cornell.xml")
@@ -48,6 +49,13 @@ def swept(tmp_path_factory, variant):
     out = tmp_path_factory.mktemp("sweep")
     assert compare.main([*SWEEP, "-o", str(out), "--cache", str(out / "cache")]) == 0
     return out
+
+
+@pytest.fixture
+def lights_cost_nothing(monkeypatch):
+    """So that ``manylights`` has virtual lights wherever there is any use for them."""
+    monkeypatch.setattr(balance, "_PAYS_BELOW", 1e30)
+    monkeypatch.setattr(balance, "_FEWEST", 4000)
 
 
 def cornell(width=16, **defines):

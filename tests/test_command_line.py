@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import manylights
-from comparison import command_line, images
+from comparison import command_line, images, one_image
 
 ROOT = Path(__file__).resolve().parent.parent
 CORNELL = str(ROOT / "scenes" / "cornell.xml")
@@ -284,7 +284,7 @@ def test_image_is_written_while_it_is_rendered(tmp_path, monkeypatch):
         return original(*arguments, **keywords)
 
     monkeypatch.setattr(mi, "render", render)
-    monkeypatch.setattr(manylights, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(one_image, "WRITE_SECONDS", 0.0)
     assert run(CORNELL, *TINY, "-o", output, "--spp", 8, "--pass-spp", 2) == 0
     assert found == [0, 2, 4, 6]
     assert [file.name for file in tmp_path.iterdir()] == ["a.exr"]

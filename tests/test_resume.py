@@ -140,6 +140,41 @@ def test_a_full_disk_is_reported_with_the_name_of_the_file(tmp_path, limit, prin
     assert not list((tmp_path / "out").glob(".*.*"))
 
 
+@pytest.mark.parametrize("limit", [100, 12_000])
+def test_a_comparison_goes_on_after_a_full_disk(tmp_path, limit):
+    """Whether nothing could be written, or all but the report."""
+    reference, out = tmp_path / "reference.exr", tmp_path / "out"
+    images.write_exr(reference, np.ones((16, 16, 3)), ["R", "G", "B"])
+    arguments = [CORNELL, "-i", "path", "--spp", "1", "--reference", str(reference), "-o", str(out)]
+    full = [sys.executable, "-c", LIMITED, str(limit), str(ROOT / "compare.py"), *arguments]
+    assert subprocess.run(full, capture_output=True, timeout=120).returncode == 1
+    assert compare.main([*arguments, "--resume"]) == 0
+    results = json.loads((out / "results.json").read_text())
+    assert results["complete"] and "errors" in results["scenes"][0]["renders"][0]
+    assert (out / "report.html").is_file() and not list(out.glob(".*.*"))
+
+
+HOSTILE = {
+    "not finite": {"spp": float("nan"), "seconds": float("inf")},
+    "markup": {"spp": "many", "integrator": "<script>alert(1)</script>", "scene": "\x01</script>", "file": "elsewhere"},
+    "large": {"spp": -5, "seconds": 1e300, "command": "x" * 100_000},
+}
+
+
+@pytest.mark.parametrize("metadata", HOSTILE)
+def test_hostile_metadata_of_a_reference_does_not_spoil_the_report(tmp_path, metadata):
+    reference, out = tmp_path / "reference.exr", tmp_path / "out"
+    images.write_exr(reference, np.ones((16, 16, 3)), ["R", "G", "B"], HOSTILE[metadata])
+    assert compare.main([CORNELL, "-i", "path", "--spp", "1", "--reference", str(reference), "-o", str(out)]) == 0
+
+    def refused(constant):
+        raise AssertionError(constant)
+
+    results = json.loads((out / "results.json").read_text(), parse_constant=refused)
+    jsonschema.validate(results, SCHEMA, jsonschema.Draft202012Validator)
+    assert "<script>alert" not in (out / "report.html").read_text()
+
+
 def test_a_run_that_cannot_be_kept_is_a_failure(tmp_path, monkeypatch):
     def save(self, result):
         raise OSError(28, "No space left on device", "run.json")

@@ -1,0 +1,82 @@
+"""Many images by one command: several scenes, frames of an animation, all sensors; and what their files are called."""
+
+import argparse
+import copy
+import re
+from collections import deque
+from pathlib import Path
+
+from .command_line import UsageError
+
+ALL = "all"  # sensors
+MOST_AHEAD = 64  # images that are prepared before it is their turn
+
+
+def frames(text):
+    """Convert `FIRST..LAST`, or numbers separated by commas, to a list of ints; an argparse type."""
+    if match := re.fullmatch(r"(\d+)\.\.(\d+)", text):
+        found = range(int(match[1]), int(match[2]) + 1)
+    else:
+        found = [int(number) for number in text.split(",")] if re.fullmatch(r"\d+(,\d+)*", text) else []
+    if not found:
+        raise argparse.ArgumentTypeError(f"'{text}' is neither FIRST..LAST nor numbers separated by commas")
+    return list(found)
+
+
+def sensor(text):
+    """Convert the index of a sensor, or `all`; an argparse type."""
+    if text != ALL and not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is neither the index of a sensor nor '{ALL}'")
+    return text if text == ALL else int(text)
+
+
+def images(options):
+    """Return the options of each scene and frame, with one `scene`, its `frame` (None without frames), and `{frame}` in
+    `define` replaced. Raises UsageError for an `output` that would be that of several images."""
+    found = []
+    for scene in options.scenes:
+        for frame in options.frames or [None]:
+            one = copy.copy(options)
+            one.scene, one.frame = scene, frame
+            if frame is not None:
+                one.define = [(key, _fill(f"-D {key}", value, frame=frame)) for key, value in options.define]
+            found.append(one)
+    if options.output and not options.output.is_dir():
+        several = {"scene": len(options.scenes) > 1, "frame": bool(options.frames), "sensor": options.sensor == ALL}
+        for name in (name for name in several if several[name] and f"{{{name}" not in str(options.output)):
+            raise UsageError(f"--output '{options.output}' would be of several images; put {{{name}}} into it")
+    return found
+
+
+def output(options, sensor):
+    """Return the file (Path) of the image of a sensor, of the options that `images` returns: as `output` says, or the
+    scene's name, with frame and sensor where there may be several, beside it or in the folder that `output` is."""
+    if options.output and not options.output.is_dir():
+        names = {"scene": options.scene.stem, "frame": options.frame, "sensor": sensor}
+        several = len(options.scenes) > 1 or options.frames or options.sensor == ALL
+        return Path(_fill("--output", str(options.output), **names)) if several else options.output
+    name = options.scene.stem
+    if options.frame is not None:
+        name += f".{options.frame:0{max(4, len(str(max(options.frames))))}}"
+    if options.sensor == ALL:
+        name += f".sensor{sensor}"
+    return (options.output or options.scene.parent) / f"{name}.exr"
+
+
+def ahead(images):
+    """Yield images (of `one_image.Image`, from an iterator) one after the other; so many are taken from the iterator
+    before their turn that workers have no gap between them."""
+    waiting = deque()
+    for image in images:
+        waiting.append(image)
+        while len(waiting) > MOST_AHEAD or any(one.fills_pool for one in list(waiting)[1:]):
+            yield waiting.popleft()
+    yield from waiting
+
+
+def _fill(title, text, **names):
+    """Replace `{name}`, or `{name:04}`, in a text."""
+    try:
+        return text.format(**names)
+    except (KeyError, IndexError, ValueError, TypeError):
+        raise UsageError(f"{title}: '{text}' has other braces than {{{'}, {'.join(names)}}}") from None

@@ -1,0 +1,89 @@
+"""Checkpoints: the passes of a render that is not finished, in a file that another process goes on from.
+
+They hold sums in double precision, so that a render which was interrupted ends with the image of one that was not.
+"""
+
+import json
+import zipfile
+from dataclasses import asdict
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from . import images
+from .occasional import OccasionalWriter
+from .rendering import Pass
+
+SUFFIX = ".checkpoint.npz"
+CHECKPOINT_SECONDS = 10.0
+_ESTIMATE = "estimate."
+
+
+def file_of(image):
+    """Return the path of the checkpoint of an image file."""
+    return Path(image).with_suffix(SUFFIX)
+
+
+class Checkpoint:
+    """The file that a render goes on from, if `resume`, and that it keeps for another one to go on from. `made_by` is
+    all that the image depends on besides number and sizes of its passes (a dict for JSON): the file of another render
+    is refused."""
+
+    def __init__(self, path, made_by, resume=True):
+        self.path, self._made_by, self._resume = Path(path), made_by, resume
+        self._passes, self._seconds = None, 0.0
+        self._writer = OccasionalWriter("The checkpoint", self.save, CHECKPOINT_SECONDS)
+
+    def restore(self, passes):
+        """Give the passes of the file, if there is one, to `Passes`, which have none; return the seconds that they
+        took. Raises ValueError for a file that is no checkpoint, and for one of another render."""
+        self._passes = passes
+        if not self.path.is_file():
+            return 0.0
+        if not self._resume:
+            mi.Log(mi.LogLevel.Warn, f"'{self.path}', which --resume would go on from, is going to be replaced.")
+            return 0.0
+        try:
+            with open(self.path, "rb") as opened, np.load(opened) as file:
+                arrays = {name: file[name] if file[name].ndim else file[name].item() for name in file.files}
+            described = json.loads(arrays["described"])
+        except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(
+                f"'{self.path}' is no checkpoint that can be read ({error}); delete it to begin anew"
+            ) from None
+        other = [name for name in self._made_by if described["made_by"].get(name) != self._made_by[name]]
+        if other:
+            raise ValueError(f"'{self.path}' is of a render with another {other[0]}; delete it to begin anew")
+        passes.channels, passes.sum = described["channels"], arrays["sum"]
+        passes.passes = [Pass(**one) for one in described["passes"]]
+        estimate = (name for name in arrays if name.startswith(_ESTIMATE))
+        passes.estimate.state = {name.removeprefix(_ESTIMATE): arrays[name] for name in estimate}
+        self._seconds = described["seconds"]
+        return self._seconds
+
+    def keep(self, seconds):
+        """There is a pass more, after `seconds` in all: write the file now and then."""
+        self._seconds = seconds
+        self._writer.offer()
+
+    def save(self):
+        """Write the file, unless there is no pass yet. Raises OSError with its name if it cannot be written; the one
+        that was there before is then as it was."""
+        passes = self._passes
+        if not passes.passes:
+            return
+        described = {
+            "made_by": self._made_by,
+            "seconds": self._seconds,
+            "channels": passes.channels,
+            "passes": [asdict(one) for one in passes.passes],
+        }
+        text = json.dumps(described, default=lambda number: number.item())
+        estimate = {_ESTIMATE + name: value for name, value in passes.estimate.state.items()}
+        with images.replacing(self.path) as temporary:
+            np.savez(temporary, described=np.array(text), sum=passes.sum, **estimate)
+
+    def remove(self):
+        """Remove the file: the render is finished."""
+        self.path.unlink(missing_ok=True)

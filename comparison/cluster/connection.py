@@ -1,0 +1,82 @@
+"""Workers: processes of our own on this machine, or those of a scheduler on the network."""
+
+import argparse
+import logging
+import re
+from contextlib import contextmanager, suppress
+
+from .. import machine
+from ..command_line import UsageError
+
+CONNECT_SECONDS = 20
+CLOSE_SECONDS = 20
+MOST_LOCAL = 256
+
+
+def workers(text):
+    """Convert what `--workers` is given: a number of local processes (int), or the address of a scheduler (text); an
+    argparse type."""
+    if re.fullmatch(r"(tcp|tls|ws|wss|ucx)://.+:\d+", text):
+        return text
+    if not text.isdecimal() or not 0 < int(text) <= MOST_LOCAL:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is neither a number of processes, 1 to {MOST_LOCAL}, nor the address of a scheduler such as "
+            "tcp://HOST:8786"
+        )
+    return int(text)
+
+
+def import_dask():
+    """Import and return `distributed`; raises UsageError where it is missing."""
+    try:
+        import distributed
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"--workers needs the package '{error.name}'; pip install 'manylights[cluster]' brings it"
+        ) from None
+    return distributed
+
+
+@contextmanager
+def connected(wanted, threads=None):
+    """Give a `Pool` of workers in the block: `wanted` is what `workers` returned. Local processes share `threads`, by
+    default all cores, and end with the block; those of a scheduler have `threads` each, by default all of their cores.
+    Raises UsageError where there is no scheduler of that address."""
+    distributed = import_dask()
+    from .pool import Pool
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # of what becomes of workers, we tell
+    if isinstance(wanted, int):
+        with _processes(distributed, wanted) as address:
+            pool = Pool(lambda: distributed.Client(address, timeout=CONNECT_SECONDS), _share(wanted, threads))
+            try:
+                yield pool
+            finally:
+                pool.close()
+        return
+    try:
+        pool = Pool(lambda: distributed.Client(wanted, timeout=CONNECT_SECONDS), threads)
+    except OSError as error:
+        raise UsageError(f"--workers: no scheduler answers at {wanted} ({error})") from None
+    try:
+        yield pool
+    finally:
+        pool.close()
+
+
+@contextmanager
+def _processes(distributed, count):
+    """Give the address of a scheduler in this process, on the loopback, with worker processes."""
+    cluster = distributed.LocalCluster(
+        n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0", memory_limit=0,
+        silence_logs=logging.CRITICAL,
+    )  # fmt: skip
+    try:
+        yield cluster.scheduler_address
+    finally:
+        with suppress(TimeoutError):  # they end with this process
+            cluster.close(timeout=CLOSE_SECONDS)
+
+
+def _share(count, threads):
+    return max(1, (threads or machine.cores()) // count)

@@ -1,0 +1,63 @@
+"""Images rendered by the workers of a pool, as `comparison.render.render` does by itself."""
+
+import math
+import time as clock
+
+from ..denoising import Denoiser
+from ..pass_sizes import PassSizes
+from ..render import check, render_passes
+from .passes import DistributedPasses, samples_of_a_pass
+from .pool import TASKS_PER_WORKER
+from .scene_travel import bundle
+
+
+class DistributedRender:
+    """An image that workers begin with before it is its turn, wherever others leave them without work.
+
+    `scene` is a `LazyScene`; the others are those of `comparison.render.render`, but that passes have a fixed
+    number of samples: `pass_spp`, or what `samples_of_a_pass` says. Raises ValueError for a sensor that does not exist,
+    and for a checkpoint of another render.
+    """
+
+    def __init__(
+        self, pool, scene, sensor=0, *, error=None, time=None, spp=None, seed=0, pass_spp=None, checkpoint=None,
+    ):  # fmt: skip
+        check(error=error, time=time, spp=spp, pass_spp=pass_spp)
+        pixels, sampler = scene.file.sampling(sensor)
+        if error is None and time is None and spp is None:
+            spp = sampler.sample_count()
+        self.spp, self._error, self._time, self._checkpoint = spp, error, time, checkpoint
+        self._scene, self._sensor, self._seed, self._pool = scene, sensor, seed, pool
+        self._pass_spp = pass_spp or samples_of_a_pass(pixels, spp)
+        travelling = bundle(scene.file)
+        self.passes = DistributedPasses(pool, travelling, seed, sensor, pixels, sampler, self._pass_spp, spp)
+        self._seconds = checkpoint.restore(self.passes) if checkpoint else 0.0
+        self.passes.start()
+
+    @property
+    def fills_pool(self):
+        """Are there tasks enough to keep all workers busy while images before it are finished?"""
+        wanted = TASKS_PER_WORKER * len(self._pool.workers)
+        return self.spp is None or math.ceil(self.spp / self._pass_spp) >= wanted
+
+    @property
+    def workers(self):
+        """How many passes each worker has rendered, by address."""
+        return dict(self.passes.workers)
+
+    def render(self, denoise=False, progress=None):
+        """Render; return the image and what it took, as `comparison.render.render`. Raises ClusterError where the
+        workers cannot."""
+        begin = clock.perf_counter() - self._seconds
+        denoiser = Denoiser(self._scene.get(), self._sensor, self._seed) if denoise else None
+        if self._time:
+            self.passes.deadline = begin + self._time - (denoiser.filter_seconds if denoiser else 0.0)
+        sizes = PassSizes(self.passes.pixels, self.spp, fixed=self._pass_spp)
+        try:
+            return render_passes(self.passes, sizes, self._error, begin, progress, denoiser, self._checkpoint)
+        finally:
+            self.close()
+
+    def close(self):
+        """Leave the workers to others."""
+        self.passes.close()

@@ -1,0 +1,157 @@
+"""Scenes on their way to a worker: files with their hashes.
+
+A worker takes the files from where they are for the client if they have the same content there (a common file system,
+or a worker on the same machine), or else from its store, by hash. What that lacks it is sent, once. Files with a path
+relative to the scene are laid out as they are for the client; those with an absolute one must be where they are.
+"""
+
+import hashlib
+import os
+import re
+import shutil
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mitsuba as mi
+
+from ..images import replacing
+from ..scene_files import SceneFile
+
+
+class FilesMissing(Exception):
+    """A worker lacks files; the argument is the list of their hashes."""
+
+
+@dataclass(frozen=True)
+class TravellingFile:
+    """File of a scene: its absolute `path` for the client, where it is below the folder that travels (`relative`, None
+    if the scene has its absolute path), and the hash of its content."""
+
+    path: str
+    relative: str | None
+    hash: str
+
+
+@dataclass(frozen=True)
+class SceneBundle:
+    """All that a scene is made from: its `files`, the scene file first, and, of the `SceneFile`, `defines` and
+    `changes`; the `variant`."""
+
+    files: tuple
+    defines: dict
+    changes: tuple
+    variant: str
+
+    @property
+    def key(self):
+        """What it is recognised by: two of a key are the same scene."""
+        content = [(file.relative or file.path, file.hash) for file in self.files]
+        return hashlib.sha256(repr((content, self.defines, self.changes, self.variant)).encode()).hexdigest()[:32]
+
+    def make(self, path):
+        """Return the `SceneFile`, from the scene file at a path."""
+        return SceneFile(path, self.defines, self.changes)
+
+
+def bundle(scene_file):
+    """Return the `SceneBundle` of a `SceneFile`."""
+    main = scene_file.path.absolute()
+    named = scene_file.files() | _included(main, scene_file.defines)
+    relative = {os.path.normpath(main.parent / name) for name in named if not os.path.isabs(name)} | {str(main)}
+    absolute = {os.path.normpath(name) for name in named if os.path.isabs(name)}
+    folder = os.path.commonpath([os.path.dirname(file) for file in relative])
+    files = [TravellingFile(file, os.path.relpath(file, folder), _hash(file)) for file in sorted(relative)]
+    files += [TravellingFile(file, None, _hash(file)) for file in sorted(absolute)]
+    files.sort(key=lambda file: file.path != str(main))
+    return SceneBundle(tuple(files), scene_file.defines, tuple(scene_file.changes), mi.variant())
+
+
+def _included(xml, defines):
+    """Return the files that attributes of an XML file name, as `SceneFile.files`: what the parser reads itself, such as
+    other XML files, whose own are among them, and spectra."""
+    found, known, waiting = {}, dict(defines), [xml]
+    while waiting:
+        for element in ElementTree.parse(waiting.pop()).iter():
+            if element.tag == "default":
+                known.setdefault(element.get("name"), element.get("value"))
+            for text in element.attrib.values():
+                name = re.sub(r"\$(\w+)", lambda match: known.get(match[1], match[0]), text)
+                file = xml.parent / name
+                if name and name not in found and len(name) < 1024 and file.is_file():
+                    found[name] = file
+                    waiting += [file] if element.tag == "include" else []
+    return found
+
+
+class Store:
+    """The files of a worker, in a folder of its own."""
+
+    def __init__(self, folder):
+        self._files, self._scenes = Path(folder) / "files", Path(folder) / "scenes"
+
+    def add(self, hash, content):
+        """Add a file (bytes). Raises OSError where there is no room."""
+        self._files.mkdir(parents=True, exist_ok=True)
+        with replacing(self._files / hash) as temporary:
+            temporary.write_bytes(content)
+
+    def place(self, bundle):
+        """Return the path of the scene file of a bundle, beside which all of its files are. Raises FilesMissing for
+        those that are neither in their place nor here, and FileNotFoundError for those that cannot travel."""
+        lacking = [file for file in bundle.files if not is_there(file.path, file.hash)]
+        if not lacking:
+            return bundle.files[0].path
+        for file in lacking:
+            if file.relative is None:
+                raise FileNotFoundError(
+                    f"'{file.path}', which the scene names by its absolute path, is not there on this worker, or is "
+                    "another file"
+                )
+        travelling = [file for file in bundle.files if file.relative is not None]
+        missing = [file.hash for file in travelling if not (self._files / file.hash).is_file()]
+        if missing:
+            raise FilesMissing(missing)
+        folder = self._scenes / bundle.key
+        for file in travelling:
+            place = folder / file.relative
+            if not place.exists():
+                place.parent.mkdir(parents=True, exist_ok=True)
+                _link(self._files / file.hash, place)
+        return str(folder / bundle.files[0].relative)
+
+
+def _link(file, place):
+    try:
+        os.link(file, place)
+    except OSError:  # a file system without links
+        shutil.copyfile(file, place)
+
+
+def read(bundle, hash):
+    """Return the content of a file of a bundle (bytes). Raises ValueError if it is not what it was."""
+    path = next(file.path for file in bundle.files if file.hash == hash)
+    content = Path(path).read_bytes()
+    if hashlib.sha256(content).hexdigest() != hash:
+        raise ValueError(f"'{path}' has been changed since the render began")
+    return content
+
+
+def is_there(path, hash):
+    """Is there a file of that content?"""
+    try:
+        return _hash(path) == hash
+    except OSError:
+        return False
+
+
+def _hash(path):
+    status = os.stat(path)
+    return _hash_as_of(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(4096)
+def _hash_as_of(path, modified, size):
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,173 @@
+"""One image of the command `manylights`: rendered here or by workers, and written now and then."""
+
+import sys
+import time
+
+import mitsuba as mi
+import numpy as np
+from tqdm import tqdm
+
+from . import batch, command_line, images, machine
+from .checkpoint import Checkpoint, file_of
+from .interruption import Deadline
+from .occasional import OccasionalWriter
+from .render import render
+from .scene_files import SceneFile
+
+WRITE_SECONDS = 10.0  # from one time that the image so far is written to the next
+INTERRUPTED = 130  # exit status
+
+
+class LazyScene:
+    """The scene of a `SceneFile`, loaded when it is asked for, once; the file can still be looked at afterwards."""
+
+    def __init__(self, file, threads=None):
+        self.file, self.seconds, self._threads, self._scene = file, 0.0, threads, None
+
+    def get(self):
+        """Return the `mi.Scene`; `seconds` is then what loading it took."""
+        if self._scene is None:
+            begin = time.perf_counter()
+            self._scene = SceneFile(self.file.path, self.file.defines, self.file.changes).load(self._threads)
+            self.seconds = time.perf_counter() - begin
+        return self._scene
+
+
+class Image:
+    """Image to render of the sensor `sensor` (index) of a `LazyScene`, as `options` say: by the workers of a `pool`,
+    or, if that is None, by this process. `described` is the integrator: "integrator", "parameters", "replaced"."""
+
+    def __init__(self, options, scene, described, sensor, pool):
+        self._options, self._scene, self._sensor = options, scene, sensor
+        self._name = described["integrator"]
+        if described["replaced"]:
+            self._name += f" in place of {described['replaced']}"
+            mi.Log(mi.LogLevel.Info, f"The integrator is {self._name}; with -i scene it would be the scene's.")
+        self._described = {"scene": str(options.scene), **described, "variant": options.mode, "seed": options.seed}
+        self.path, self._checkpoint, self._remote = batch.output(options, sensor), None, None
+        if pool or options.resume:
+            made_by = {"scene": scene.file.fingerprint(), "sensor": sensor, "seed": options.seed, **machine.versions()}
+            self._checkpoint = Checkpoint(file_of(self.path), made_by, options.resume)
+        if pool:
+            from .cluster.render import DistributedRender
+
+            self._remote = DistributedRender(pool, scene, sensor, checkpoint=self._checkpoint, **self._limits())
+
+    @property
+    def fills_pool(self):
+        """Are there passes enough to keep all workers busy while images before it are finished?"""
+        return self._remote.fills_pool
+
+    def run(self):
+        """Render and write; return the exit status."""
+        if not self._remote:
+            self._scene.get()
+        output = Output(self.path, self._options.exposure, self._checkpoint)
+        output.metadata = self._described | {"load_seconds": self._scene.seconds, **command_line.versions()}
+        try:
+            image, took = self._render(output)
+        except KeyboardInterrupt:
+            return output.end_early()
+        if self._remote:
+            output.metadata["workers"] = self._remote.workers
+        output.keep(took, image)
+        if took.ended_by == "interruption":
+            return output.end_early()
+        output.write()
+        error = "" if took.error is None else f", error {took.error:.2%}"
+        print(f"{self.path}: {self._name}, {took.spp} samples per pixel, {took.seconds:.2f} s{error}")
+        return 0
+
+    def _limits(self):
+        return {name: getattr(self._options, name) for name in ("error", "time", "spp", "seed", "pass_spp")}
+
+    def _render(self, output):
+        """Render with a bar, and write now and then."""
+        spp = self._remote.spp if self._remote else self._local_spp()
+        with tqdm(total=spp, unit="spp", disable=None) as bar, Deadline(output.end_early):
+
+            def progress(took, image):
+                shown = {"passes": took.passes} if self._remote else {}
+                shown |= {} if took.error is None else {"error": f"{took.error:.2%}"}
+                bar.set_postfix(shown, refresh=False)
+                bar.update(took.spp - bar.n)
+                output.keep(took, image)
+
+            if self._remote:
+                return self._remote.render(denoise=self._options.denoise, progress=progress)
+            limits = self._limits() | {"spp": spp}
+            return render(
+                self._scene.get(), sensor=self._sensor, denoise=self._options.denoise, progress=progress,
+                checkpoint=self._checkpoint, **limits,
+            )  # fmt: skip
+
+    def _local_spp(self):
+        """Return the samples per pixel that end the render, None where only time or error do."""
+        options = self._options
+        if options.spp or options.time or options.error:
+            return options.spp
+        return self._scene.get().sensors()[self._sensor].sampler().sample_count()
+
+
+class Failed:
+    """In the place of an image that could not even be begun, for an error."""
+
+    fills_pool = False
+
+    def __init__(self, path, error):
+        self.path, self._error = path, error
+
+    def run(self):
+        """Raise the error."""
+        raise self._error
+
+
+class Output:
+    """The file that an image is written to; `metadata` (a dict) is what is known of it before it is rendered."""
+
+    def __init__(self, path, exposure=None, checkpoint=None):
+        self.path, self.metadata, self._exposure, self._checkpoint = path, {}, exposure, checkpoint
+        self._image, self._took = None, None
+        self._writer = OccasionalWriter("The image so far", self.write, WRITE_SECONDS)
+
+    def keep(self, took, image):
+        """Take an image, and write it now and then."""
+        self._image, self._took = np.array(image), took
+        self._writer.offer()
+
+    def end_early(self):
+        """Write the last image that was taken, say so, and return the exit status."""
+        if self._took is None:
+            print("manylights: interrupted before the first pass was finished; nothing was written", file=sys.stderr)
+        else:
+            self.write()
+            if self._checkpoint:
+                self._checkpoint.save()
+            resume = "; --resume goes on" if self._checkpoint else ""
+            print(
+                f"manylights: interrupted; wrote {self._took.spp} samples per pixel to {self.path}{resume}",
+                file=sys.stderr,
+            )
+        return INTERRUPTED
+
+    def write(self):
+        """Write the last image that was taken."""
+        took, image = self._took, self._image
+        if self.path.suffix == ".png":
+            rgb = images.colour(image, took.channels)
+            exposure = images.automatic_exposure(rgb) if self._exposure is None else 2.0**self._exposure
+            images.write_png(self.path, images.tone_map(rgb, exposure))
+            return
+        metadata = self.metadata | {
+            "spp": took.spp,
+            "passes": took.passes,
+            "render_seconds": took.seconds,
+            "estimated_error": took.error,
+            "ended_by": took.ended_by,
+            "statistics": took.statistics,
+        }
+        if took.raw is not None:
+            described = metadata | {"denoise_seconds": took.denoise_seconds}
+            images.write_exr(self.path.with_suffix(".denoised.exr"), image, took.channels, described)
+            image = np.array(took.raw)
+        images.write_exr(self.path, image, took.channels, metadata)
