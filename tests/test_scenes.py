@@ -3,8 +3,11 @@
 import importlib
 import importlib.util
 import re
+import subprocess
+import sys
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -67,6 +70,39 @@ def test_shipped_scenes_are_what_their_generators_make(name, tmp_path, monkeypat
         assert np.allclose(made, shipped, rtol=1e-2)
 
 
+def test_shipped_room_is_what_its_generator_makes(tmp_path):
+    """Which needs a variant of its own, as the add-on."""
+    script = ROOT / "scenes" / "blender_room.py"
+    subprocess.run([sys.executable, script, "--output", tmp_path / "blender_room.xml"], check=True, timeout=120)
+    made = [file for file in tmp_path.rglob("*") if file.is_file() and file.suffix != ".exr"]
+    assert len(made) == 10
+    for file in made:
+        assert file.read_bytes() == (ROOT / "scenes" / file.relative_to(tmp_path)).read_bytes(), file.name
+
+
+def test_a_scene_from_blender_renders_unchanged():
+    """Principled materials, textures, a sun, a sky and a camera as the add-on writes them: the image of `path`."""
+    file = SceneFile(ROOT / "scenes" / "blender_room.xml", {"resx": "48", "resy": "36"})
+    assert file.integrator == ("path", {"max_depth": 12})
+    scene = file.load()
+    assert scene.sensors()[0].sampler().sample_count() == 64
+    seeds = range(8)
+    means = {
+        name: [mi.render(scene, integrator=integrator, seed=seed, spp=64).numpy().mean((0, 1)) for seed in seeds]
+        for name, integrator in (("path", scene.integrator()), ("manylights", of_its_own(file).integrator()))
+    }
+    noise = np.sqrt(sum(np.var(of, axis=0, ddof=1) / len(of) for of in means.values()))
+    difference = np.mean(means["manylights"], axis=0) - np.mean(means["path"], axis=0)
+    assert (noise < 0.01 * np.mean(means["path"], axis=0)).all()
+    assert (abs(difference) < 4 * noise).all()
+
+
+def of_its_own(file):
+    """The scene of a file with `manylights` in place of its integrator, as the command does it."""
+    file.set_integrator("manylights")
+    return file.load()
+
+
 @pytest.mark.parametrize("direct", ["nee", pytest.param("adaptive", marks=pytest.mark.stress)])
 def test_the_furnace_is_white(direct):
     scene = SceneFile(ROOT / "scenes" / "furnace.xml", {"resx": "24", "resy": "18"})
@@ -126,3 +162,14 @@ def test_scenes_of_others_parse():
         assert file.name == path.parent.name
         assert file.size == (64, 36)
         assert file.integrator == ("path", {"max_depth": 6})
+
+
+def test_a_scene_with_an_exr_file_is_loaded_by_a_single_thread():
+    """Mitsuba alone would wait for ever."""
+    before = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        SceneFile(ROOT / "scenes" / "arcade.xml", {"resx": "16", "resy": "8"}).load()
+        assert dr.thread_count() == 1
+    finally:
+        dr.set_thread_count(before)

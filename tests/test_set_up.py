@@ -22,7 +22,7 @@ case $* in
     *llvm_version*)
         case $DRJIT_LIBLLVM_PATH in */.venv/system/*) ;; *) [ ! -e "$STATE/old_llvm" ] ;; esac ;;
     *'import drjit'*) [ ! -e "$STATE/no_libatomic" ] ;;
-    *compare.py* | *pytest*) pwd; printf '<%s>' "$@" ;;
+    *compare.py* | *pytest* | *sphinx*) pwd; printf '<%s>' "$@" ;;
 esac
 """
 
@@ -136,6 +136,12 @@ def test_command_is_handed_over_untouched(project):
 @pytest.mark.parametrize("command, call", [("demo", "<compare.py><--demo>"), ("test", "<-m><pytest>")])
 def test_demo_and_test_run_in_the_project(project, command, call):
     assert project.run(command, "-k", "a b").stdout == f"{project.folder}\n{call}<-k><a b>"
+
+
+def test_docs_builds_the_site_and_says_where_it_is(project):
+    first, call, last = project.run("docs", "-j", "2").stdout.partition("<-m><sphinx><--fail-on-warning>")
+    assert first == f"{project.folder}\n" and "<-j><2>" in last
+    assert last.endswith(f"{project.folder}/output/docs/index.html\n") and call
 
 
 def test_works_through_a_link_and_by_name(project):

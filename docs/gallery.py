@@ -1,0 +1,133 @@
+"""Make the gallery: every scene of scenes/ by `path` and by `manylights` at equal time, and a reference.
+
+    ./run -- python docs/gallery.py
+
+References are made by `manylights`, whose mean is that of `path`, those of direct light alone by `adaptivedirect`; they
+are kept in output/gallery. The comparison is compare.py's. Writes docs/gallery.md and the pictures in docs/gallery/.
+"""
+
+import argparse
+import json
+import shutil
+import sys
+import time
+from pathlib import Path
+
+import mitsuba as mi
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import compare  # noqa: E402  (the project's own, whatever folder this is called from)
+from comparison import command_line, images, references, tables  # noqa: E402
+from comparison.pictures import REFERENCE  # noqa: E402
+from comparison.rendering import Progressive, pass_seed  # noqa: E402
+from comparison.scene_files import SceneFile  # noqa: E402
+
+SCENES, WORK, PAGE = ROOT / "scenes", ROOT / "output" / "gallery", ROOT / "docs" / "gallery.md"
+PICTURES = PAGE.with_suffix("")
+INTEGRATORS = ("path", "manylights")
+WIDTH, BATCH, QUALITY = 256, 64, 85
+# Samples of a pixel in a pass: what two seconds hold on an idle machine, so that a busy one does not make passes small
+PASS = 32
+# `max_depth` of scenes that show direct light alone, and the error of a pass of their references
+DIRECT, FINE = 2, 0.02
+INTRODUCTION = """\
+[README](../README.md) · [front page](index.md) · gallery
+
+# Gallery
+
+Every scene of [scenes/](../scenes/README.md): `path` and `manylights` after about {seconds:g} seconds each, and the \
+reference. On the site, drag across a picture to compare two of them, and choose which two below it. All have \
+{width} pixels across; times are those of rendering, with kernels that are compiled already. Below each picture are \
+its time, its samples per pixel, and its error: the mean absolute difference from the reference, as a share of its \
+mean. The smaller one is bold. Nothing is denoised.
+
+{doubts}One image of a scene shows its noise, and little more: for how much faster one is than the other, see \
+[results](results.md). `./run -- python docs/gallery.py` renders all of this again.
+"""
+
+
+def make_reference(name, seconds):
+    """Write output/gallery/references/NAME.exr, at least two batches of samples, unless it is there."""
+    file = WORK / "references" / f"{name}.exr"
+    if file.exists():
+        return
+    scene = SceneFile(SCENES / f"{name}.xml")
+    scene.set_width(WIDTH)
+    direct = scene.integrator[1]["max_depth"] == DIRECT
+    integrator, more = ("adaptivedirect", {"error": FINE}) if direct else ("manylights", {})
+    scene.set_integrator(integrator, more)
+    progressive, batches = Progressive(scene.load(), references.SEED), references.Batches()
+    end = time.monotonic() + seconds
+    while batches.count < 2 or time.monotonic() < end:
+        progressive.restart()
+        progressive.render(BATCH, pass_seed(references.SEED, batches.count))
+        batches = batches.with_batch(images.colour(progressive.image, progressive.channels), progressive.spp)
+    batches.write(file, {"integrator": integrator, "scene": name, "seed": references.SEED})
+
+
+def convert(source, target):
+    """Write a PNG file of compare.py as a small JPEG."""
+    bitmap = mi.Bitmap(images.read_png(source))
+    bitmap.write(str(target), mi.Bitmap.FileFormat.JPEG, QUALITY)
+
+
+def rows(scene, introduced):
+    """The part of the page about one scene of results.json: a table of three pictures and their numbers."""
+    name, found = scene["name"], {one["integrator"]: one for one in scene["renders"]}
+    errors = {label: found[label]["errors"]["relative_l1"] for label in INTEGRATORS}
+    cells = []
+    for label in INTEGRATORS:
+        one, error = found[label], f"{float(f'{100 * errors[label]:.2g}'):g}%"
+        bold = "**" if errors[label] == min(errors.values()) else ""
+        cells.append(f"{one['seconds']:.1f} s, {one['spp']} samples, {bold}{error}{bold}")
+    labels = [*INTEGRATORS, REFERENCE]
+    pictures = [f"![{name} by {label}](gallery/{name}.{label}.jpg)" for label in labels]
+    cells.append(f"{scene['reference']['spp']} samples")
+    titles = [f"`{label}`" for label in INTEGRATORS] + [REFERENCE]
+    lines = [titles, ["---"] * 3, pictures, cells]
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    doubts = "".join(f"\n{sentence}\n" for sentence in tables.doubts(scene))
+    return f"## {name}\n\n{introduced[name]}\n\n{table}\n{doubts}"
+
+
+def described():
+    """What scenes/README.md says of each scene: lights, and what it is for."""
+    lines = (SCENES / "README.md").read_text().splitlines()
+    cells = [line.strip("| ").split(" | ") for line in lines if line.startswith("| [")]
+    return {cell[0][1:].partition("]")[0]: f"{cell[1][0].upper()}{cell[1][1:]}. For: {cell[2]}." for cell in cells}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=30.0, help="time of each image (default: 30)")
+    parser.add_argument("--reference-seconds", type=float, default=150.0, help="of each reference (default: 150)")
+    options = parser.parse_args()
+    names = sorted(path.stem for path in SCENES.glob("*.xml"))
+    command_line.set_variant("llvm_ad_rgb")
+    (WORK / "references").mkdir(parents=True, exist_ok=True)
+    for name in names:
+        make_reference(name, options.reference_seconds)
+    status = compare.main([
+        *(str(SCENES / f"{name}.xml") for name in names), "-i", ",".join(INTEGRATORS), "--time", str(options.seconds),
+        "--pass-spp", str(PASS), "--width", str(WIDTH), "-r", str(WORK / "references"), "-o", str(WORK), "--resume",
+    ])  # fmt: skip
+    if status:
+        return status
+    results = json.loads((WORK / "results.json").read_text())
+    shutil.rmtree(PICTURES, ignore_errors=True)
+    PICTURES.mkdir()
+    for name in names:
+        for label in (*INTEGRATORS, REFERENCE):
+            convert(WORK / f"{name}.{label}.png", PICTURES / f"{name}.{label}.jpg")
+    introduced = described()
+    renders = [one for scene in results["scenes"] for one in scene["renders"]]
+    doubts = "".join(f"{sentence} " for sentence in tables.busy(renders, results["machine"]["cores"]))
+    introduction = INTRODUCTION.format(seconds=options.seconds, width=WIDTH, doubts=doubts)
+    PAGE.write_text("\n".join([introduction, *(rows(scene, introduced) for scene in results["scenes"])]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,6 @@
+from collections.abc import Sequence
+
+from comparison.render import Took as Took
+from comparison.render import render as render
+
+def main(arguments: Sequence[str] | None = None) -> int: ...
