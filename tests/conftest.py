@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -32,6 +33,20 @@ def variant():
     import integrators  # noqa: F401
 
     return VARIANT
+
+
+@pytest.fixture(scope="session")
+def threads(variant):
+    """The number of threads that tests start with."""
+    return dr.thread_count()
+
+
+@pytest.fixture(autouse=True)
+def restore_threads(threads):
+    """A command keeps to the threads that it was given, and so would all later tests: with one, Mitsuba waits for ever
+    when it reads EXR files."""
+    yield
+    dr.set_thread_count(threads)
 
 
 @pytest.fixture

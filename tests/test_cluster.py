@@ -6,7 +6,6 @@ import signal
 import time
 from pathlib import Path
 
-import drjit as dr
 import jsonschema
 import numpy as np
 import pytest
@@ -37,14 +36,6 @@ def run(*arguments):
 
 def pixels(file):
     return images.read_exr(file)[0]
-
-
-@pytest.fixture(autouse=True)
-def restore_threads():
-    """The command keeps to the threads that it was given, and so would all later tests."""
-    before = dr.thread_count()
-    yield
-    dr.set_thread_count(before)
 
 
 @pytest.fixture(scope="module")
