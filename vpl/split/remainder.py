@@ -175,8 +175,9 @@ def _follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits)
         left = dr.max(dr.abs(reflected - carried)) / dr.max(dr.abs(reflected))
         left = dr.select(connects & ((flags & other_lobes) == 0), dr.clip(left, _LEAST_SURVIVAL, 1), 1)
         left = dr.select(dr.isfinite(left), left, 1)
-        survival = limits.worth.survival(si, side, throughput, importance, left)
-        survival = dr.select(smooth & (scattered == 1), survival, left)
+        # Not before a surface was met that alpha shows: paths that have only passed masks are still to find one
+        judged = smooth & (scattered == 1) & valid
+        survival = dr.select(judged, limits.worth.survival(si, side, throughput, importance, left), left)
         goes_on &= sampler.next_1d() < survival
         smooth &= goes_on
         throughput /= survival
