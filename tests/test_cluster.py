@@ -18,6 +18,7 @@ from comparison.cluster.render import DistributedRender
 from comparison.scene_files import SceneFile
 
 from .conftest import CORNELL
+from .test_batch import TWO_SENSORS
 from .test_report import SCHEMA
 
 distributed = pytest.importorskip("distributed")
@@ -217,6 +218,12 @@ def test_a_scheduler_that_is_not_there(monkeypatch, capfd):
     assert "no scheduler answers at tcp://127.0.0.1:9" in capfd.readouterr().err
 
 
+def test_a_scheduler_that_is_not_there_is_asked_once(monkeypatch, capfd, tmp_path):
+    monkeypatch.setattr(connection, "CONNECT_SECONDS", 0.5)
+    assert run(CORNELL, "--frames", "1..3", "-o", tmp_path, "--workers", "tcp://127.0.0.1:9") == 2
+    assert capfd.readouterr().err.count("no scheduler answers") == 1
+
+
 @pytest.mark.parametrize("text", ["0", "-1", "1.5", "localhost", "tcp://host", "1000000"])
 def test_bad_workers_are_refused(text, capsys):
     assert run(CORNELL, "--workers", text) == 2
@@ -274,6 +281,14 @@ def test_a_full_disk_ends_no_render(monkeypatch, tmp_path, capfd):
     assert run(CORNELL, *USUAL, "--spp", 8, "-o", tmp_path / "a.exr", "--resume") == 1
     said = "".join(capfd.readouterr())
     assert said.count("the render goes on") >= 2 and "manylights: [Errno 28] No space left on device: 'a.exr'" in said
+
+
+def test_a_broken_checkpoint_of_one_sensor_keeps_no_other_from_being_rendered(two, tmp_path, capsys):
+    (tmp_path / "a.xml").write_text(TWO_SENSORS)
+    (tmp_path / "a.sensor0.checkpoint.npz").write_bytes(b"PK\x03\x04 no more")
+    assert run(tmp_path / "a.xml", "--sensor", "all", "--spp", 1, "--resume", "--workers", two) == 1
+    assert f"{tmp_path / 'a.sensor0.exr'}: '{tmp_path / 'a.sensor0.checkpoint.npz'}' is no" in capsys.readouterr().err
+    assert (tmp_path / "a.sensor1.exr").is_file()
 
 
 def test_a_broken_checkpoint_is_named(tmp_path, capsys):
