@@ -13,9 +13,10 @@ import pytest
 import compare
 import manylights
 from comparison import checkpoint, images, one_image
-from comparison.cluster import compatibility, connection, passes, pool, scene_travel
+from comparison.cluster import compatibility, connection, passes, pool, runs, scene_travel
 from comparison.cluster.render import DistributedRender
 from comparison.scene_files import SceneFile
+from comparison.worker import Job
 
 from .conftest import CORNELL
 from .test_batch import TWO_SENSORS
@@ -383,6 +384,26 @@ def test_a_comparison_has_the_images_of_one_machine(two, tmp_path, capsys):
         here = tmp_path / "here" / Path(render["output"]).name
         np.testing.assert_array_equal(pixels(here), pixels(render["output"]))
     assert compare.main([*command, "--reference", "vpl", "-o", str(tmp_path / "vpl"), "--workers", two]) == 2
+
+
+def test_the_same_run_by_two_labels_is_given_to_both():
+    """Both results may be there before the first is asked for."""
+
+    class Workers:
+        sources = []
+
+        def wait(self, seconds):
+            (source,) = self.sources
+            tasks = list(iter(lambda: source.next_task(0), None))
+            assert tasks, "waits for ever"
+            for task in tasks:
+                source.done(task.name, ({"label": "?"}, {}), "tcp://here")
+
+    found, file = runs.DistributedRuns(Workers()), SceneFile(CORNELL, TINY)
+    jobs = [Job(label, "path", CORNELL, f"{label}.exr", run="same") for label in "ab"]
+    for job in jobs:
+        found.expect(job, file)
+    assert [found.run(job)["label"] for job in jobs] == ["a", "b"]
 
 
 # ---------------------- Many images ----------------------
