@@ -81,6 +81,8 @@ def render(
     another thread renders with the same sensor.
     """
     if sensor == ALL:
+        if checkpoint:
+            raise ValueError(f"checkpoint must be None where sensor is '{ALL}': it is of one image")
         return _render_all(
             scene, integrator, error=error, time=time, spp=spp, seed=seed, denoise=denoise, progress=progress,
             pass_spp=pass_spp,
@@ -165,10 +167,10 @@ class _Render:
         try:
             self._run(sizes, goal, interruption)
         finally:
-            if self._checkpoint and self._ended_by in (None, "interruption"):
-                self._checkpoint.save()
-            elif self._checkpoint:
+            if self._checkpoint and self._ended_by in ("spp", "time", "error"):
                 self._checkpoint.remove()
+            elif self._checkpoint:
+                self._checkpoint.leave()
 
     def _run(self, sizes, goal, interruption):
 
