@@ -19,7 +19,7 @@ from .convergence import ErrorGoal
 from .denoising import Denoiser
 from .interruption import Interruption
 from .pass_sizes import PassSizes
-from .rendering import Progressive, total_statistics
+from .rendering import Progressive, TotalStatistics
 
 
 @dataclass
@@ -160,7 +160,7 @@ class _Render:
     def __init__(self, progressive, begin, progress, checkpoint):
         self.progressive, self._begin, self._progress = progressive, begin, progress
         self._checkpoint = checkpoint
-        self._error, self._ended_by = None, None
+        self._error, self._ended_by, self._statistics = None, None, TotalStatistics()
 
     def run(self, sizes, goal, interruption):
         """Render passes until something ends it; leave a checkpoint unless nothing is missing."""
@@ -220,5 +220,5 @@ class _Render:
     def _took(self):
         one = self.progressive
         seconds = clock.perf_counter() - self._begin
-        statistics = total_statistics(one.passes)
+        statistics = self._statistics.of(one.passes)
         return Took(one.spp, len(one.passes), seconds, self._error, statistics, self._ended_by, one.channels)
