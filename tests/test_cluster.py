@@ -5,6 +5,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
@@ -123,6 +124,23 @@ def test_samples_of_passes_depend_on_the_image_alone():
     assert passes.samples_of_a_pass(256**2, spp=64) == 4
     assert passes.samples_of_a_pass(256**2, spp=150) == 8
     assert passes.samples_of_a_pass(16**2, spp=1) == 4
+
+
+def test_images_that_wait_for_another_one_have_bounded_memory(monkeypatch):
+    """However long the first image waits for its last pass, workers begin with few of the others."""
+    workers = SimpleNamespace(sources=[], workers={"one": [], "two": []})
+    file = SceneFile(CORNELL, TINY)
+    pixels, sampler = file.sampling(0)
+    monkeypatch.setattr(passes, "WAITING_BYTES", 10 * 12 * pixels)
+    waiting = [passes.DistributedPasses(workers, None, 0, 0, pixels, sampler, 4, spp=16) for _ in range(8)]
+    for one in waiting:
+        one.start()
+    image, begun = SimpleNamespace(taken=rendering.Pass(0, 4, 1.0)), 0
+    for one in waiting[1:]:
+        while task := one.next_task(0):
+            one.done(task.name, image, "one")
+            begun += 1
+    assert begun == 10 and waiting[0].next_task(0)
 
 
 # ---------------------- Faults ----------------------
