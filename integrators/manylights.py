@@ -18,9 +18,10 @@ from vpl.split.balance import Balance, balance, importance, judged_by, noise, wi
 from vpl.split.gather_vertices import drawn_later, joined
 from vpl.split.next_event import emitters_of
 from vpl.split.numbers import SpreadNumbers
+from vpl.split.paths import AT_FIRST, EVERYWHERE, NOWHERE, FirstEdge, Limits
 from vpl.split.pilot import Pilot
 from vpl.split.pixel_clusters import PixelClusters, light_clusters
-from vpl.split.remainder import AT_FIRST, EVERYWHERE, NOWHERE, FirstEdge, Limits, follow
+from vpl.split.remainder import follow
 from vpl.split.surface_lights import surface_lights
 from vpl.split.worth import Worth
 from vpl.transport.evaluation import Transport
