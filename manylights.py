@@ -28,6 +28,7 @@ Exit status: 0; 1 if rendering failed; 2 for a command that makes no sense; 130 
 
 import argparse
 import sys
+import traceback
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
@@ -160,8 +161,10 @@ def run(options):
             try:
                 found = image.run()
             except Exception as error:
-                if options.verbose or not several:
+                if not several:
                     raise
+                if options.verbose:
+                    traceback.print_exc()
                 print(f"manylights: {image.path}: {command_line.explain(error)}", file=sys.stderr)
                 found = 1
             status = max(status, found)
@@ -172,20 +175,25 @@ def run(options):
 
 def _images(wanted, options, stack):
     """Yield the `Image` of each sensor of the scenes of `wanted`, a list of options; workers are let go with the
-    `stack`."""
+    `stack`. Raises UsageError where there is no scheduler: no image could be rendered."""
     pool = None
     for one in wanted:
         try:
             file, described = parse_scene(one)
-            if options.verbose:
-                mi.set_log_level(mi.LogLevel.Info)
-            if options.workers and pool is None:  # not before it is known that there is something to render
-                pool = stack.enter_context(connected(options.workers, options.threads))
-            scene = LazyScene(file, options.threads)
-            for sensor in range(file.sensors) if options.sensor == batch.ALL else [options.sensor]:
-                yield Image(one, scene, described, sensor, pool)
         except Exception as error:
             yield Failed(batch.output(one, 0), error)
+            continue
+        if options.verbose:
+            mi.set_log_level(mi.LogLevel.Info)
+        if options.workers and pool is None:  # not before it is known that there is something to render
+            pool = stack.enter_context(connected(options.workers, options.threads))
+        scene = LazyScene(file, options.threads)
+        for sensor in range(file.sensors) if options.sensor == batch.ALL else [options.sensor]:
+            try:
+                image = Image(one, scene, described, sensor, pool)
+            except Exception as error:
+                image = Failed(batch.output(one, sensor), error)
+            yield image
 
 
 def main(arguments=None):

@@ -32,7 +32,7 @@ def sensor(text):
 
 def images(options):
     """Return the options of each scene and frame, with one `scene`, its `frame` (None without frames), and `{frame}` in
-    `define` replaced. Raises UsageError for an `output` that would be that of several images."""
+    `define` replaced. Raises UsageError where a file would be that of several images."""
     found = []
     for scene in options.scenes:
         for frame in options.frames or [None]:
@@ -45,6 +45,12 @@ def images(options):
         several = {"scene": len(options.scenes) > 1, "frame": bool(options.frames), "sensor": options.sensor == ALL}
         for name in (name for name in several if several[name] and f"{{{name}" not in str(options.output)):
             raise UsageError(f"--output '{options.output}' would be of several images; put {{{name}}} into it")
+    made = {}
+    for one in found:
+        file = output(one, 0).absolute()
+        if file in made:
+            raise UsageError(f"'{file}' would be of both {_title(made[file])} and {_title(one)}")
+        made[file] = one
     return found
 
 
@@ -72,6 +78,10 @@ def ahead(images):
         while len(waiting) > MOST_AHEAD or any(one.fills_pool for one in list(waiting)[1:]):
             yield waiting.popleft()
     yield from waiting
+
+
+def _title(options):
+    return f"'{options.scene}'" + ("" if options.frame is None else f", frame {options.frame}")
 
 
 def _fill(title, text, **names):

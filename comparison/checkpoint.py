@@ -32,7 +32,7 @@ class Checkpoint:
 
     def __init__(self, path, made_by, resume=True):
         self.path, self._made_by, self._resume = Path(path), made_by, resume
-        self._passes, self._seconds = None, 0.0
+        self._passes, self._kept, self._saved = None, None, None
         self._writer = OccasionalWriter("The checkpoint", self.save, CHECKPOINT_SECONDS)
 
     def restore(self, passes):
@@ -59,31 +59,47 @@ class Checkpoint:
         passes.passes = [Pass(**one) for one in described["passes"]]
         estimate = (name for name in arrays if name.startswith(_ESTIMATE))
         passes.estimate.state = {name.removeprefix(_ESTIMATE): arrays[name] for name in estimate}
-        self._seconds = described["seconds"]
-        return self._seconds
+        return described["seconds"]
 
     def keep(self, seconds):
         """There is a pass more, after `seconds` in all: write the file now and then."""
-        self._seconds = seconds
+        passes = self._passes
+        # All of it now: another thread may save it while the next pass is added
+        described = {
+            "made_by": self._made_by,
+            "seconds": seconds,
+            "channels": passes.channels,
+            "passes": list(passes.passes),
+        }
+        estimate = {_ESTIMATE + name: value for name, value in passes.estimate.state.items()}
+        self._kept = described, {"sum": passes.sum, **estimate}
         self._writer.offer()
 
     def save(self):
-        """Write the file, unless there is no pass yet. Raises OSError with its name if it cannot be written; the one
+        """Write the file, unless there is no pass more. Raises OSError with its name if it cannot be written; the one
         that was there before is then as it was."""
-        passes = self._passes
-        if not passes.passes:
+        kept = self._kept
+        if kept is self._saved:
             return
-        described = {
-            "made_by": self._made_by,
-            "seconds": self._seconds,
-            "channels": passes.channels,
-            "passes": [asdict(one) for one in passes.passes],
-        }
-        text = json.dumps(described, default=lambda number: number.item())
-        estimate = {_ESTIMATE + name: value for name, value in passes.estimate.state.items()}
+        described, arrays = kept
+        text = json.dumps(described, default=_plain)
         with images.replacing(self.path) as temporary:
-            np.savez(temporary, described=np.array(text), sum=passes.sum, **estimate)
+            np.savez(temporary, described=np.array(text), **arrays)
+        self._saved = kept
+
+    def leave(self):
+        """Write the file for another render to go on from; return whether that was possible. The image of this one is
+        not lost where it is not."""
+        return self._writer.write()
 
     def remove(self):
-        """Remove the file: the render is finished."""
-        self.path.unlink(missing_ok=True)
+        """Remove the file: the render is finished, and its image is not lost where that is not possible."""
+        try:
+            self.path.unlink(missing_ok=True)
+        except OSError as error:
+            mi.Log(mi.LogLevel.Warn, f"The checkpoint could not be removed: {error}")
+
+
+def _plain(value):
+    """Return what JSON knows of a `Pass`, or of a number of NumPy's."""
+    return asdict(value) if isinstance(value, Pass) else value.item()

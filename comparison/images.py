@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import threading
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,10 +24,10 @@ AOV_PERCENTILES = (1, 99.9)
 
 @contextmanager
 def replacing(path):
-    """Give a temporary path beside `path` that takes its place when the block ends without an error. An OSError names
-    `path`, which those of a full disk do not."""
+    """Give a temporary path beside `path`, one for each thread, that takes its place when the block ends without an
+    error. An OSError names `path`, which those of a full disk do not."""
     path = Path(path)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{threading.get_native_id()}{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)

@@ -37,7 +37,7 @@ class Interruption:
 
 class Deadline:
     """While in force, ends this process when `PATIENCE` seconds after Ctrl-C it is still in force: `save` is called, in
-    another thread, and returns the exit status.
+    another thread, and returns the exit status; if it raises, that is told, and the status is 1.
 
     No kernel can be stopped, and Python hears of a signal only after it. But the wake-up pipe hears it at once. For the
     main thread of a command.
@@ -64,6 +64,10 @@ class Deadline:
     def _watch(self):
         while signals := os.read(self._reading, 64):
             if signal.SIGINT in signals and not self._over.wait(PATIENCE):
-                status = self._save()
+                try:
+                    status = self._save()
+                except Exception as error:  # whatever it is: nobody else would end this process
+                    print(f"manylights: {error}", file=sys.stderr)
+                    status = 1
                 sys.stderr.flush()
                 os._exit(status)

@@ -13,11 +13,17 @@ class OccasionalWriter:
         self._written = time.monotonic()
 
     def offer(self):
-        """There is something new: write it if that was not done for some time. A disk that is full ends no render."""
-        if time.monotonic() - self._written <= self._seconds:
-            return
-        self._written = time.monotonic()
+        """There is something new: write it if that was not done for some time."""
+        if time.monotonic() - self._written > self._seconds:
+            self.write()
+
+    def write(self):
+        """Write it; return whether that was possible. A disk that is full ends no render."""
         try:
             self._write()
         except OSError as error:
-            mi.Log(mi.LogLevel.Warn, f"{self._title} could not be written, the render goes on: {error}")
+            mi.Log(mi.LogLevel.Warn, f"{self._title} could not be written: {error}")
+            return False
+        finally:
+            self._written = time.monotonic()  # not before: a disk may be slower than passes
+        return True

@@ -141,9 +141,7 @@ class Output:
             print("manylights: interrupted before the first pass was finished; nothing was written", file=sys.stderr)
         else:
             self.write()
-            if self._checkpoint:
-                self._checkpoint.save()
-            resume = "; --resume goes on" if self._checkpoint else ""
+            resume = "; --resume goes on" if self._checkpoint and self._checkpoint.leave() else ""
             print(
                 f"manylights: interrupted; wrote {self._took.spp} samples per pixel to {self.path}{resume}",
                 file=sys.stderr,

@@ -19,7 +19,7 @@ from .convergence import ErrorGoal
 from .denoising import Denoiser
 from .interruption import Interruption
 from .pass_sizes import PassSizes
-from .rendering import Progressive, total_statistics
+from .rendering import Progressive, TotalStatistics
 
 
 @dataclass
@@ -81,6 +81,8 @@ def render(
     another thread renders with the same sensor.
     """
     if sensor == ALL:
+        if checkpoint:
+            raise ValueError(f"checkpoint must be None where sensor is '{ALL}': it is of one image")
         return _render_all(
             scene, integrator, error=error, time=time, spp=spp, seed=seed, denoise=denoise, progress=progress,
             pass_spp=pass_spp,
@@ -158,17 +160,17 @@ class _Render:
     def __init__(self, progressive, begin, progress, checkpoint):
         self.progressive, self._begin, self._progress = progressive, begin, progress
         self._checkpoint = checkpoint
-        self._error, self._ended_by = None, None
+        self._error, self._ended_by, self._statistics = None, None, TotalStatistics()
 
     def run(self, sizes, goal, interruption):
         """Render passes until something ends it; leave a checkpoint unless nothing is missing."""
         try:
             self._run(sizes, goal, interruption)
         finally:
-            if self._checkpoint and self._ended_by in (None, "interruption"):
-                self._checkpoint.save()
-            elif self._checkpoint:
+            if self._checkpoint and self._ended_by in ("spp", "time", "error"):
                 self._checkpoint.remove()
+            elif self._checkpoint:
+                self._checkpoint.leave()
 
     def _run(self, sizes, goal, interruption):
 
@@ -218,5 +220,5 @@ class _Render:
     def _took(self):
         one = self.progressive
         seconds = clock.perf_counter() - self._begin
-        statistics = total_statistics(one.passes)
+        statistics = self._statistics.of(one.passes)
         return Took(one.spp, len(one.passes), seconds, self._error, statistics, self._ended_by, one.channels)

@@ -2,6 +2,7 @@
 
 import time
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -167,22 +168,34 @@ def _shown(planes, channels):
 
 
 def total_statistics(passes):
-    """Add up the integrators' counters over passes; return {} if there are none.
+    """Add up the integrators' counters over passes: see `TotalStatistics`."""
+    return TotalStatistics().of(passes)
+
+
+class TotalStatistics:
+    """The integrators' counters, added up over passes as these come.
 
     Numbers are summed, nested dicts (such as "seconds") likewise. What describes a pass, as text (such as "balance")
     and "lights" do, is that of the pass with the most samples, the last of these if there are several.
     """
-    total = {}
-    for one in sorted(passes, key=lambda one: one.spp):
-        _add(total, one.statistics)
-    return total
+
+    def __init__(self):
+        self._total, self._count, self._most = {}, 0, 0
+
+    def of(self, passes):
+        """Return the total of a list of passes, {} if they counted nothing. It begins with those of the last call."""
+        for one in passes[self._count :]:
+            _add(self._total, one.statistics, describe=one.spp >= self._most)
+            self._most = max(self._most, one.spp)
+        self._count = len(passes)
+        return deepcopy(self._total)
 
 
-def _add(total, statistics):
+def _add(total, statistics, describe):
     for key, value in statistics.items():
         if isinstance(value, dict) and key != "lights":
-            _add(total.setdefault(key, {}), value)
+            _add(total.setdefault(key, {}), value, describe)
         elif isinstance(value, int | float | np.number) and not isinstance(value, bool):
             total[key] = total.get(key, 0) + (value.item() if isinstance(value, np.number) else value)
-        else:
+        elif describe or key not in total:
             total[key] = value

@@ -18,9 +18,10 @@ from vpl.split.balance import Balance, balance, importance, judged_by, noise, wi
 from vpl.split.gather_vertices import drawn_later, joined
 from vpl.split.next_event import emitters_of
 from vpl.split.numbers import SpreadNumbers
+from vpl.split.paths import AT_FIRST, EVERYWHERE, NOWHERE, FirstEdge, Limits
 from vpl.split.pilot import Pilot
 from vpl.split.pixel_clusters import PixelClusters, light_clusters
-from vpl.split.remainder import AT_FIRST, EVERYWHERE, NOWHERE, FirstEdge, Limits, follow
+from vpl.split.remainder import follow
 from vpl.split.surface_lights import surface_lights
 from vpl.split.worth import Worth
 from vpl.transport.evaluation import Transport
@@ -110,6 +111,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
     that the command writes. The same seed chooses the same.
 
     - Values of single pixels may be negative while samples are few: what is traced is a difference.
+    - Masks: the image is that of ``prb``. ``path`` (Mitsuba 3.9.1) shows black for samples that have passed nothing but
+      masks when their paths end, and so is too dark where nothing is behind a mask; with ``hide_emitters`` it hides an
+      environment behind a mask by that, which is seen through it here. Alpha is that of ``path``.
     - Surfaces only: a scene with a participating medium is refused.
     - ``*_rgb`` and ``*_mono`` variants only. Not differentiable.
     - Materials and emitters: all that ``path`` renders. Light that metals and surfaces with bump or normal maps send

@@ -77,6 +77,20 @@ def test_an_output_for_several_images_is_refused(given, missing):
         batch.images(options(output=Path("x.exr"), **given))
 
 
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"scenes": [Path("a/scene.xml"), Path("b/scene.xml")]}, "both 'a/scene.xml' and 'b/scene.xml'"),
+        ({"frames": [3, 4, 3]}, "both 'a.xml', frame 3 and 'a.xml', frame 3"),
+    ],
+)
+def test_a_file_for_two_images_is_refused(tmp_path, given, said):
+    with pytest.raises(UsageError, match=f"would be of {said}"):
+        batch.images(options(output=tmp_path, **given))
+    if "frames" not in given:
+        assert len(batch.images(options(**given))) == 2  # each beside its scene
+
+
 def test_all_sensors(tmp_path):
     scene = tmp_path / "a.xml"
     scene.write_text(TWO_SENSORS)
@@ -98,3 +112,11 @@ def test_what_fails_does_not_keep_others_from_being_rendered(tmp_path, capsys):
     assert manylights.main(["nosuch.xml", CORNELL, *tiny]) == 1
     assert [file.name for file in tmp_path.iterdir()] == ["cornell.exr"]
     assert "no scene file 'nosuch.xml'" in capsys.readouterr().err
+
+
+def test_each_of_several_failures_is_told_with_its_traceback_if_that_is_asked_for(capsys):
+    assert manylights.main(["nosuch.xml", "nobody.xml", "-v"]) == 1
+    said = capsys.readouterr().err
+    assert (
+        "no scene file 'nosuch.xml'" in said and "no scene file 'nobody.xml'" in said and said.count("Traceback") == 2
+    )

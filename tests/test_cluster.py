@@ -5,6 +5,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
@@ -12,12 +13,14 @@ import pytest
 
 import compare
 import manylights
-from comparison import checkpoint, images, one_image
-from comparison.cluster import compatibility, connection, passes, pool, scene_travel
+from comparison import checkpoint, images, one_image, rendering
+from comparison.cluster import compatibility, connection, passes, pool, runs, scene_travel
 from comparison.cluster.render import DistributedRender
 from comparison.scene_files import SceneFile
+from comparison.worker import Job
 
 from .conftest import CORNELL
+from .test_batch import TWO_SENSORS
 from .test_report import SCHEMA
 
 distributed = pytest.importorskip("distributed")
@@ -123,6 +126,23 @@ def test_samples_of_passes_depend_on_the_image_alone():
     assert passes.samples_of_a_pass(16**2, spp=1) == 4
 
 
+def test_images_that_wait_for_another_one_have_bounded_memory(monkeypatch):
+    """However long the first image waits for its last pass, workers begin with few of the others."""
+    workers = SimpleNamespace(sources=[], workers={"one": [], "two": []})
+    file = SceneFile(CORNELL, TINY)
+    pixels, sampler = file.sampling(0)
+    monkeypatch.setattr(passes, "WAITING_BYTES", 10 * 12 * pixels)
+    waiting = [passes.DistributedPasses(workers, None, 0, 0, pixels, sampler, 4, spp=16) for _ in range(8)]
+    for one in waiting:
+        one.start()
+    image, begun = SimpleNamespace(taken=rendering.Pass(0, 4, 1.0)), 0
+    for one in waiting[1:]:
+        while task := one.next_task(0):
+            one.done(task.name, image, "one")
+            begun += 1
+    assert begun == 10 and waiting[0].next_task(0)
+
+
 # ---------------------- Faults ----------------------
 
 
@@ -217,10 +237,28 @@ def test_a_scheduler_that_is_not_there(monkeypatch, capfd):
     assert "no scheduler answers at tcp://127.0.0.1:9" in capfd.readouterr().err
 
 
+def test_a_scheduler_that_is_not_there_is_asked_once(monkeypatch, capfd, tmp_path):
+    monkeypatch.setattr(connection, "CONNECT_SECONDS", 0.5)
+    assert run(CORNELL, "--frames", "1..3", "-o", tmp_path, "--workers", "tcp://127.0.0.1:9") == 2
+    assert capfd.readouterr().err.count("no scheduler answers") == 1
+
+
 @pytest.mark.parametrize("text", ["0", "-1", "1.5", "localhost", "tcp://host", "1000000"])
 def test_bad_workers_are_refused(text, capsys):
     assert run(CORNELL, "--workers", text) == 2
     assert f"'{text}' is neither a number of processes" in capsys.readouterr().err
+
+
+def test_workers_are_let_go_where_an_image_cannot_be_denoised(two, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("no albedo")
+
+    monkeypatch.setattr("comparison.cluster.render.Denoiser", broken)
+    with connection.connected(two, 1) as workers:
+        render = prepared(workers, spp=4)
+        with pytest.raises(RuntimeError, match="no albedo"):
+            render.render(denoise=True)
+        assert not workers.sources
 
 
 # ---------------------- Checkpoints ----------------------
@@ -273,7 +311,56 @@ def test_a_full_disk_ends_no_render(monkeypatch, tmp_path, capfd):
     monkeypatch.setattr(one_image.Output, "write", full)
     assert run(CORNELL, *USUAL, "--spp", 8, "-o", tmp_path / "a.exr", "--resume") == 1
     said = "".join(capfd.readouterr())
-    assert said.count("the render goes on") >= 2 and "manylights: [Errno 28] No space left on device: 'a.exr'" in said
+    assert said.count("could not be written") >= 2 and "manylights: [Errno 28] No space left on device: 'a.exr'" in said
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_no_image_is_lost_by_its_checkpoint(ends, tmp_path, monkeypatch, capfd, interruptible):
+    """A folder is in the place of the file: it can neither be written nor removed."""
+    (tmp_path / "a.checkpoint.npz").mkdir()
+    if not ends:
+        interrupted_after(monkeypatch, 2)
+    arguments = [CORNELL, *USUAL, "--spp", 16, "-o", tmp_path / "a.exr", "--resume"]
+    assert run(*arguments) == (0 if ends else 130)
+    assert images.read_exr(tmp_path / "a.exr")[2]["spp"] == (16 if ends else 8)
+    said = "".join(capfd.readouterr())
+    assert f"could not be {'removed' if ends else 'written'}" in said and "--resume goes on" not in said
+
+
+def pass_of(value):
+    planes = np.full((4, 4, 3), value, np.float32)
+    return rendering.PassImage(planes, ["R", "G", "B"], rendering.Pass(0, 2, 1.0, {"count": np.int64(3)}))
+
+
+def test_a_checkpoint_that_is_saved_while_a_pass_is_added_is_of_those_before(tmp_path, monkeypatch):
+    """After Ctrl-C another thread saves it where the main one does not come to an end."""
+    kept, restored = rendering.Passes(0), rendering.Passes(0)
+    file = checkpoint.Checkpoint(tmp_path / "a.checkpoint.npz", {})
+    file.restore(kept)
+    kept.add(pass_of(1.0))
+    file.keep(3.0)
+    monkeypatch.setattr(kept.estimate, "add", lambda *_: file.save())
+    kept.add(pass_of(5.0))
+    assert checkpoint.Checkpoint(file.path, {}).restore(restored) == 3.0
+    assert restored.spp == 2 and (restored.image == 1.0).all() and restored.passes == kept.passes[:1]
+
+
+def test_a_render_that_somebody_ends_leaves_a_checkpoint(tmp_path):
+    scene, file = SceneFile(CORNELL, TINY).load(1), checkpoint.Checkpoint(tmp_path / "a.checkpoint.npz", {})
+    _, took = manylights.render(scene, "path", spp=64, pass_spp=2, progress=lambda *_: False, checkpoint=file)
+    assert took.ended_by == "progress" and file.path.is_file()
+    assert manylights.render(scene, "path", spp=64, pass_spp=2, checkpoint=file)[1].ended_by == "spp"
+    assert not file.path.exists()
+    with pytest.raises(ValueError, match="checkpoint must be None where sensor is 'all'"):
+        manylights.render(scene, sensor="all", checkpoint=file)
+
+
+def test_a_broken_checkpoint_of_one_sensor_keeps_no_other_from_being_rendered(two, tmp_path, capsys):
+    (tmp_path / "a.xml").write_text(TWO_SENSORS)
+    (tmp_path / "a.sensor0.checkpoint.npz").write_bytes(b"PK\x03\x04 no more")
+    assert run(tmp_path / "a.xml", "--sensor", "all", "--spp", 1, "--resume", "--workers", two) == 1
+    assert f"{tmp_path / 'a.sensor0.exr'}: '{tmp_path / 'a.sensor0.checkpoint.npz'}' is no" in capsys.readouterr().err
+    assert (tmp_path / "a.sensor1.exr").is_file()
 
 
 def test_a_broken_checkpoint_is_named(tmp_path, capsys):
@@ -368,6 +455,27 @@ def test_a_comparison_has_the_images_of_one_machine(two, tmp_path, capsys):
         here = tmp_path / "here" / Path(render["output"]).name
         np.testing.assert_array_equal(pixels(here), pixels(render["output"]))
     assert compare.main([*command, "--reference", "vpl", "-o", str(tmp_path / "vpl"), "--workers", two]) == 2
+
+
+def test_the_same_run_by_two_labels_is_given_to_both():
+    """Both results may be there before the first is asked for."""
+
+    class Workers:
+        def __init__(self):
+            self.sources = []
+
+        def wait(self, seconds):
+            (source,) = self.sources
+            tasks = list(iter(lambda: source.next_task(0), None))
+            assert tasks, "waits for ever"
+            for task in tasks:
+                source.done(task.name, ({"label": "?"}, {}), "tcp://here")
+
+    found, file = runs.DistributedRuns(Workers()), SceneFile(CORNELL, TINY)
+    jobs = [Job(label, "path", CORNELL, f"{label}.exr", run="same") for label in "ab"]
+    for job in jobs:
+        found.expect(job, file)
+    assert [found.run(job)["label"] for job in jobs] == ["a", "b"]
 
 
 # ---------------------- Many images ----------------------

@@ -290,15 +290,19 @@ def test_image_is_written_while_it_is_rendered(tmp_path, monkeypatch):
     assert [file.name for file in tmp_path.iterdir()] == ["a.exr"]
 
 
-@pytest.mark.parametrize("passes", [0, 3])
-def test_interruption_does_not_wait_for_a_pass(tmp_path, passes):
+@pytest.mark.parametrize(("passes", "disk"), [(0, "free"), (3, "free"), (3, "full")])
+def test_interruption_does_not_wait_for_a_pass(tmp_path, passes, disk):
     """Of an integrator that hears nothing for as long as it renders."""
     output = tmp_path / "a.exr"
     script = f"""
 import sys, time
 import mitsuba as mi
-from comparison import interruption
+from comparison import images, interruption
 import manylights
+def full(path, *_):
+    raise OSError(28, "No space left on device", str(path))
+if {disk == "full"}:
+    images.write_exr = full
 interruption.PATIENCE = 0.1
 render, calls = mi.render, []
 def slow(*arguments, **keywords):
@@ -316,6 +320,9 @@ sys.exit(manylights.main({[CORNELL, *TINY, "-o", str(output), "--spp", "100", "-
         assert rendering.stdout.readline() == "waiting\n"
         rendering.send_signal(signal.SIGINT)
         _, said = rendering.communicate(timeout=60)
+    if disk == "full":
+        assert rendering.returncode == 1 and f"No space left on device: '{output}'" in said
+        return
     assert rendering.returncode == 130
     assert ("wrote 6 samples per pixel" if passes else "nothing was written") in said
     assert [images.read_exr(file)[2]["spp"] for file in tmp_path.iterdir()] == ([6] if passes else [])

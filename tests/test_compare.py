@@ -164,6 +164,22 @@ def test_what_describes_a_pass_is_that_of_the_largest():
     assert rendering.total_statistics(passes) == {"balance": "glossy", "share": 0.75, "lights": {"surface": 7}}
 
 
+def test_statistics_are_read_once_as_passes_come():
+    read = []
+
+    class Read(dict):
+        def items(self):
+            read.append(1)
+            return super().items()
+
+    totals, passes, found = rendering.TotalStatistics(), [], []
+    for spp in (4, 8, 2, 8):
+        passes.append(rendering.Pass(0, spp, 1.0, Read(rays=spp, balance=f"{spp}, {len(passes)}")))
+        found.append(totals.of(passes))
+    assert len(read) == 4 and found[-1] == rendering.total_statistics(passes) == {"rays": 22, "balance": "8, 3"}
+    assert found[0] == {"rays": 4, "balance": "4, 0"}
+
+
 # --- Workers ---
 
 

@@ -1,9 +1,12 @@
 """EXR and PNG files, tone mapping, false colours."""
 
+import threading
+
 import numpy as np
 import pytest
 
 from comparison import images
+from comparison.occasional import OccasionalWriter
 
 
 @pytest.mark.parametrize("half", [False, True])
@@ -27,6 +30,23 @@ def test_failed_write_leaves_the_old_file(tmp_path):
         temporary.write_text("new, but")
         raise RuntimeError("disk full")
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("a.png", "old")]
+
+
+def test_two_threads_may_write_a_file_at_once(tmp_path):
+    written = []
+
+    def write():
+        with images.replacing(tmp_path / "a.png") as other:
+            other.write_text("whole")
+            written.append(other)
+
+    with images.replacing(tmp_path / "a.png") as temporary:
+        temporary.write_text("whole, too")
+        thread = threading.Thread(target=write)
+        thread.start()
+        thread.join()
+        assert written and (tmp_path / "a.png").read_text() == "whole"
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("a.png", "whole, too")]
 
 
 def test_a_full_disk_is_an_error_that_names_the_file(tmp_path):
@@ -75,3 +95,18 @@ def test_colour_of_luminance_and_of_nothing():
     assert images.colour(np.ones((2, 2, 1)), ["Y"]).shape == (2, 2, 3)
     with pytest.raises(ValueError, match="no colour channels among depth"):
         images.colour(np.ones((2, 2, 1)), ["depth"])
+
+
+def test_files_that_take_long_to_write_are_not_written_all_the_time(monkeypatch):
+    now, written = [0.0], []
+
+    def write():
+        now[0] += 15.0
+        written.append(now[0])
+
+    monkeypatch.setattr("comparison.occasional.time.monotonic", lambda: now[0])
+    writer = OccasionalWriter("The image", write, 10.0)
+    for _ in range(100):
+        now[0] += 1.0
+        writer.offer()
+    assert len(written) == 9 and min(np.diff(written)) > 25.0

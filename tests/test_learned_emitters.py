@@ -7,7 +7,7 @@ import pytest
 
 from vpl.core.arrays import upload_vectors
 from vpl.split.learned_emitters import LearnedEmitters
-from vpl.split.remainder import EVERYWHERE
+from vpl.split.paths import EVERYWHERE
 from vpl.split.sites import Sites
 
 from .catalogue import EMITTERS, SENSORS, film, image, rgb

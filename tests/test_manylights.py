@@ -125,6 +125,21 @@ def test_a_half_transparent_mask_around_all():
     assert_image_of_path(room_of(mask, bulb()), reference="prb", max_depth=4)
 
 
+@pytest.mark.parametrize("hide_emitters", [False, True])
+def test_a_mask_with_nothing_behind_it(hide_emitters):
+    """Of its light, `path` loses that of samples that pass it; alpha is the same."""
+    mask = {"type": "mask", "opacity": 0.3, "nested": {"type": "diffuse"}}
+    lamp = EMITTERS["constant"]() if hide_emitters else {"lamp": {"type": "point", "position": [0, 0, 3]}}
+    description = {"type": "scene", "sensor": sensor(16), **lamp, "mask": wall([0, 0, 0], [0, 1, 0], 0, 8, bsdf=mask)}
+    description["sensor"]["film"]["pixel_format"] = "rgba"
+    scene, given = mi.load_dict(description), {"max_depth": 4, "hide_emitters": hide_emitters}
+    found, darker, expected = (
+        render(scene, name, 256, **given).mean((0, 1)) for name in ("manylights", "path", "prb")
+    )  # fmt: skip
+    assert found[:3] == pytest.approx(expected[:3], rel=0.01) and (darker[:3] < 0.5 * found[:3]).all()
+    assert found[3] == pytest.approx(darker[3], rel=0.02) and found[3] == pytest.approx(0.3, rel=0.02)
+
+
 @pytest.mark.parametrize("material", ["bumpmap", "normalmap"])
 def test_walls_that_turn_their_normals(material):
     """Lights would shine from below the turned normal too, where no sample of the BSDF goes to take that off."""

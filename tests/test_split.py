@@ -315,6 +315,11 @@ def test_lights_pay_where_indirect_light_is_the_noise_and_only_there():
     assert balance(direct, 0 * indirect, level, 10**8, 64).light_paths == 0
 
 
+def test_one_sample_has_no_noise_that_lights_could_take_away():
+    chosen = balance(np.ones(2), np.full(2, 0.5), np.ones(2), 1, 1)
+    assert chosen.light_paths == 0 and "nan" not in chosen.reason
+
+
 def test_later_vertices_are_drawn_by_weight_and_stand_for_all_of_them():
     rng, pixels, samples, most = np.random.default_rng(2), 50, 8, 3
     weights = []

@@ -8,7 +8,15 @@ from vpl.core.arrays import upload_vectors
 from vpl.split.balance import importance
 from vpl.split.worth import Worth
 
-from .conftest import assert_same_mean_over_seeds, closed_box, render, render_with_statistics, unit_vectors
+from .conftest import (
+    assert_same_mean_over_seeds,
+    closed_box,
+    render,
+    render_with_statistics,
+    sensor,
+    unit_vectors,
+    wall,
+)
 from .test_manylights import lamp_behind_the_camera
 
 
@@ -55,3 +63,16 @@ def test_the_image_is_that_of_path(monkeypatch, lights_cost_nothing, lights):
         assert ("lights" in statistics) == lights and statistics["worth"] > 0
         pairs.append((found, render(scene, "path", 32, 1000 + seed)))
     assert_same_mean_over_seeds(pairs)
+
+
+def test_alpha_is_that_of_path_where_a_pixel_sees_masks_behind_masks(monkeypatch):
+    monkeypatch.setattr("integrators.manylights.importance", lambda *_: 1e-6)
+    mask = {"type": "mask", "opacity": 0.3, "nested": {"type": "twosided", "nested": {"type": "diffuse"}}}
+    veils = {f"veil{k}": wall([0, 0, -0.3 * k], [0, 1, 0], 0, 8, bsdf=mask) for k in range(6)}
+    description = {"type": "scene", "sensor": sensor(16), "lamp": {"type": "point", "position": [0, 0, 3]}, **veils}
+    description["sensor"]["film"]["pixel_format"] = "rgba"
+    scene = mi.load_dict(description)
+    given = {"max_depth": 10, "rr_depth": 20}
+    found, statistics = render_with_statistics("manylights", scene, 64, **given)
+    assert statistics["worth"] > 0
+    assert found[..., 3].mean() == pytest.approx(render(scene, "path", 64, 1, **given)[..., 3].mean(), rel=0.02)

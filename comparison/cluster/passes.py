@@ -15,7 +15,7 @@ from .pool import TASKS_PER_WORKER, Task
 PASS_SAMPLES = 2**20  # pixel samples of a pass, at most, unless a single one per pixel is more
 LEAST_PASSES = 16  # of an image with given samples per pixel
 LEAST_SPP = 4  # Mitsuba compiles other kernels for passes of fewer
-WAITING_BYTES = 2**31  # of passes that wait for one before them, of three channels
+WAITING_BYTES = 2**31  # of passes that wait for one before them, of one image or of all
 WAIT_SECONDS = 0.1  # from one look for Ctrl-C to the next
 
 
@@ -86,10 +86,18 @@ class DistributedPasses(Passes):
         ahead = self._next - len(self.passes)
         if not size or ahead >= self._most_ahead() or (self._next and self._is_too_late(queued)):
             return None
+        sources = self._pool.sources
+        if self is not sources[0] and sum(one.waiting_bytes for one in sources) >= WAITING_BYTES:
+            return None  # images before this one wait for a pass
         arguments = (self._bundle, self._sensor, size, pass_seed(self.seed, self._next))
         task = Task(self, self._next, worker.render_pass, arguments)
         self._next += 1
         return task
+
+    @property
+    def waiting_bytes(self):
+        """Of passes that are here and not added yet, of three channels."""
+        return 12 * self.pixels * len(self._finished)
 
     def done(self, index, image, address):
         """A pass is there."""

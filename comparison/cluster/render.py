@@ -49,11 +49,11 @@ class DistributedRender:
         """Render; return the image and what it took, as `comparison.render.render`. Raises ClusterError where the
         workers cannot."""
         begin = clock.perf_counter() - self._seconds
-        denoiser = Denoiser(self._scene.get(), self._sensor, self._seed) if denoise else None
-        if self._time:
-            self.passes.deadline = begin + self._time - (denoiser.filter_seconds if denoiser else 0.0)
-        sizes = PassSizes(self.passes.pixels, self.spp, fixed=self._pass_spp)
         try:
+            denoiser = Denoiser(self._scene.get(), self._sensor, self._seed) if denoise else None
+            if self._time:
+                self.passes.deadline = begin + self._time - (denoiser.filter_seconds if denoiser else 0.0)
+            sizes = PassSizes(self.passes.pixels, self.spp, fixed=self._pass_spp)
             return render_passes(self.passes, sizes, self._error, begin, progress, denoiser, self._checkpoint)
         finally:
             self.close()

@@ -3,6 +3,7 @@
 A worker makes one run at a time, in a process of its own, as this machine would. Images come back as files.
 """
 
+from collections import defaultdict
 from pathlib import Path
 
 from ..command_line import failure
@@ -20,7 +21,8 @@ class DistributedRuns:
     """Runs that workers begin with as soon as they are expected, and that are asked for one by one."""
 
     def __init__(self, pool):
-        self._pool, self._waiting, self._results = pool, [], {}
+        self._pool, self._waiting = pool, []
+        self._results = defaultdict(list)  # of each run: two labels may have the same
         pool.sources.append(self)
 
     def expect(self, job, scene_file):
@@ -32,10 +34,10 @@ class DistributedRuns:
     def run(self, job, tick=lambda: None):
         """Return the result of an expected job, as `comparison.worker.run`, with `machine`: a dict that names the one
         that made it. Raises ClusterError where there are no workers."""
-        while job.run not in self._results:
+        while not self._results[job.run]:
             self._pool.wait(TICK)
             tick()
-        found = self._results.pop(job.run)
+        found = self._results[job.run].pop(0)
         own = {key: getattr(job, key) for key in OWN}
         if isinstance(found, Exception):
             return vars(job) | {"load_average": 0.0, "error": str(found), "traceback": ""}
@@ -56,8 +58,8 @@ class DistributedRuns:
 
     def done(self, run, result, address):
         """A run has been made."""
-        self._results[run] = result
+        self._results[run].append(result)
 
     def failed(self, run, error):
         """A run could not be made."""
-        self._results[run] = error
+        self._results[run].append(error)

@@ -11,6 +11,7 @@ In the order to read in:
 - ``floors``: the split: floors of BSDFs, and the share w of virtual lights
 - ``sites``: cubes of space, each for six ways to face, for which something is learned
 - ``worth``: what it is worth to follow a path
+- ``paths``: where paths begin, what they carry along, what they find
 - ``remainder``: paths as ``path`` follows them, less what virtual lights carry; ``follow``
 - ``next_event``: next-event estimation: how emitters are chosen
 - ``learned_emitters``: emitters, and regions of the environment, chosen by what vertices of a pilot see, site by site

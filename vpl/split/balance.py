@@ -79,7 +79,7 @@ def balance(radiance: np.ndarray, indirect: np.ndarray, brightness: np.ndarray, 
     cost = 1 + _RAY_COST * rays / samples + fixed
     if cost * (rest + _CUT_NOISE * samples / rays) > _PAYS_BELOW * whole:
         price = f"virtual lights would cost {cost - 1:.2g} times as much as the paths"
-        return without_lights(f"{price} and leave {rest / whole:.0%} of the noise")
+        return without_lights(f"{price} and leave {1 - _GAIN * share:.0%} of the noise")
     vertices = int(np.clip(samples // _SAMPLES_A_VERTEX, 1, _MOST_VERTICES))
     return Balance(light_paths, error, vertices, rest, f"{share:.0%} of the noise is that of indirect light")
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.arrays import channel_mean, download
 from .gather_vertices import Arrival, GatherVertices
-from .remainder import Found
+from .paths import Found
 
 # Tiles of the pilot's image, in pixels
 _TILE = 16

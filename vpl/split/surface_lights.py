@@ -24,8 +24,9 @@ from ..lights.virtual_lights import VirtualLights
 from .cells import Cells, Lines
 from .floors import floor_of, side_of
 from .numbers import SpreadNumbers
+from .paths import PAST, FirstEdge, Limits
 from .pilot import Arrivals
-from .remainder import PAST, FirstEdge, Limits, follow
+from .remainder import follow
 
 # Arrivals of average brightness that a cell is taken to have had, besides its own
 _PRIOR = 2.0
