@@ -5,12 +5,12 @@ import time
 
 import mitsuba as mi
 import numpy as np
-from tqdm import tqdm
 
 from . import batch, command_line, images, machine
 from .checkpoint import Checkpoint, file_of
 from .interruption import Deadline
 from .occasional import OccasionalWriter
+from .progress import ImageBar
 from .render import render
 from .scene_files import SceneFile
 
@@ -83,30 +83,19 @@ class Image:
 
     def _render(self, output):
         """Render with a bar, and write now and then."""
-        spp = self._remote.spp if self._remote else self._local_spp()
-        with tqdm(total=spp, unit="spp", disable=None) as bar, Deadline(output.end_early):
+        with ImageBar() as bar, Deadline(output.end_early):
 
             def progress(took, image):
-                shown = {"passes": took.passes} if self._remote else {}
-                shown |= {} if took.error is None else {"error": f"{took.error:.2%}"}
-                bar.set_postfix(shown, refresh=False)
-                bar.update(took.spp - bar.n)
-                output.keep(took, image)
+                bar.show(took, *([f"{took.passes} passes"] if self._remote else []))
+                if image is not None:
+                    output.keep(took, image)
 
             if self._remote:
                 return self._remote.render(denoise=self._options.denoise, progress=progress)
-            limits = self._limits() | {"spp": spp}
             return render(
                 self._scene.get(), sensor=self._sensor, denoise=self._options.denoise, progress=progress,
-                checkpoint=self._checkpoint, **limits,
+                checkpoint=self._checkpoint, **self._limits(),
             )  # fmt: skip
-
-    def _local_spp(self):
-        """Return the samples per pixel that end the render, None where only time or error do."""
-        options = self._options
-        if options.spp or options.time or options.error:
-            return options.spp
-        return self._scene.get().sensors()[self._sensor].sampler().sample_count()
 
 
 class Failed:

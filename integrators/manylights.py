@@ -154,12 +154,11 @@ class ManyLightsIntegrator(GatheringIntegrator):
 
     def _trace(self, view: View):
         """(Radiance of each camera ray, whether it is opaque in the film's alpha)."""
-        clock, self.statistics = Clock(), {}
+        clock, self.statistics = Clock(Stage.PILOT), {}
         pilot = self._pilot(view)
         chosen = self._balance(view, pilot)
         self._judge(view, pilot, chosen)
         mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
-        clock.lap(Stage.PILOT)
         lights = self._lights(view, pilot, chosen, clock)
         gathering, c = (EVERYWHERE, lights.smallest_distance) if lights else (NOWHERE, _WHOLE)
         limits = self._limits(view, c, self.max_depth, gathering)
@@ -173,8 +172,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
                 break
             lane = dr.arange(mi.UInt32, min(most, view.count - first)) + dr.opaque(mi.UInt32, first)
             dr.eval(lane)
+            clock.begin(Stage.TRACED)
             found, vertices, later, _ = view.follow(lane, limits, 4, first)
-            clock.lap(Stage.TRACED)
             if lights:
                 nearby = expected[first // view.samples :][: -(-len(lane) // view.samples)]
                 seed = derived_seed(view.seed, 5, first)
@@ -182,6 +181,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
             dr.scatter(radiance, found.radiance, lane)
             dr.scatter(valid, found.valid, lane)
             dr.eval(radiance, valid)
+        clock.stop()
         if view.scene.environment() is not None and not self.hide_emitters:
             valid |= view.active
         finite = dr.all(dr.isfinite(radiance))
@@ -255,18 +255,18 @@ class ManyLightsIntegrator(GatheringIntegrator):
         """Virtual lights and their tree; None where there are none."""
         if chosen.light_paths == 0:
             return None
+        clock.begin(Stage.LIGHTS)
         # The path from a light is shorter by the two edges between camera and light
         limits = self._limits(view, _WHOLE, self.max_depth - 2, NOWHERE, rr_depth=1)
         limits.hide_emitters, limits.worth = False, Worth.unknown()
         made = surface_lights(
             view.scene, view.emission, pilot.arrivals, chosen.light_paths, limits, derived_seed(view.seed, 2)
         )  # fmt: skip
-        clock.lap(Stage.LIGHTS)
         self.statistics |= {"light_paths": chosen.light_paths, "lights": {"surface": made.lights.count}}
         if made.lights.count == 0:
             return None
+        clock.begin(Stage.TREE)
         group = ScatteredGroup.of(made.lights, derived_seed(view.seed, 3))
-        clock.lap(Stage.TREE)
         return LightSet([group], _TAPER * made.spacing, self.max_depth, chosen.light_paths, 0, {})
 
     def _gather(self, view, lights, chosen, vertices, found, expected, seed, clock):
@@ -275,6 +275,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         ``expected``: indirect light that each pixel should have, by which errors are judged together with what its
         paths found.
         """
+        clock.begin(Stage.CLUSTERS)
         samples, count = view.samples, dr.width(found.radiance)
         step = -(-samples // chosen.vertices)
         kept = -(-samples // step)
@@ -292,13 +293,13 @@ class ManyLightsIntegrator(GatheringIntegrator):
         picked = first.select(rays).and_then(later.select(later_rays, factor, share))
         rays = joined(rays, later_rays)
         clusters = PixelClusters(picked, rays, samples, alone)
-        clock.lap(Stage.CLUSTERS)
+        clock.begin(Stage.CUTS)
         traced = np.nan_to_num(download(channel_mean(found.radiance)), posinf=0, neginf=0)
         level = np.add.reduceat(np.maximum(traced, 0), np.arange(0, count, samples)) / samples + expected
         level = np.maximum(level, _DARK_FLOOR * level.mean())[clusters.pixel] * kept
         transport = Transport(view.scene, _OPAQUE, lights)
         shadow_rays = light_clusters(transport, clusters, level, chosen.error, _MAX_CUT, seed, lit)
-        clock.lap(Stage.CUTS)
+        clock.stop()
         more = {"shadow_rays": shadow_rays, "gather_points": len(rays), "clusters": clusters.count}
         add_statistics(self.statistics, more | {"later": alone})
         # Every step-th sample stands for all
