@@ -19,16 +19,30 @@ INTERRUPTED = 130  # exit status
 
 
 class LazyScene:
-    """The scene of a `SceneFile`, loaded when it is asked for, once; the file can still be looked at afterwards."""
+    """The scene of a `SceneFile`, loaded when it is asked for, once; the file can still be looked at afterwards.
+    `before`, if given, is the `LazyScene` of the frame before."""
 
-    def __init__(self, file, threads=None):
+    def __init__(self, file, threads=None, before=None):
         self.file, self.seconds, self._threads, self._scene = file, 0.0, threads, None
+        self._before = before if self.keeps_lights else None
+        self.integrator = None
+
+    @property
+    def keeps_lights(self):
+        """Is the integrator to keep its lights for other images of this scene?"""
+        return self.file.integrator[1].get("keep_lights", False)
 
     def get(self):
-        """Return the `mi.Scene`; `seconds` is then what loading it took."""
+        """Return the `mi.Scene`; `seconds` is then what loading it took, and `integrator` what it is rendered with: its
+        own, or that of the frame before, which has lights, if nothing but the camera is another one."""
         if self._scene is None:
             begin = time.perf_counter()
+            before, self._before = self._before, None  # whose scene is not needed any more
+            if before and before.file.fingerprint(camera=False) == self.file.fingerprint(camera=False):
+                self.integrator = before.integrator
+            del before
             self._scene = SceneFile(self.file.path, self.file.defines, self.file.changes).load(self._threads)
+            self.integrator = self.integrator or self._scene.integrator()
             self.seconds = time.perf_counter() - begin
         return self._scene
 
@@ -92,8 +106,9 @@ class Image:
 
             if self._remote:
                 return self._remote.render(denoise=self._options.denoise, progress=progress)
+            scene = self._scene.get()
             return render(
-                self._scene.get(), sensor=self._sensor, denoise=self._options.denoise, progress=progress,
+                scene, self._scene.integrator, self._sensor, denoise=self._options.denoise, progress=progress,
                 checkpoint=self._checkpoint, **self._limits(),
             )  # fmt: skip
 

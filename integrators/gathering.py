@@ -102,9 +102,10 @@ class CameraPass:
 class GatheringIntegrator(mi.SamplingIntegrator):
     """Base class: follows camera rays to gather points, asks ``light`` for their radiance, and sums up.
 
-    Lights belong to one call of ``sample``: a scene that was edited in between is never lit by the lights of the old
-    one, and each pass of a render with several passes gets new ones.  Seeds are drawn from the sampler, so that
-    wrappers such as ``moment`` and ``aov``, which only call ``sample``, work like ``mi.render``.
+    Lights belong to one call of ``sample``, unless ``manylights`` is told to keep them: a scene that was edited in
+    between is never lit by the lights of the old one, and each pass of a render with several passes gets new ones.
+    Seeds are drawn from the sampler, so that wrappers such as ``moment`` and ``aov``, which only call ``sample``, work
+    like ``mi.render``.
     """
 
     aovs: tuple[str, ...] = ()  # channels that are asked for, where derived classes have a knob of that name
