@@ -18,6 +18,7 @@ denoised image.
 With --workers passes are rendered by several processes or machines, see docs/cluster.md. Several scenes, --frames with
 {frame} in the values of -D, and --sensor all make many images, one after the other; what fails is told, the others are
 rendered. --resume goes on from the checkpoint of an image that was not finished.
+With `-p keep_lights=true` frames and sensors of a scene that stays as it is share their virtual lights.
 
 In Python, `manylights.render(scene, error=0.02)` does the same, and `import manylights` registers the plugins, for the
 variant that is set and each that will be.
@@ -130,6 +131,8 @@ def parse_scene(options):
     replaced = None if options.integrator or name == own else own
     if options.sensor != batch.ALL and options.sensor >= file.sensors:
         raise UsageError(f"no sensor {options.sensor}: the scene has {file.sensors}")
+    if options.workers and file.integrator[1].get("keep_lights"):
+        raise UsageError("keep_lights is for one process: the lights of a worker would depend on the passes it had")
     return file, {"integrator": name, "parameters": file.integrator[1], "replaced": replaced}
 
 
@@ -176,7 +179,7 @@ def run(options):
 def _images(wanted, options, stack):
     """Yield the `Image` of each sensor of the scenes of `wanted`, a list of options; workers are let go with the
     `stack`. Raises UsageError where there is no scheduler: no image could be rendered."""
-    pool = None
+    pool = scene = None
     for one in wanted:
         try:
             file, described = parse_scene(one)
@@ -187,7 +190,7 @@ def _images(wanted, options, stack):
             mi.set_log_level(mi.LogLevel.Info)
         if options.workers and pool is None:  # not before it is known that there is something to render
             pool = stack.enter_context(connected(options.workers, options.threads))
-        scene = LazyScene(file, options.threads)
+        scene = LazyScene(file, options.threads, scene)
         for sensor in range(file.sensors) if options.sensor == batch.ALL else [options.sensor]:
             try:
                 image = Image(one, scene, described, sensor, pool)

@@ -121,6 +121,11 @@ class ErrorGoal:
         self._next = GROWTH * spp
         return True
 
+    def samples(self, found, spp):
+        """Return about how many samples per pixel there will be at the look that ends the render, if there are `spp` at
+        the last one, with an error `found`."""
+        return max(self._next, spp * (found / self.error) ** 2)
+
     def is_reached(self, found):
         """Is an estimated error (None: it is not known) low enough?"""
         return found is not None and found <= self.error

@@ -5,12 +5,12 @@ import time
 
 import mitsuba as mi
 import numpy as np
-from tqdm import tqdm
 
 from . import batch, command_line, images, machine
 from .checkpoint import Checkpoint, file_of
 from .interruption import Deadline
 from .occasional import OccasionalWriter
+from .progress import ImageBar
 from .render import render
 from .scene_files import SceneFile
 
@@ -19,16 +19,30 @@ INTERRUPTED = 130  # exit status
 
 
 class LazyScene:
-    """The scene of a `SceneFile`, loaded when it is asked for, once; the file can still be looked at afterwards."""
+    """The scene of a `SceneFile`, loaded when it is asked for, once; the file can still be looked at afterwards.
+    `before`, if given, is the `LazyScene` of the frame before."""
 
-    def __init__(self, file, threads=None):
+    def __init__(self, file, threads=None, before=None):
         self.file, self.seconds, self._threads, self._scene = file, 0.0, threads, None
+        self._before = before if self.keeps_lights else None
+        self.integrator = None
+
+    @property
+    def keeps_lights(self):
+        """Is the integrator to keep its lights for other images of this scene?"""
+        return self.file.integrator[1].get("keep_lights", False)
 
     def get(self):
-        """Return the `mi.Scene`; `seconds` is then what loading it took."""
+        """Return the `mi.Scene`; `seconds` is then what loading it took, and `integrator` what it is rendered with: its
+        own, or that of the frame before, which has lights, if nothing but the camera is another one."""
         if self._scene is None:
             begin = time.perf_counter()
+            before, self._before = self._before, None  # whose scene is not needed any more
+            if before and before.file.fingerprint(camera=False) == self.file.fingerprint(camera=False):
+                self.integrator = before.integrator
+            del before
             self._scene = SceneFile(self.file.path, self.file.defines, self.file.changes).load(self._threads)
+            self.integrator = self.integrator or self._scene.integrator()
             self.seconds = time.perf_counter() - begin
         return self._scene
 
@@ -83,30 +97,20 @@ class Image:
 
     def _render(self, output):
         """Render with a bar, and write now and then."""
-        spp = self._remote.spp if self._remote else self._local_spp()
-        with tqdm(total=spp, unit="spp", disable=None) as bar, Deadline(output.end_early):
+        with ImageBar() as bar, Deadline(output.end_early):
 
             def progress(took, image):
-                shown = {"passes": took.passes} if self._remote else {}
-                shown |= {} if took.error is None else {"error": f"{took.error:.2%}"}
-                bar.set_postfix(shown, refresh=False)
-                bar.update(took.spp - bar.n)
-                output.keep(took, image)
+                bar.show(took, *([f"{took.passes} passes"] if self._remote else []))
+                if image is not None:
+                    output.keep(took, image)
 
             if self._remote:
                 return self._remote.render(denoise=self._options.denoise, progress=progress)
-            limits = self._limits() | {"spp": spp}
+            scene = self._scene.get()
             return render(
-                self._scene.get(), sensor=self._sensor, denoise=self._options.denoise, progress=progress,
-                checkpoint=self._checkpoint, **limits,
+                scene, self._scene.integrator, self._sensor, denoise=self._options.denoise, progress=progress,
+                checkpoint=self._checkpoint, **self._limits(),
             )  # fmt: skip
-
-    def _local_spp(self):
-        """Return the samples per pixel that end the render, None where only time or error do."""
-        options = self._options
-        if options.spp or options.time or options.error:
-            return options.spp
-        return self._scene.get().sensors()[self._sensor].sampler().sample_count()
 
 
 class Failed:

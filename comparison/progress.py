@@ -1,4 +1,5 @@
-"""How far a comparison is, and how long it still takes: a bar where somebody watches, nothing where output is piped."""
+"""How far a comparison or an image is, and how long it still takes: a bar where somebody watches, nothing where output
+is piped."""
 
 import time
 from contextlib import contextmanager
@@ -6,6 +7,37 @@ from contextlib import contextmanager
 from tqdm import tqdm
 
 BAR = "{desc} |{bar}| {n_fmt}/{total_fmt} runs{postfix}"
+IMAGE_BAR = "{desc}|{bar}| {percentage:.0f}%{postfix}"
+
+
+class ImageBar:
+    """A bar of an image: the part of the time that has gone, as far as the end can be foreseen; the stage of the pass;
+    samples per pixel, shadow rays and error so far."""
+
+    def __init__(self):
+        self._bar = tqdm(total=1.0, disable=None, bar_format=IMAGE_BAR)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._bar.close()
+
+    def show(self, took, *more):
+        """Show a `render.Took` of a render that goes on, and `more`, in words."""
+        left = took.seconds_left
+        if left is not None:
+            self._bar.n = took.seconds / max(took.seconds + left, 1e-9)
+        shown = [f"{took.spp} spp", *more]
+        if rays := took.statistics.get("shadow_rays"):
+            shown.append(f"{tqdm.format_sizeof(rays)} shadow rays")
+        if took.error is not None:
+            shown.append(f"error {took.error:.2%}")
+        if left is not None:
+            shown.append(f"{tqdm.format_interval(left)} left")
+        self._bar.set_description_str(f"{took.stage} " if took.stage else "", refresh=False)
+        self._bar.set_postfix_str(", ".join(shown), refresh=False)
+        self._bar.refresh()
 
 
 class Progress:

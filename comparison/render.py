@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import mitsuba as mi
@@ -12,11 +13,12 @@ import numpy as np
 
 from integrators.knobs import doubt_percentage
 from vpl.core.exclusive import exclusive
+from vpl.core.stages import listening
 
 from .batch import ALL
 from .checkpoint import Checkpoint
-from .convergence import ErrorGoal
 from .denoising import Denoiser
+from .ending import Ending
 from .interruption import Interruption
 from .pass_sizes import PassSizes
 from .rendering import Progressive, TotalStatistics
@@ -33,6 +35,9 @@ class Took:
     reached, "interruption" (Ctrl-C, or the integrator's `cancel`) or "progress"; None while it goes on; `channels`:
     names of the image's channels; `denoise_seconds`: those of `seconds` that denoising took; `raw`: the image before it
     was denoised (`mi.TensorXf`), None if it was not.
+
+    Of a render that goes on: `stage`, that which a pass is in, as `statistics["seconds"]` has it, None between passes;
+    `seconds_left` until the end, as expected of the passes so far, None where that is not known.
     """
 
     spp: int
@@ -44,6 +49,8 @@ class Took:
     channels: list[str]
     denoise_seconds: float = 0.0
     raw: mi.TensorXf | None = field(default=None, repr=False)
+    stage: str | None = None
+    seconds_left: float | None = None
 
 
 def render(
@@ -56,7 +63,7 @@ def render(
     spp: int | None = None,
     seed: int = 0,
     denoise: bool = False,
-    progress: Callable[[Took, mi.TensorXf], bool | None] | None = None,
+    progress: Callable[[Took, mi.TensorXf | None], bool | None] | None = None,
     pass_spp: int | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> tuple[mi.TensorXf, Took]:
@@ -68,10 +75,11 @@ def render(
     which any may be given: `error`, the relative standard error that 95% of the pixels are to be below; `time`, in
     seconds, compilation included; `spp`, samples per pixel (if none is given, the scene's). There is always one pass.
     `seed`: of the first pass; the others have hashes of it. `denoise`: return the denoised image, see denoising.py.
-    `progress`: called after each pass with what it took so far and the image so far; if it returns False, the render
-    ends. `pass_spp`: samples per pixel of a pass, instead of two seconds. `checkpoint`: a `checkpoint.Checkpoint` that
-    the render of one sensor goes on from, counting its samples and seconds; it is kept for another one to go on from,
-    unless this one ends by what was asked for.
+    `progress`: called after each pass with what it took so far and the image so far, and, by the integrators of this
+    project, whenever a stage of a pass begins, with None for an image; if it returns False, no other pass begins, and
+    what it raises ends the render at once. `pass_spp`: samples per pixel of a pass, instead of two seconds.
+    `checkpoint`: a `checkpoint.Checkpoint` that the render of one sensor goes on from, counting its samples and
+    seconds; it is kept for another one to go on from, unless this one ends by what was asked for.
 
     After Ctrl-C, or `cancel()` of the integrator, the image of the finished passes is returned. Where there are none,
     KeyboardInterrupt is raised, or RuntimeError after `cancel()`; and KeyboardInterrupt by a second Ctrl-C.
@@ -80,6 +88,7 @@ def render(
     integrator if none is given; ModuleNotFoundError for `denoise` without the package that it needs; RuntimeError where
     another thread renders with the same sensor.
     """
+    integrator = _integrator(scene, integrator)
     if sensor == ALL:
         if checkpoint:
             raise ValueError(f"checkpoint must be None where sensor is '{ALL}': it is of one image")
@@ -95,13 +104,14 @@ def render(
         spp = scene.sensors()[sensor].sampler().sample_count()
     begin = clock.perf_counter()
     denoiser = Denoiser(scene, sensor, seed) if denoise else None
-    progressive = Progressive(scene, seed, sensor, _integrator(scene, integrator))
+    progressive = Progressive(scene, seed, sensor, integrator)
     reserved = denoiser.filter_seconds if denoiser else 0.0
     sizes = PassSizes(progressive.pixels, spp, time and time - reserved, pass_spp, many=error is not None)
+    ending = Ending(spp, time and time - reserved, error, reserved)
     if checkpoint:
         begin -= checkpoint.restore(progressive)
     with exclusive(sensor=scene.sensors()[sensor]):
-        return render_passes(progressive, sizes, error, begin, progress, denoiser, checkpoint)
+        return render_passes(progressive, sizes, ending, begin, progress, denoiser, checkpoint)
 
 
 def _render_all(scene, integrator, **limits):
@@ -114,19 +124,16 @@ def _render_all(scene, integrator, **limits):
     return found
 
 
-def render_passes(progressive, sizes, error, begin, progress=None, denoiser=None, checkpoint=None):
+def render_passes(progressive, sizes, ending, begin, progress=None, denoiser=None, checkpoint=None):
     """Render passes until something ends it; return the image and what it took, as `render`.
 
     `progressive` makes and adds up the passes (`rendering.Progressive`, or `cluster.passes.DistributedPasses`), and may
-    have some from the checkpoint; `sizes` says how large they are (`PassSizes`); `begin` is when the render began (of
-    `perf_counter`), earlier by what the passes of the checkpoint took.
+    have some from the checkpoint; `sizes` says how large they are (`PassSizes`), `ending` what ends them (`Ending`);
+    `begin` is when the render began (of `perf_counter`), earlier by what the passes of the checkpoint took.
     """
-    running = _Render(progressive, begin, progress, checkpoint)
-    goal = ErrorGoal(error) if error else None
-    if goal:
-        goal.resume(progressive.passes)
+    running = _Render(progressive, ending, begin, progress, checkpoint)
     with Interruption() as interruption:
-        running.run(sizes, goal, interruption)
+        running.run(sizes, interruption)
     if not progressive.passes:
         raise KeyboardInterrupt if interruption.asked else RuntimeError("cancelled before the first pass was finished")
     return running.result(denoiser)
@@ -157,51 +164,87 @@ def _integrator(scene, integrator):
 class _Render:
     """A render that began at a time (of `perf_counter`): its passes, and what ended it."""
 
-    def __init__(self, progressive, begin, progress, checkpoint):
-        self.progressive, self._begin, self._progress = progressive, begin, progress
+    def __init__(self, progressive, ending, begin, progress, checkpoint):
+        self.progressive, self._ending, self._begin, self._progress = progressive, ending, begin, progress
         self._checkpoint = checkpoint
         self._error, self._ended_by, self._statistics = None, None, TotalStatistics()
+        self._raised = None
+        if ending.goal:
+            ending.goal.resume(progressive.passes)
 
-    def run(self, sizes, goal, interruption):
+    def run(self, sizes, interruption):
         """Render passes until something ends it; leave a checkpoint unless nothing is missing."""
         try:
-            self._run(sizes, goal, interruption)
+            self._run(sizes, interruption)
         finally:
             if self._checkpoint and self._ended_by in ("spp", "time", "error"):
                 self._checkpoint.remove()
             elif self._checkpoint:
                 self._checkpoint.leave()
 
-    def _run(self, sizes, goal, interruption):
+    def _run(self, sizes, interruption):
 
         def interrupted():
             return interruption.asked or self.progressive.should_stop()
 
+        self._ending.mark(self.progressive.spp, self._elapsed())
         while self._ended_by is None:
-            size = sizes.next(self.progressive.passes, clock.perf_counter() - self._begin)
+            size = sizes.next(self.progressive.passes, self._elapsed())
             if isinstance(size, str):
                 self._ended_by = size
                 return
-            try:
-                # Mitsuba, too, hears Ctrl-C, and stops: then the pass may be unfinished.
-                one = self.progressive.render(size, accept=lambda: not interrupted())
-            except KeyboardInterrupt:
-                one = None
+            one = self._pass(size, interrupted)
             if one is not None:
-                self._look(goal)
+                self._look()
             if one is None or interrupted():
                 self._ended_by = "time" if self.progressive.is_late() else "interruption"
 
-    def _look(self, goal):
+    def _pass(self, size, interrupted):
+        """Render a pass and return it, None if it is not to be counted."""
+        try:
+            with listening(self._listener()) if self._progress else nullcontext():
+                # Mitsuba, too, hears Ctrl-C, and stops: then the pass may be unfinished.
+                return self.progressive.render(size, accept=lambda: not interrupted())
+        except BaseException as error:
+            # Mitsuba and Dr.Jit make other errors of what is raised below them
+            if self._raised is not None:
+                raise self._raised from None
+            if not isinstance(error, KeyboardInterrupt):
+                raise
+
+    def _listener(self):
+        """Return what is to be called with the stages of the next pass."""
+        before = self._took()
+
+        def begins(stage):
+            elapsed = self._elapsed()
+            left = self._ending.seconds_left(elapsed)
+            try:
+                self._tell(replace(before, seconds=elapsed, stage=str(stage), seconds_left=left), None)
+            except BaseException as error:
+                self._raised = error
+                raise _Refused from error
+
+        return begins
+
+    def _tell(self, took, image):
+        """Tell how far it is."""
+        if self._progress(took, image) is False:
+            self._ended_by = self._ended_by or "progress"
+
+    def _look(self):
         """See whether the last pass was enough, and tell how far it is."""
+        spp, goal = self.progressive.spp, self._ending.goal
+        self._ending.mark(spp, self._elapsed())
         if self._checkpoint:
-            self._checkpoint.keep(clock.perf_counter() - self._begin)
+            self._checkpoint.keep(self._elapsed())
         if goal and goal.is_due(self.progressive):
             self._error = self.progressive.estimate.relative()
+            self._ending.look(self._error, spp)
             if goal.is_reached(self._error):
                 self._ended_by = "error"
-        if self._progress and self._progress(self._took(), self._image()) is False:
-            self._ended_by = self._ended_by or "progress"
+        if self._progress:
+            self._tell(self._took(), self._image())
 
     def result(self, denoiser):
         """Return the image and what it took."""
@@ -211,14 +254,23 @@ class _Render:
         if denoiser:
             image, took.raw = denoiser.denoise(image, took.channels), image
             took.denoise_seconds = denoiser.seconds
-            took.seconds = clock.perf_counter() - self._begin
+            took.seconds = self._elapsed()
         return image, took
+
+    def _elapsed(self):
+        return clock.perf_counter() - self._begin
 
     def _image(self):
         return mi.TensorXf(np.float32(self.progressive.image))
 
     def _took(self):
-        one = self.progressive
-        seconds = clock.perf_counter() - self._begin
+        one, seconds = self.progressive, self._elapsed()
         statistics = self._statistics.of(one.passes)
-        return Took(one.spp, len(one.passes), seconds, self._error, statistics, self._ended_by, one.channels)
+        return Took(
+            one.spp, len(one.passes), seconds, self._error, statistics, self._ended_by, one.channels,
+            seconds_left=None if self._ended_by else self._ending.seconds_left(seconds),
+        )  # fmt: skip
+
+
+class _Refused(BaseException):
+    """Goes in the place of what a callback raised, past all that tells of an `Exception` on its way."""

@@ -11,6 +11,8 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
+# What a scene is looked at by
+_OF_CAMERA = ("Sensor", "Film", "Sampler", "ReconstructionFilter")
 # What a replaced integrator hands on to its successor: it says which light is to be shown, not how it is computed.
 KEPT_PARAMETERS = ("max_depth", "rr_depth", "hide_emitters")
 GIVEN_TO_RENDER = ("sample_count", "seed")  # instead of what the sampler says
@@ -116,11 +118,14 @@ class SceneFile:
             film.props["width"] = int(width)
             film.props["height"] = max(1, round(old_height * width / old_width))
 
-    def fingerprint(self):
+    def fingerprint(self, camera=True):
         """Return a hash (hexadecimal) of everything that the image depends on, but for the samples per pixel and the
-        seed: variant, scene with all other parameters, and the content of every file that it names."""
+        seed: variant, scene with all other parameters, and the content of every file that it names. Without `camera`,
+        sensors and what belongs to them are left out."""
         digest = hashlib.sha256(mi.variant().encode())
         for node in self._state.nodes:
+            if not camera and node.type in {getattr(mi.ObjectType, name) for name in _OF_CAMERA}:
+                continue
             properties = mi.Properties(node.props)
             if node.type == mi.ObjectType.Sampler:
                 for name in GIVEN_TO_RENDER:

@@ -163,14 +163,15 @@ class ManyLightIntegrator(GatheringIntegrator):
         if camera.dark or self.max_depth < 2:
             return prepared
         lights = prepare_lights(scene, emitters, self.light_options(), points.places(_PLACES), camera.seed)
-        clock.split(lights.seconds)
+        clock.add(lights.seconds)
         grid = self.pixel_grid(scene, sampler)
         if self.direct in ("nee", "adaptive"):
+            clock.begin(Stage.DIRECT)
             light = self._nee if self.direct == "nee" else self._adaptive
             direct, rays = light(scene, camera, grid)
             prepared.direct += direct
             prepared.counts["emitter_rays"] = rays
-            clock.lap(Stage.DIRECT)
+            clock.stop()
         prepared.counts |= {
             "lights": lights.counts,
             "light_paths": lights.paths,
@@ -211,7 +212,7 @@ class ManyLightIntegrator(GatheringIntegrator):
                 values = getattr(part, name)
                 total = totals.setdefault(name, dr.zeros(type(values), camera.paths.points.count))
                 dr.scatter(total, values, job.batch.index)
-            camera.clock.split(part.seconds)
+            camera.clock.add(part.seconds)
             for name, number in (part.counts | {"dropped": part.dropped}).items():
                 prepared.counts[name] = prepared.counts.get(name, 0) + number
         names = {"shadow_rays": "shadow_rays", "upper_bounds": "bound_computations", "cut_size": "cut_size"}
@@ -221,8 +222,9 @@ class ManyLightIntegrator(GatheringIntegrator):
     def _jobs(self, transport: Transport, prepared: Prepared, seed: int, grid: PixelGrid) -> list[ShadeJob]:
         """One job per batch of gather points, each knowing the mean radiance over all of them."""
         points, jobs, mean = prepared.paths.points, [], 0.0
+        prepared.clock.begin(Stage.PROBE)
         batches = make_batches(points, probe_materials(points, transport.traits))
-        prepared.clock.lap(Stage.PROBE)
+        prepared.clock.begin(Stage.PILOT)
         for number, batch in enumerate(batches):
             direct = dr.gather(type(prepared.direct), prepared.direct, batch.index)
             stream = derived_seed(seed, 31, number)
@@ -235,5 +237,5 @@ class ManyLightIntegrator(GatheringIntegrator):
                 mean += (level + float(download(direct).mean(dtype="float64"))) * share
         for job in jobs:
             job.mean = mean
-        prepared.clock.lap(Stage.PILOT)
+        prepared.clock.stop()
         return jobs

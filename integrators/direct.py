@@ -133,8 +133,9 @@ class DirectLightIntegrator(GatheringIntegrator):
         points = camera.paths.points
         if camera.dark or self.max_depth < 2:
             return mi.UnpolarizedSpectrum(0), {}, {"shadow_rays": 0}
+        camera.clock.begin(Stage.SOURCES)
         sources = Sources(scene, camera.emitters)
-        camera.clock.lap(Stage.SOURCES)
+        camera.clock.begin(Stage.DIRECT)
         options, level = self.options(), None
         if self._band:
             options, level = replace(options, time=self._band.time), self._band.level
@@ -142,7 +143,7 @@ class DirectLightIntegrator(GatheringIntegrator):
             scene, camera.traits, sources, points, self.pixel_grid(scene, sampler), self.max_depth, options,
             derived_seed(camera.seed, 30), self.should_stop, level,
         )  # fmt: skip
-        camera.clock.lap(Stage.DIRECT)
+        camera.clock.stop()
         counts = {"sources": sources.count, "shadow_rays": whole_sum(found.shadow_rays)}
         counts |= {"passes": whole_sum(found.passes), "clusters": found.clusters}
         return found.radiance, vars(found), counts | {"dropped": camera.emitters.dropped}

@@ -13,7 +13,7 @@ import numpy as np
 
 from vpl.core.arrays import add_at, download, usable
 from vpl.core.exclusive import exclusive
-from vpl.core.stages import Stage
+from vpl.core.stages import Stage, tell
 from vpl.lights.emitters import Emitters, read_emitters
 from vpl.points.camera_paths import CameraPaths, PixelGrid, SceneTraits, follow_camera_rays, refuse_media, scene_traits
 
@@ -25,24 +25,32 @@ _SAMPLES_PER_PASS = Integer("samples_per_pass", 2**32 - 1, "Most samples of a pi
 
 
 class Clock:
-    """Seconds by stage; a stage ends when the device has finished."""
+    """Seconds by stage, of which the first begins at once.  A stage ends when the next one begins or the clock is
+    stopped, and the device has finished; who listens (:func:`vpl.core.stages.listening`) is told of each."""
 
-    def __init__(self):
+    def __init__(self, stage: Stage):
         self.seconds: dict[str, float] = {}
-        self._start = perf_counter()
+        self._stage: Stage | None = None
+        self.begin(stage)
 
-    def lap(self, stage: Stage) -> None:
-        """End the current stage and name it."""
-        dr.sync_thread()
-        now = perf_counter()
-        self.split({stage: now - self._start})
+    def begin(self, stage: Stage) -> None:
+        """End the current stage and begin another one."""
+        self.stop()
+        tell(stage)
+        self._stage, self._start = stage, perf_counter()
 
-    def split(self, seconds: dict[str, float]) -> None:
-        """Add the times of stages that were taken elsewhere; the current stage begins now."""
+    def stop(self) -> None:
+        """End the current stage."""
+        if self._stage is not None:
+            dr.sync_thread()
+            self.add({self._stage: perf_counter() - self._start})
+            self._stage = None
+
+    def add(self, seconds: dict[str, float]) -> None:
+        """Add the times of stages that were taken elsewhere."""
         for stage, spent in seconds.items():
             # By plain text, as statistics are printed
             self.seconds[str(stage)] = self.seconds.get(stage, 0.0) + spent
-        self._start = perf_counter()
 
 
 def whole_sum(values) -> int:
@@ -94,9 +102,10 @@ class CameraPass:
 class GatheringIntegrator(mi.SamplingIntegrator):
     """Base class: follows camera rays to gather points, asks ``light`` for their radiance, and sums up.
 
-    Lights belong to one call of ``sample``: a scene that was edited in between is never lit by the lights of the old
-    one, and each pass of a render with several passes gets new ones.  Seeds are drawn from the sampler, so that
-    wrappers such as ``moment`` and ``aov``, which only call ``sample``, work like ``mi.render``.
+    Lights belong to one call of ``sample``, unless ``manylights`` is told to keep them: a scene that was edited in
+    between is never lit by the lights of the old one, and each pass of a render with several passes gets new ones.
+    Seeds are drawn from the sampler, so that wrappers such as ``moment`` and ``aov``, which only call ``sample``, work
+    like ``mi.render``.
     """
 
     aovs: tuple[str, ...] = ()  # channels that are asked for, where derived classes have a knob of that name
@@ -161,17 +170,17 @@ class GatheringIntegrator(mi.SamplingIntegrator):
 
     def begin(self, scene, sampler, ray, active=True) -> CameraPass:
         """Emitters and camera paths."""
-        clock = Clock()
+        clock = Clock(Stage.SCENE)
         seed = int(dr.reinterpret_array(mi.UInt32, dr.detach(sampler.next_1d()))[0])
         emitters, traits = read_emitters(scene), scene_traits(scene)
         if emitters.count == 0:
             mi.Log(mi.LogLevel.Warn, "The scene has no emitters: the image will be black.")
-        clock.lap(Stage.SCENE)
+        clock.begin(Stage.GATHER)
         skip = self.skip_area_emitters if self.hide_emitters else None
         paths = follow_camera_rays(
             scene, emitters, traits, sampler, seed, ray, active, self.max_depth, self.rr_depth, skip, self.along_curve
         )
-        clock.lap(Stage.GATHER)
+        clock.stop()
         sky = emitters.environment is not None and not self.hide_emitters
         return CameraPass(seed, emitters, traits, paths, paths.valid | (active & sky), clock)
 

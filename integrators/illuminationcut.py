@@ -107,23 +107,23 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
 
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Phase I, Phase II and the evaluation of the pairs, for one batch ([IC] section 3)."""
-        clock = Clock()
+        clock = Clock(Stage.POINT_TREE)
         clusters = PointClusters(job.batch)
-        clock.lap(Stage.POINT_TREE)
+        clock.begin(Stage.PHASE_ONE)
         counter = BoundCounter(clusters, "upper_bounds" in self.aovs)
         bright, rays = self._approximate(job, clusters, counter)
         threshold = self._threshold(job, clusters, bright, counter)
-        clock.lap(Stage.PHASE_ONE)
+        clock.begin(Stage.PHASE_TWO)
 
         shaded = ShadeResult(
             dr.zeros(mi.UnpolarizedSpectrum, clusters.count), rays, None, dr.zeros(mi.UInt32, clusters.count)
         )
         for group, pairs in self._pairs(job, clusters, threshold, counter):
-            clock.lap(Stage.PHASE_TWO)
             if job.stopped():
                 break
             self._evaluate(job, group, clusters, pairs, shaded, clock)
-        clock.lap(Stage.PHASE_TWO)
+            clock.begin(Stage.PHASE_TWO)
+        clock.stop()
         shaded.upper_bounds = counter.per_point()
         shaded.phase_one = upload(mi.Float, bright[clusters.tree.leaf])
         shaded.seconds = clock.seconds
@@ -163,10 +163,11 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         """Add the light of some pairs to ``shaded``."""
         seen, traced = [], [pairs]
         if self.visibility == "adaptive":
+            clock.begin(Stage.VISIBILITY)
             seen, traced = decide_visibility(job.transport, group, clusters, pairs, shaded.shadow_rays)
-            clock.lap(Stage.VISIBILITY)
         if not seen and not traced:
             return
+        clock.begin(Stage.EVALUATE)
         lists = list_pairs(group, clusters, traced, seen)
         rows = dr.arange(mi.UInt32, clusters.count)
         radiance, rays = evaluate_lists(job.transport, group, clusters.batch, lists, rows)
@@ -174,7 +175,6 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         shaded.shadow_rays += rays
         shaded.cut_size += lists.length
         dr.eval(shaded.radiance, shaded.shadow_rays, shaded.cut_size)
-        clock.lap(Stage.EVALUATE)
 
 
 mi.register_integrator("illuminationcut", IlluminationCutIntegrator)

@@ -76,14 +76,14 @@ class LightcutsIntegrator(ManyLightIntegrator):
 
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Choose a cut for every point of a batch and evaluate it."""
-        clock = Clock()
+        clock = Clock(Stage.ESTIMATE)
         spent = estimate_radiance(job.transport, job.batch, job.direct, job.mean, self.max_cut, _ESTIMATE_STRIDE)
-        clock.lap(Stage.ESTIMATE)
+        clock.begin(Stage.CUT)
         wanted = upload(mi.Float, self.error * np.maximum(spent.radiance, self.dark_floor * job.mean))
         threshold, sizes, searched = limited_cuts(job.lights, job.batch, wanted, self.max_cut)
-        clock.lap(Stage.CUT)
+        clock.begin(Stage.EVALUATE)
         radiance, rays, collected = evaluate_cuts(job.transport, job.batch, threshold, sizes, stopped=job.stopped)
-        clock.lap(Stage.EVALUATE)
+        clock.stop()
         bounds = searched + collected + spent.upper_bounds
         return ShadeResult(radiance, rays + spent.shadow_rays, bounds, sum(sizes.count), clock.seconds)
 

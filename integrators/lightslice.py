@@ -125,24 +125,24 @@ class LightSliceIntegrator(ManyLightIntegrator):
 
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Slices, the lights of each, and what these send to its points, for one batch."""
-        clock, turn = Clock(), self._turns(job)
+        clock, turn = Clock(Stage.SLICES), self._turns(job)
         slices, seeds = max(round(self.slices * job.share), 1), [derived_seed(job.seed, k) for k in range(4)]
         clusters = PointClusters(job.batch, partial(build_slices, slices=slices, seed=seeds[0], rank=turn))
         tree = clusters.tree
         first, size = (of_node[tree.leaves].astype(np.int64) for of_node in (tree.first, tree.count))
         # A row of the light matrix is sampled at one random point of each slice
         points = first + (np.random.default_rng(seeds[1]).random(len(size)) * size).astype(np.int64)
-        clock.lap(Stage.SLICES)
+        clock.begin(Stage.SHARED_COLUMNS)
         forest, rays, bounds = shared_columns(job.transport, clusters, points, self.shared_columns, seeds[2])
-        clock.lap(Stage.SHARED_COLUMNS)
+        clock.begin(Stage.ROWS)
         rows = SampledRows(job.transport, clusters.batch, DeviceForest(forest, job.lights), points)
-        clock.lap(Stage.ROWS)
+        clock.begin(Stage.COLUMNS)
         near = NearRows.nearest(slice_places(clusters), self.neighbours)
         chosen = slice_lights(rows, near, clusters, self.columns, self.unseen, self.sets, seeds[3])
-        clock.lap(Stage.COLUMNS)
+        clock.begin(Stage.EVALUATE)
         entry = upload(mi.UInt32, turn[tree.order] * rows.count + np.repeat(np.arange(rows.count), size))
         radiance, traced, columns = self._light(job, clusters, chosen, entry)
-        clock.lap(Stage.EVALUATE)
+        clock.stop()
         radiance, traced, columns = clusters.in_batch_order([radiance, traced, columns])
         # What was spent on choosing is shared by all points
         shared = [(rays + rows.rays) / clusters.count, (bounds + rows.count * rows.forest.columns) / clusters.count]

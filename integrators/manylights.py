@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +17,7 @@ from vpl.lights.perturbed import Perturbed
 from vpl.points.camera_paths import SceneTraits
 from vpl.split.balance import Balance, balance, importance, judged_by, noise, without_lights
 from vpl.split.gather_vertices import drawn_later, joined
+from vpl.split.kept_lights import KeptLights, TreedLights
 from vpl.split.next_event import emitters_of
 from vpl.split.numbers import SpreadNumbers
 from vpl.split.paths import AT_FIRST, EVERYWHERE, NOWHERE, FirstEdge, Limits
@@ -110,6 +112,16 @@ class ManyLightsIntegrator(GatheringIntegrator):
     is ``path`` with well spread samples. What was chosen is in ``statistics``, in the log (level Info) and in files
     that the command writes. The same seed chooses the same.
 
+    **Kept lights.** With ``keep_lights`` the frames of a camera that moves, or several sensors, share their lights and
+    the tree over them, each seed its own, as far as these are two million. Every frame still has the mean of ``path``,
+    and a pilot of its own. It costs quality: lights are aimed at what the first camera saw, so that what others see has
+    fewer of them and more noise, and the noise of lights is the same in all frames: it stands still where it would
+    flicker, and does not average out over them. Whether the scene is still the same is asked before each pass: of
+    every object but sensors and the integrator, all that Mitsuba prints of it and the values of all parameters are
+    compared (by hashes, 10 to 40 ms in most scenes); where anything differs, lights are made anew. To change what
+    Mitsuba neither prints nor lists as a parameter, such as how a texture is filtered, takes a scene that is loaded
+    anew: give it an integrator of its own.
+
     - Values of single pixels may be negative while samples are few: what is traced is a difference.
     - Masks: the image is that of ``prb``. ``path`` (Mitsuba 3.9.1) shows black for samples that have passed nothing but
       masks when their paths end, and so is too dark where nothing is behind a mask; with ``hide_emitters`` it hides an
@@ -137,7 +149,16 @@ class ManyLightsIntegrator(GatheringIntegrator):
             "virtual_lights", True,
             "Whether virtual lights may carry indirect light where they pay. Without them all of it is traced.",
         ),
+        Boolean(
+            "keep_lights", False,
+            "Whether the virtual lights of a seed are kept for the next image of it, by the same integrator, as long "
+            "as the scene stays as it is but for its sensors.",
+        ),
     )  # fmt: skip
+
+    def __init__(self, props):
+        super().__init__(props)
+        self._kept = KeptLights()
 
     def _sample(self, scene, sampler, ray, active):
         radiance, valid = self._trace(self._view(scene, sampler, ray, active))
@@ -158,12 +179,11 @@ class ManyLightsIntegrator(GatheringIntegrator):
 
     def _trace(self, view: View):
         """(Radiance of each camera ray, whether it is opaque in the film's alpha)."""
-        clock, self.statistics = Clock(), {}
+        clock, self.statistics = Clock(Stage.PILOT), {}
         pilot = self._pilot(view)
         chosen = self._balance(view, pilot)
         self._judge(view, pilot, chosen)
         mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
-        clock.lap(Stage.PILOT)
         lights = self._lights(view, pilot, chosen, clock)
         gathering, c = (EVERYWHERE, lights.smallest_distance) if lights else (NOWHERE, _WHOLE)
         limits = self._limits(view, c, self.max_depth, gathering)
@@ -177,8 +197,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
                 break
             lane = dr.arange(mi.UInt32, min(most, view.count - first)) + dr.opaque(mi.UInt32, first)
             dr.eval(lane)
+            clock.begin(Stage.TRACED)
             found, vertices, later, _ = view.follow(lane, limits, 4, first)
-            clock.lap(Stage.TRACED)
             if lights:
                 nearby = expected[first // view.samples :][: -(-len(lane) // view.samples)]
                 seed = derived_seed(view.seed, 5, first)
@@ -186,6 +206,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
             dr.scatter(radiance, found.radiance, lane)
             dr.scatter(valid, found.valid, lane)
             dr.eval(radiance, valid)
+        clock.stop()
         if view.scene.environment() is not None and not self.hide_emitters:
             valid |= view.active
         finite = dr.all(dr.isfinite(radiance))
@@ -259,19 +280,33 @@ class ManyLightsIntegrator(GatheringIntegrator):
         """Virtual lights and their tree; None where there are none."""
         if chosen.light_paths == 0:
             return None
+        clock.begin(Stage.LIGHTS)
+        # None is followed where they are kept
+        self.statistics["light_paths"] = 0
+        if not self.keep_lights:
+            made = self._made_lights(view, pilot, chosen, clock)
+        else:
+            make = partial(self._made_lights, view, pilot, chosen, clock)
+            made = self._kept.find(view.scene, (view.seed, self.max_depth), make)
+        self.statistics["lights"] = {"surface": made.surface.lights.count}
+        if made.group is None:
+            return None
+        c = _TAPER * made.surface.spacing(pilot.arrivals)
+        return LightSet([made.group], c, self.max_depth, self.statistics["light_paths"], 0, {})
+
+    def _made_lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> TreedLights:
+        """Virtual lights where the pilot's paths arrived, and their tree."""
         # The path from a light is shorter by the two edges between camera and light
         limits = self._limits(view, _WHOLE, self.max_depth - 2, NOWHERE, rr_depth=1)
         limits.hide_emitters, limits.worth = False, Worth.unknown()
         made = surface_lights(
             view.scene, view.emission, pilot.arrivals, chosen.light_paths, limits, derived_seed(view.seed, 2)
         )  # fmt: skip
-        clock.lap(Stage.LIGHTS)
-        self.statistics |= {"light_paths": chosen.light_paths, "lights": {"surface": made.lights.count}}
+        self.statistics["light_paths"] = chosen.light_paths
         if made.lights.count == 0:
-            return None
-        group = ScatteredGroup.of(made.lights, derived_seed(view.seed, 3))
-        clock.lap(Stage.TREE)
-        return LightSet([group], _TAPER * made.spacing, self.max_depth, chosen.light_paths, 0, {})
+            return TreedLights(made, None)
+        clock.begin(Stage.TREE)
+        return TreedLights(made, ScatteredGroup.of(made.lights, derived_seed(view.seed, 3)))
 
     def _gather(self, view, lights, chosen, vertices, found, expected, seed, clock):
         """Light of virtual lights at the vertices of some pixels, per camera ray.
@@ -279,6 +314,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         ``expected``: indirect light that each pixel should have, by which errors are judged together with what its
         paths found.
         """
+        clock.begin(Stage.CLUSTERS)
         samples, count = view.samples, dr.width(found.radiance)
         step = -(-samples // chosen.vertices)
         kept = -(-samples // step)
@@ -296,13 +332,13 @@ class ManyLightsIntegrator(GatheringIntegrator):
         picked = first.select(rays).and_then(later.select(later_rays, factor, share))
         rays = joined(rays, later_rays)
         clusters = PixelClusters(picked, rays, samples, alone)
-        clock.lap(Stage.CLUSTERS)
+        clock.begin(Stage.CUTS)
         traced = np.nan_to_num(download(channel_mean(found.radiance)), posinf=0, neginf=0)
         level = np.add.reduceat(np.maximum(traced, 0), np.arange(0, count, samples)) / samples + expected
         level = np.maximum(level, _DARK_FLOOR * level.mean())[clusters.pixel] * kept
         transport = Transport(view.scene, _OPAQUE, lights)
         shadow_rays = light_clusters(transport, clusters, level, chosen.error, _MAX_CUT, seed, lit)
-        clock.lap(Stage.CUTS)
+        clock.stop()
         more = {"shadow_rays": shadow_rays, "gather_points": len(rays), "clusters": clusters.count}
         add_statistics(self.statistics, more | {"later": alone})
         # Every step-th sample stands for all

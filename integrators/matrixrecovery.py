@@ -155,41 +155,42 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
 
     def start(self, job: ShadeJob) -> Work:
         """The slices of a batch."""
-        clock = Clock()
+        clock = Clock(Stage.SLICES)
         pixel = download(job.ray).astype(np.int64) // job.grid.samples
         clusters = PointClusters(job.batch, partial(build_row_slices, pixel, self.slice_rows))
         rows = MatrixRows(clusters, pixel, job.seed)
-        clock.lap(Stage.SLICES)
+        clock.stop()
         return Work(MatrixEntries(job.transport, rows), clock)
 
     def recovered(self, job: ShadeJob, work: Work):
         """Yield the matrices of all slices, recovered: (block, what was found), block by block."""
         rows = work.entries.rows
+        work.begin(Stage.INITIAL_CUT)
         columns, work.bounds = initial_columns(work.entries, job.mean, min(self.initial_columns, self.max_columns))
-        work.lap(Stage.INITIAL_CUT)
         for number, begin in enumerate(range(0, rows.slices, _SLICES)):
             if job.stopped():
                 break
+            work.begin(Stage.COLUMNS)
             slices = (begin, min(begin + _SLICES, rows.slices))
             part = columns.select(np.arange(*np.searchsorted(columns.piece, slices)))
             seed = derived_seed(job.seed, number)
             count = min(math.ceil(self.sampling * rows.count / rows.slices), rows.most)
             part, first = split_columns(work.entries, part, self.alpha, self.max_columns, count, seed)
-            work.lap(Stage.COLUMNS)
             if part.count:
                 samples = VisibilitySamples(work.entries, part, min(count * (self.rounds + 1), rows.most), seed)
                 samples.resume(first)
                 yield from self._blocks(job, work, samples, count, slices, seed)
+        work.stop()
 
     def _blocks(
         self, job: ShadeJob, work: Work, samples: VisibilitySamples, count: int, slices: tuple[int, int], seed: int
     ):
         """Predict the columns of some slices, and recover their matrices as many at a time as memory allows."""
+        work.begin(Stage.PREDICTION)
         entries, columns = work.entries, samples.columns
         named = tuple(kind for name, kind in PREDICTORS.items() if name in self.steps)
         kinds, rounds = (named, self.rounds) if named else (tuple(PREDICTORS.values()), 0)
         predictors, best = predict_columns(samples, kinds, count, self.prediction_error, rounds, seed)
-        work.lap(Stage.PREDICTION)
         for name, kind in PREDICTORS.items():
             work.add(f"{name}_columns", int((best == kind).sum()) if named else 0)
         for begin, end in _chunks(entries, columns, slices):
@@ -199,11 +200,11 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
             if low < high:
                 block = MatrixBlock(entries, columns.select(np.arange(low, high)), begin, end)
                 seed_of_block = derived_seed(seed, 1, begin)
-                found = recover(block, predictors, best, int(low), self.steps, seed_of_block, work.lap)
+                found = recover(block, predictors, best, int(low), self.steps, seed_of_block, work.begin)
                 work.add("failed_slices", found.failed)
                 work.add("entries", int(block.counts.prod(1).sum()))
+                work.begin(Stage.EVALUATE)
                 yield block, found
-                work.lap(Stage.EVALUATE)
 
 
 class Work:
@@ -215,6 +216,7 @@ class Work:
 
     def __init__(self, entries: MatrixEntries, clock: Clock):
         self.entries, self.clock, self.bounds, rows = entries, clock, 0, entries.rows
+        self.stage: Stage | None = None
         tree, count = rows.clusters.tree, rows.clusters.count
         self._begin = np.append(tree.first[tree.leaves].astype(np.int64), count)
         self.radiance, self.columns = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UInt32, count)
@@ -226,11 +228,19 @@ class Work:
         """Count something."""
         self.counts[name] = self.counts.get(name, 0) + number
 
-    def lap(self, stage: Stage) -> None:
-        """A stage has ended: its time, and its shadow rays."""
-        self.clock.lap(stage)
-        before = sum(number for name, number in self.counts.items() if name.endswith("_rays"))
-        self.add(f"{stage}_rays", self.entries.rays - before)
+    def begin(self, stage: Stage) -> None:
+        """A stage begins, and the one before ends."""
+        self.stop()
+        self.stage = stage
+        self.clock.begin(stage)
+
+    def stop(self) -> None:
+        """The stage ends: its time, and its shadow rays."""
+        self.clock.stop()
+        if self.stage is not None:
+            before = sum(number for name, number in self.counts.items() if name.endswith("_rays"))
+            self.add(f"{self.stage}_rays", self.entries.rays - before)
+            self.stage = None
 
     def light(self, block: MatrixBlock, visibility) -> None:
         """Add what the columns of a block send to the points of its slices."""

@@ -97,7 +97,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
 
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Gather trees, thresholds, and the cut of every pixel, for one batch."""
-        clock = Clock()
+        clock = Clock(Stage.ESTIMATE)
         if not job.grid.known:
             mi.Log(mi.LogLevel.Warn, "The sensor is not one of the scene's: every camera ray counts as a pixel.")
         pixel = download(job.ray).astype(np.int64) // job.grid.samples
@@ -106,27 +106,28 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
             job.transport, job.batch, job.direct, job.mean, self.max_cut,
             round(_ESTIMATE_PIXELS * per_pixel),
         )  # fmt: skip
-        clock.lap(Stage.ESTIMATE)
+        clock.begin(Stage.GATHER_TREE)
         leaf_size = 1 if job.batch.proxy.glossy else self.leaf_points
         clusters = PointClusters(job.batch, partial(build_gather_tree, pixel, job.grid.width, leaf_size))
         order = clusters.tree.order
         weight = dr.gather(type(job.weight), job.weight, clusters.order)
         cuts = PixelCuts(clusters, pixel[order], weight, job.grid.samples, job.seed)
-        clock.lap(Stage.GATHER_TREE)
+        clock.begin(Stage.THRESHOLD)
         counter = BoundCounter(clusters, "upper_bounds" in self.aovs)
         allowed = self._allowed(job, estimate, pixel)[order]
         stride = round(_TRIED_PIXELS * per_pixel)
         rule = cuts.rule(raise_thresholds(job.lights, clusters, allowed, self.max_cut, stride, counter))
-        clock.lap(Stage.THRESHOLD)
+        clock.begin(Stage.PAIRS)
         for group, pairs in self._pairs(job, clusters, rule, counter):
-            clock.lap(Stage.PAIRS)
             if job.stopped():
                 break
+            clock.begin(Stage.EVALUATE)
             cuts.evaluate(job.transport, group, pairs)
-            clock.lap(Stage.EVALUATE)
+            clock.begin(Stage.PAIRS)
+        clock.begin(Stage.SUM)
         radiance, pairs = cuts.per_point()
         radiance, rays, bounds, pairs = clusters.in_batch_order([radiance, cuts.rays, counter.per_point(), pairs])
-        clock.lap(Stage.SUM)
+        clock.stop()
         rays, bounds = rays + estimate.shadow_rays, bounds + mi.Float(estimate.upper_bounds)
         return ShadeResult(radiance, rays, bounds, pairs, clock.seconds, dropped=cuts.dropped)
 

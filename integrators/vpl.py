@@ -5,9 +5,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from vpl.core.stages import Stage
 from vpl.transport.evaluation import sum_all_lights
 
 from .common import ManyLightIntegrator, ShadeJob, ShadeResult
+from .gathering import Clock
 from .manual import manual_page
 
 
@@ -47,9 +49,11 @@ class VPLIntegrator(ManyLightIntegrator):
 
     def shade(self, job: ShadeJob) -> ShadeResult:
         """Sum over all lights; see :func:`vpl.transport.evaluation.sum_all_lights`."""
-        count = job.batch.count
+        count, clock = job.batch.count, Clock(Stage.EVALUATE)
         radiance, rays = sum_all_lights(job.transport, job.batch, job.stopped)
-        return ShadeResult(radiance, rays, dr.zeros(mi.UInt32, count), dr.opaque(mi.UInt32, job.lights.count, count))
+        clock.stop()
+        lights = dr.opaque(mi.UInt32, job.lights.count, count)
+        return ShadeResult(radiance, rays, dr.zeros(mi.UInt32, count), lights, clock.seconds)
 
 
 mi.register_integrator("vpl", VPLIntegrator)

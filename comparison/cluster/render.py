@@ -4,6 +4,7 @@ import math
 import time as clock
 
 from ..denoising import Denoiser
+from ..ending import Ending
 from ..pass_sizes import PassSizes
 from ..render import check, render_passes
 from .passes import DistributedPasses, samples_of_a_pass
@@ -51,10 +52,12 @@ class DistributedRender:
         begin = clock.perf_counter() - self._seconds
         try:
             denoiser = Denoiser(self._scene.get(), self._sensor, self._seed) if denoise else None
+            reserved = denoiser.filter_seconds if denoiser else 0.0
+            ending = Ending(self.spp, self._time and self._time - reserved, self._error, reserved)
             if self._time:
-                self.passes.deadline = begin + self._time - (denoiser.filter_seconds if denoiser else 0.0)
+                self.passes.deadline = begin + self._time - reserved
             sizes = PassSizes(self.passes.pixels, self.spp, fixed=self._pass_spp)
-            return render_passes(self.passes, sizes, self._error, begin, progress, denoiser, self._checkpoint)
+            return render_passes(self.passes, sizes, ending, begin, progress, denoiser, self._checkpoint)
         finally:
             self.close()
 

@@ -6,6 +6,7 @@ Where a scene has a hundred thousand emitters, that takes ten times as long as l
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from functools import cache
 
@@ -41,7 +42,7 @@ class Parameters(Mapping):
 def parameters_of(node, below: bool = True) -> Parameters:
     """Parameters of an object and, if wanted, of all objects below it, with the objects' own names before theirs."""
     found = Parameters()
-    _reader()(node, "", found, {node} if below else None)
+    _read(node, "", found, {node} if below else None)
     return found
 
 
@@ -59,23 +60,66 @@ def numbers(value) -> list[float]:
     return [float(component[0]) for component in (value if dr.depth_v(value) > 1 else (value,))]
 
 
+def fingerprint(nodes) -> str:
+    """What tells objects from others, in whatever order they come: of each of them, and of all below it, what Mitsuba
+    prints, and the values of all parameters."""
+    known: dict = {}
+    return hashlib.blake2b(b"".join(sorted(_digest(node, known) for node in nodes))).hexdigest()
+
+
+def fingerprint_without_camera(scene) -> str:
+    """What tells a scene from others, but for its sensors and its integrator."""
+    objects = (value for _, value, _ in _members(scene) if isinstance(value, mi.Object))
+    return fingerprint(one for one in objects if not isinstance(one, mi.Sensor | mi.Integrator))
+
+
+def _digest(node, known: dict) -> bytes:
+    if node in known:
+        return known[node]
+    # Met again on the way, it is one that this one belongs to
+    known[node] = b""
+    digest = hashlib.blake2b(f"{node.class_name()} {node}".encode())
+    for name, value, cpptype in _members(node):
+        digest.update(name.encode())
+        if isinstance(value, mi.Object):
+            digest.update(_digest(value, known))
+            continue
+        value = value if cpptype is None else mi.get_property(value, cpptype, node)
+        digest.update(np.ascontiguousarray(value).tobytes() if dr.is_array_v(value) else str(value).encode())
+    known[node] = digest.digest()
+    return known[node]
+
+
+def _read(node, prefix: str, found: Parameters, visited: set | None) -> None:
+    """Add the parameters of a node to ``found``."""
+    for name, value, cpptype in _members(node):
+        if not isinstance(value, mi.Object):
+            found.add(prefix + name, value, cpptype, node)
+        elif visited is not None and value not in visited:
+            visited.add(value)
+            _read(value, f"{prefix}{name}.", found, visited)
+
+
+def _members(node) -> list[tuple]:
+    """(Name, value, its type in C++ where Python knows it by that alone) of all parameters of a node, and of all
+    objects right below it."""
+    reader = _reader()()
+    node.traverse(reader)
+    return reader.members
+
+
 @cache
 def _reader():
     # Mitsuba has no classes before a variant is set
     class Reader(mi.TraversalCallback):
-        """Adds the parameters of a node to ``found`` when it is made."""
+        """Notes what a node says of itself."""
 
-        def __init__(self, node, prefix: str, found: Parameters, visited: set | None):
+        def __init__(self):
             super().__init__()
-            self.node, self.prefix, self.found, self.visited = node, prefix, found, visited
-            node.traverse(self)
+            self.members = []
 
         def put(self, name, value, flags, cpptype=None):
             """Called by Mitsuba for every parameter."""
-            if not isinstance(value, mi.Object):
-                self.found.add(self.prefix + name, value, cpptype, self.node)
-            elif self.visited is not None and value not in self.visited:
-                self.visited.add(value)
-                Reader(value, f"{self.prefix}{name}.", self.found, self.visited)
+            self.members.append((name, value, cpptype))
 
     return Reader

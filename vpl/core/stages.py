@@ -1,7 +1,13 @@
-"""Names of the stages of a render, by which its seconds are kept: what methods write and comparisons read."""
+"""Names of the stages of a render, by which its seconds are kept: what methods write and comparisons read.
+
+Who wants to know which stage a render is in listens, and is told as each begins, in the thread that renders.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import contextmanager
+from contextvars import ContextVar
 from enum import StrEnum
 
 
@@ -51,3 +57,24 @@ class Stage(StrEnum):
     TRACED = "traced"  # what virtual lights do not carry
     CLUSTERS = "clusters"  # gather vertices of pixels are clustered
     CUTS = "cuts"  # their light cuts are chosen, shaded and traced
+
+
+_LISTENER: ContextVar[Callable[[Stage], None] | None] = ContextVar("listener", default=None)
+
+
+@contextmanager
+def listening(listener: Callable[[Stage], None]):
+    """While the block runs, ``listener`` is called with every stage that begins in this thread; what it raises ends the
+    render."""
+    token = _LISTENER.set(listener)
+    try:
+        yield
+    finally:
+        _LISTENER.reset(token)
+
+
+def tell(stage: Stage) -> None:
+    """Say that a stage begins."""
+    listener = _LISTENER.get()
+    if listener is not None:
+        listener(stage)

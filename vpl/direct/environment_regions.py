@@ -8,7 +8,6 @@ jittered.  The radiance of the direction itself is used, so nothing is lost betw
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 
 import drjit as dr
@@ -16,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import channel_mean, download, finite_or_zero, upload
-from ..core.parameters import parameters_of
+from ..core.parameters import fingerprint, parameters_of
 from ..core.sampling import find_interval, independent_sampler
 from .environment_strata import cones, stratify
 
@@ -45,19 +44,10 @@ _last = _Last()
 
 def regions_of(environment, count: int, most_columns: int = _LARGEST_WIDTH) -> EnvironmentRegions:
     """Regions of an environment: those of the last call where nothing has changed since."""
-    key = mi.variant(), count, most_columns, _fingerprint(environment)
+    key = mi.variant(), count, most_columns, fingerprint([environment])
     if _last.key != key:
         _last.key, _last.regions = key, EnvironmentRegions(environment, count, most_columns)
     return _last.regions
-
-
-def _fingerprint(environment) -> str:
-    """What tells environments apart: all that Mitsuba prints of one, and the values of its parameters."""
-    digest = hashlib.blake2b(str(environment).encode())
-    for name, value in parameters_of(environment).items():
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(value).tobytes() if dr.is_array_v(value) else str(value).encode())
-    return digest.hexdigest()
 
 
 class EnvironmentRegions:

@@ -16,7 +16,7 @@ import numpy as np
 from ..core.arrays import NO_LIMIT, channel_mean, download, finite_or_zero, spectrum_to_rgb, upload
 from ..core.cones import COSINE_ROUNDING
 from ..core.sampling import Choice, derived_seed, find_interval, independent_sampler, running_sums, stratified
-from ..core.stages import Stage
+from ..core.stages import Stage, tell
 from .emission import bounding_sphere
 from .emitters import Emitters
 from .focus import Focus, spacing
@@ -192,6 +192,7 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, places: np.
     Nothing is traced for ``max_depth`` up to 2, where light cannot bounce.  ``places``: some that the camera sees,
     (n, 3) world units.
     """
+    tell(Stage.TRACE)
     start = perf_counter()
     found, traced = [], None
     if options.direct != "none" and options.max_depth >= 2:
@@ -205,6 +206,7 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, places: np.
         found.append(traced.lights)
     seconds = {Stage.TRACE: perf_counter() - start}
 
+    tell(Stage.TREE)
     start = perf_counter()
     groups, dropped = [], 0
     for number, kind in enumerate(KINDS):

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..core.arrays import download, upload
 from ..core.sampling import HASH_ROUNDS, derived_seed
-from ..core.stages import Stage
+from ..core.stages import Stage, tell
 from .matrix_block import MatrixBlock
 from .separation import Separation, SeparationLimits, separate
 from .visibility_prediction import PREDICTORS, Predictors
@@ -67,28 +67,28 @@ class Recovered:
 
 def recover(
     block: MatrixBlock, predictors: Predictors, best: np.ndarray, first: int, steps: tuple[str, ...], seed: int,
-    lap: Callable[[Stage], None] = lambda stage: None,
+    begin: Callable[[Stage], None] = tell,
 ) -> Recovered:  # fmt: skip
     """Recover a block: see :class:`Recovered`.
 
     ``best``: the predictor of every column that has samples; those of the block are these from number ``first`` on.
     ``steps``: those of STEPS that are taken; without a predictor what was not traced is taken to arrive, and correction
-    needs separation.  ``lap``: called with every stage as it ends.
+    needs separation.  ``begin``: called with every stage as it begins.
     """
+    begin(Stage.PREDICTION)
     prediction = any(step in PREDICTORS for step in steps)
     predicted, traced = _predicted(block, predictors, best, first, prediction, seed)
-    lap(Stage.PREDICTION)
+    begin(Stage.SHADING)
     found = Recovered(block.unoccluded(), predicted, traced, mi.Float(predicted))
-    lap(Stage.SHADING)
     mixed = _mixed_columns(predictors, first, block.columns.count) if "separation" in steps else []
     if len(mixed):
+        begin(Stage.SEPARATION)
         wanted = _separate(found, block, mixed, "correction" in steps, seed)
-        lap(Stage.SEPARATION)
+        begin(Stage.CORRECTION)
         _trace(found, block, wanted, seed)
-        lap(Stage.CORRECTION)
     if "largest" in steps:
+        begin(Stage.CORRECTION)
         _trace(found, block, _largest(found, block), derived_seed(seed, 1))
-        lap(Stage.CORRECTION)
     return found
 
 

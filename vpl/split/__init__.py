@@ -22,5 +22,6 @@ In the order to read in:
 - ``balance``: what the pilot decides: whether lights pay, how many, how finely they are clustered
 - ``cells``: boxes where camera paths arrive, and random lines that meet surfaces in them with a known density
 - ``surface_lights``: a virtual light wherever such a line meets a surface
+- ``kept_lights``: these, for other cameras in the same scene
 - ``pixel_clusters``: one light cut for those gather vertices of a pixel that face the same way
 """

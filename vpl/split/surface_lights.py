@@ -36,11 +36,16 @@ _MOST_LAYERS = 1024
 
 @dataclass
 class SurfaceLights:
-    """``lights``: of kind "surface"; ``spacing``: typical distance between them where camera paths arrive, world
-    units."""
+    """``lights``: of kind "surface"; ``cells``, ``lines``: what they were drawn by, and how often."""
 
     lights: VirtualLights
-    spacing: float
+    cells: Cells
+    lines: int
+
+    def spacing(self, arrivals: Arrivals) -> float:
+        """Typical distance between lights where camera paths arrive, world units."""
+        density = self.lines * self.cells.density(arrivals.position, arrivals.normal)
+        return float(np.median(1 / np.sqrt(density)))
 
 
 def surface_lights(scene, emission, arrivals: Arrivals, count: int, limits: Limits, seed: int) -> SurfaceLights:
@@ -57,8 +62,7 @@ def surface_lights(scene, emission, arrivals: Arrivals, count: int, limits: Limi
     lights = _lights_along(scene, emission, cells.lines(count, generator), limits, derived_seed(seed, 1))
     density = count * cells.density(lights.position, lights.direction)
     lights.intensity = (lights.intensity / density[:, None]).astype(np.float32)
-    spacing = np.median(1 / np.sqrt(count * cells.density(arrivals.position, arrivals.normal)))
-    return SurfaceLights(lights, float(spacing))
+    return SurfaceLights(lights, cells, count)
 
 
 def _importance(cells: Cells, arrivals: Arrivals) -> np.ndarray:
