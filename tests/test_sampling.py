@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vpl.core.arrays import download
-from vpl.core.sampling import Choice, SpreadSamples, independent_sampler, precise_sample
+from vpl.core.arrays import download, upload
+from vpl.core.sampling import Choice, RowChoice, SpreadSamples, independent_sampler, precise_sample
 
 from .conftest import area_light, render, sensor, wall
 
@@ -75,6 +75,30 @@ def test_rows_are_drawn_with_exactly_the_claimed_probability(rows):
     assert np.array_equal(choice.pmf > 0, weight > 0)
     assert np.array_equal(download(choice.probability(dr.arange(mi.UInt32, rows))), choice.pmf.astype(np.float32))
     assert np.abs(choice.pmf - weight / weight.sum()).max() < 1e-5 + rows * 2.0**-22 * weight.max() / weight.sum()
+
+
+@pytest.mark.parametrize("lengths", [[1], [1, 5, 1], [300, 2, 7, 4000], [3] * 2000])
+def test_members_of_rows_are_drawn_with_exactly_the_claimed_probability(lengths):
+    lengths, random = np.array(lengths), np.random.default_rng(0)
+    weight = random.random(lengths.sum()) ** 20
+    # Of each row, at the beginning, in the middle or at the end, some that are never drawn
+    row, first = np.repeat(np.arange(len(lengths)), lengths), np.cumsum(lengths) - lengths
+    weight[random.random(len(weight)) < 0.3] = 0
+    weight[first + random.integers(0, lengths)] += 1e-3
+    share = weight / np.bincount(row, weight)[row]
+    choice = RowChoice(share, lengths)
+    count = (1 << 23) // len(lengths)
+    number, of = np.arange(1 << 23) % count, np.minimum(np.arange(1 << 23) // count, len(lengths) - 1)
+    number = number * ((1 << 23) // count)
+    drawn = download(choice.draw(upload(mi.UInt32, of), upload(mi.Float, number * 2.0**-23)))
+    assert np.array_equal(row[drawn], of)
+    after = np.cumsum(choice.pmf)
+    whole = np.concatenate([[0.0], after])[first][of]
+    assert (after[drawn] - choice.pmf[drawn] - whole <= number * 2.0**-23).all()
+    assert (number * 2.0**-23 < after[drawn] - whole).all()
+    assert np.array_equal(choice.pmf > 0, share > 0)
+    assert np.abs(choice.pmf - share).max() < 1e-5
+    assert np.array_equal(np.bincount(row, choice.pmf), np.ones(len(lengths)))
 
 
 def test_precise_numbers_have_bits_below_those_of_the_sampler(variant):

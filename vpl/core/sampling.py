@@ -107,6 +107,71 @@ def find_interval(cumulative, first, last, sample):
     return low
 
 
+def rounded_shares(share: np.ndarray, row: np.ndarray, rows: int) -> np.ndarray:
+    """Sums of the shares of a row up to each, (n,) float64: whole multiples of 2^-23.
+
+    ``share`` (n,) float64: of the members of all rows, ``row`` (n,) the row of each, from 0 to ``rows`` - 1 and not
+    falling; those of a row sum to one.  Numbers of 23 bits or more fall between two such sums with exactly the probability that is their
+    difference: at least 2^-23 where the share is positive (of up to 2^22 in a row), and within some 1e-7 of the share.
+    """
+    positive = share > 0
+    number = np.bincount(row, positive, rows)
+    # Sums that differ by a whole multiple still do when they are rounded
+    least = np.minimum(2.0**-_SAMPLE_BITS, 0.5 / np.maximum(number, 1))
+    total = np.cumsum((1 - least * number)[row] * share + least[row] * positive)
+    ends = np.flatnonzero(np.diff(row, append=rows))
+    before = np.concatenate([[0.0], total[ends[:-1]]])
+    total = np.round((total - before[row]) * 2.0**_SAMPLE_BITS) * 2.0**-_SAMPLE_BITS
+    # What is drawn last has all that is left
+    places = np.where(positive, np.arange(len(share)), -1)
+    total[np.arange(len(share)) >= np.maximum.reduceat(places, np.concatenate([[0], ends[:-1] + 1]))[row]] = 1
+    return total
+
+
+class RowChoice:
+    """Choose a member of a row with its share, in a few steps however long the row: guided search [Chen and Asau 1974,
+    "On generating random variates from an empirical distribution"].
+
+    ``share`` (n,) float64: of the members of all rows, one row after the other; ``length`` (rows,): members of each, at
+    least one; those of a row sum to one.  ``pmf`` (n,) float64: the probabilities with which they are drawn, exactly
+    (see :func:`rounded_shares`).
+    """
+
+    def __init__(self, share: np.ndarray, length: np.ndarray):
+        rows = len(length)
+        row, first = np.repeat(np.arange(rows), length), np.cumsum(length) - length
+        after = rounded_shares(share, row, rows)
+        before = np.concatenate([[0.0], after[:-1]])
+        before[first] = 0
+        self.pmf = after - before
+        # As many guides to a row as it has members, about; of a power of two a number finds its own without rounding
+        guides = 1 << int(np.ceil(np.log2(max(len(share) / rows, 2))))
+        steps = np.arange(rows)[:, None] + np.arange(guides) / guides
+        low = np.searchsorted(row + before, steps.ravel(), side="right") - 1
+        # Up to the last member that begins before the next guide
+        high = np.append(low[1:], len(share) - 1)
+        high[guides - 1 :: guides] = first + length - 1
+        self._guides = dr.opaque(mi.UInt32, guides)
+        self._bounds = upload(mi.UInt32, np.stack([low, high + 1], 1).ravel())
+        self._before = upload(mi.Float, before)
+
+    def draw(self, row, number, active=True):
+        """A member of each row, counted from the first of all rows, for a uniform number in [0, 1)."""
+        guide = row * self._guides + mi.UInt32(number * mi.Float(self._guides))
+        low, high = dr.gather(mi.Vector2u, self._bounds, guide, active)
+        return self._search(low, high, number)
+
+    @dr.syntax
+    def _search(self, low, high, number):
+        table = self._before
+        while dr.hint(high > low + 1, exclude=[table]):
+            middle = (low + high) >> 1
+            below = dr.gather(mi.Float, table, middle) <= number
+            low = dr.select(below, middle, low)
+            high = dr.select(below, high, middle)
+        return low
+
+
 class Choice:
     """Choose a row with probability proportional to a weight; exact zero weights are never chosen.
 
@@ -119,13 +184,7 @@ class Choice:
         total = weight.sum(dtype=np.float64)
         if not (np.isfinite(total) and total > 0):
             raise ValueError(f"weights must be finite with a positive sum, got a sum of {total}")
-        positive = weight > 0
-        # Sums that differ by a whole multiple still do when they are rounded
-        least = min(2.0**-_SAMPLE_BITS, 0.5 / np.count_nonzero(positive))
-        share = (1 - least * np.count_nonzero(positive)) * (weight / total) + least * positive
-        cumulative = np.round(np.cumsum(share) * 2.0**_SAMPLE_BITS) * 2.0**-_SAMPLE_BITS
-        last = np.flatnonzero(positive)[-1]
-        cumulative[last:] = 1
+        cumulative = rounded_shares(weight / total, np.zeros(len(weight), np.int64), 1)
         self.pmf = np.diff(cumulative, prepend=0.0)
         # The search's kernel holds its bounds: the same for all lengths up to a power of two
         padding = (1 << len(weight).bit_length()) - len(weight)

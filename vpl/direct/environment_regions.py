@@ -16,7 +16,7 @@ import numpy as np
 
 from ..core.arrays import channel_mean, download, finite_or_zero, upload
 from ..core.parameters import fingerprint, parameters_of
-from ..core.sampling import find_interval, independent_sampler
+from ..core.sampling import RowChoice, independent_sampler
 from .environment_strata import cones, stratify
 
 _CONSTANT = "ConstantBackgroundEmitter"
@@ -82,11 +82,8 @@ class EnvironmentRegions:
         share = (1 - _EVEN_SHARE) * share + _EVEN_SHARE * solid_angle / angle[labels]
         share[total == 0] = (solid_angle / angle[labels])[total == 0]
         order = np.argsort(labels, kind="stable")
-        # One sum that grows by one from region to region: a region is where it lies between two whole numbers
-        cumulative = np.cumsum(share[order])
-        self._cumulative = upload(dr.float64_array_t(mi.Float), np.concatenate([[0.0], cumulative]))
-        ends = np.cumsum(np.bincount(labels, minlength=self.count))
-        self._first = upload(mi.UInt32, np.concatenate([[0], ends]))
+        self._choice = RowChoice(share[order], np.bincount(labels, minlength=self.count))
+        share[order] = self._choice.pmf
         self._cells = upload(mi.UInt32, order)
         # Side by side, so that one access to memory fetches both
         self._found = upload(mi.UInt32, np.stack([labels.astype(np.uint32), (share / solid_angle).astype(np.float32)
@@ -98,9 +95,7 @@ class EnvironmentRegions:
 
         ``member``: uniform number that picks the cell; ``sample``: two that pick the direction in it.
         """
-        first, last = (dr.gather(mi.UInt32, self._first, region + k, active) for k in (0, 1))
-        place = find_interval(self._cumulative, first, last, member)
-        cell = dr.gather(mi.UInt32, self._cells, place, active)
+        cell = dr.gather(mi.UInt32, self._cells, self._choice.draw(region, member, active), active)
         row, column = cell // self._width, cell % self._width
         step = dr.pi / mi.Float(self._height)
         top, bottom = dr.cos(mi.Float(row) * step), dr.cos(mi.Float(row + 1) * step)

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import channel_mean, download, finite_or_zero, upload, upload_vectors
-from ..core.sampling import find_interval, independent_sampler
+from ..core.sampling import RowChoice, independent_sampler
 from ..direct.environment_regions import regions_of
 from .sites import Sites
 
@@ -60,9 +60,8 @@ class LearnedEmitters:
 
     def _use(self, probability: np.ndarray) -> None:
         """``probability`` (sites, sources) float64 of each source; rows sum to 1."""
-        cumulative = np.concatenate([[0.0], np.cumsum(probability)])
-        self._cumulative = upload(dr.float64_array_t(mi.Float), cumulative)
-        self._probability = upload(mi.Float, np.diff(cumulative))
+        self._choice = RowChoice(probability.ravel(), np.full(len(probability), self._sources))
+        self._probability = upload(mi.Float, self._choice.pmf)
 
     # ---------------------- Learning ----------------------
 
@@ -152,9 +151,8 @@ class LearnedEmitters:
     def sample(self, si, site, chosen, member, place, active):
         """A direction to an emitter: (direction, visible radiance over density, density per solid angle, whether the
         emitter is a point or a direction)."""
-        first = site * self._sources
-        row = find_interval(self._cumulative, first, first + self._sources, chosen)
-        source, probability = row - first, dr.gather(mi.Float, self._probability, row, active)
+        row = self._choice.draw(site, chosen, active)
+        source, probability = row - site * self._sources, dr.gather(mi.Float, self._probability, row, active)
         direction, weight, density, delta, ray = self._draw(si, source, member, place, active)
         whole = density * probability
         if self._both:
