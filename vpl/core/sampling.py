@@ -111,8 +111,9 @@ def rounded_shares(share: np.ndarray, row: np.ndarray, rows: int) -> np.ndarray:
     """Sums of the shares of a row up to each, (n,) float64: whole multiples of 2^-23.
 
     ``share`` (n,) float64: of the members of all rows, ``row`` (n,) the row of each, from 0 to ``rows`` - 1 and not
-    falling; those of a row sum to one.  Numbers of 23 bits or more fall between two such sums with exactly the probability that is their
-    difference: at least 2^-23 where the share is positive (of up to 2^22 in a row), and within some 1e-7 of the share.
+    falling; those of a row sum to one.  Numbers of 23 bits or more fall between two such sums with exactly the
+    probability that is their difference: at least 2^-23 where the share is positive (of up to 2^22 in a row), and within
+    some 1e-7 of the share.
     """
     positive = share > 0
     number = np.bincount(row, positive, rows)
@@ -134,32 +135,40 @@ class RowChoice:
 
     ``share`` (n,) float64: of the members of all rows, one row after the other; ``length`` (rows,): members of each, at
     least one; those of a row sum to one.  ``pmf`` (n,) float64: the probabilities with which they are drawn, exactly
-    (see :func:`rounded_shares`).
+    (see :func:`rounded_shares`).  ``place`` (n,): of each in the table, where a row has one entry more than members.
     """
 
     def __init__(self, share: np.ndarray, length: np.ndarray):
-        rows = len(length)
-        row, first = np.repeat(np.arange(rows), length), np.cumsum(length) - length
+        rows, row = len(length), np.repeat(np.arange(len(length)), length)
+        first = np.cumsum(length + 1) - (length + 1)
+        self.place = np.arange(len(share)) + row
         after = rounded_shares(share, row, rows)
-        before = np.concatenate([[0.0], after[:-1]])
-        before[first] = 0
-        self.pmf = after - before
-        # As many guides to a row as it has members, about; of a power of two a number finds its own without rounding
-        guides = 1 << int(np.ceil(np.log2(max(len(share) / rows, 2))))
+        before = np.zeros(len(share) + rows)
+        before[self.place + 1] = after
+        self.pmf = after - before[self.place]
+        # Half as many guides to a row as it has members, or more; of a power of two, so that a number finds its own
+        # without rounding, and two at least, because arrays of one entry make other kernels
+        guides = 2 ** max(int(np.log2(len(share) / rows)), 1)
         steps = np.arange(rows)[:, None] + np.arange(guides) / guides
-        low = np.searchsorted(row + before, steps.ravel(), side="right") - 1
+        order = np.repeat(np.arange(rows), length + 1) + before
+        low = np.searchsorted(order, steps.ravel(), side="right") - 1
         # Up to the last member that begins before the next guide
-        high = np.append(low[1:], len(share) - 1)
+        high = np.append(low[1:], 0)
         high[guides - 1 :: guides] = first + length - 1
         self._guides = dr.opaque(mi.UInt32, guides)
         self._bounds = upload(mi.UInt32, np.stack([low, high + 1], 1).ravel())
         self._before = upload(mi.Float, before)
 
     def draw(self, row, number, active=True):
-        """A member of each row, counted from the first of all rows, for a uniform number in [0, 1)."""
+        """The place of a member of each row, for a uniform number in [0, 1)."""
         guide = row * self._guides + mi.UInt32(number * mi.Float(self._guides))
         low, high = dr.gather(mi.Vector2u, self._bounds, guide, active)
         return self._search(low, high, number)
+
+    def probability(self, place, active=True):
+        """Probability of the members with these places (0 where not active)."""
+        # Side by side: mostly one access to memory
+        return dr.gather(mi.Float, self._before, place + 1, active) - dr.gather(mi.Float, self._before, place, active)
 
     @dr.syntax
     def _search(self, low, high, number):

@@ -84,7 +84,9 @@ class EnvironmentRegions:
         order = np.argsort(labels, kind="stable")
         self._choice = RowChoice(share[order], np.bincount(labels, minlength=self.count))
         share[order] = self._choice.pmf
-        self._cells = upload(mi.UInt32, order)
+        cells = np.zeros(self._choice.place[-1] + 1, np.int64)
+        cells[self._choice.place] = order
+        self._cells = upload(mi.UInt32, cells)
         # Side by side, so that one access to memory fetches both
         self._found = upload(mi.UInt32, np.stack([labels.astype(np.uint32), (share / solid_angle).astype(np.float32)
                                                   .view(np.uint32)], 1).ravel())  # fmt: skip

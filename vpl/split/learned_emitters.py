@@ -61,7 +61,6 @@ class LearnedEmitters:
     def _use(self, probability: np.ndarray) -> None:
         """``probability`` (sites, sources) float64 of each source; rows sum to 1."""
         self._choice = RowChoice(probability.ravel(), np.full(len(probability), self._sources))
-        self._probability = upload(mi.Float, self._choice.pmf)
 
     # ---------------------- Learning ----------------------
 
@@ -126,6 +125,10 @@ class LearnedEmitters:
         """The site of a vertex; ``side``: see :func:`vpl.split.floors.side_of`."""
         return self._sites.at(si.p, si.sh_frame.n * side)
 
+    def _row(self, site):
+        """Where the row of a site begins in the table of probabilities."""
+        return site * (self._sources + 1)
+
     def _draw(self, si, source, member, place, active):
         """A direction to each source: (direction, radiance over density, density of the direction, whether the source
         is a point or a direction, shadow ray)."""
@@ -152,7 +155,7 @@ class LearnedEmitters:
         """A direction to an emitter: (direction, visible radiance over density, density per solid angle, whether the
         emitter is a point or a direction)."""
         row = self._choice.draw(site, chosen, active)
-        source, probability = row - site * self._sources, dr.gather(mi.Float, self._probability, row, active)
+        source, probability = row - self._row(site), self._choice.probability(row, active)
         direction, weight, density, delta, ray = self._draw(si, source, member, place, active)
         whole = density * probability
         if self._both:
@@ -168,12 +171,12 @@ class LearnedEmitters:
     def _environment_density(self, si, site, direction, active):
         """Density with which a direction to the environment is drawn."""
         region, density = self._regions.find(direction, active)
-        first = site * self._sources
-        density *= dr.gather(mi.Float, self._probability, first + self._count + region, active)
+        first = self._row(site)
+        density *= self._choice.probability(first + self._count + region, active)
         if self._both:
             ds = dr.zeros(mi.DirectionSample3f)
             ds.d = direction
-            by_emitter = dr.gather(mi.Float, self._probability, first + self._environment_number, active)
+            by_emitter = self._choice.probability(first + self._environment_number, active)
             density += self._environment.pdf_direction(si, ds, active) * by_emitter
         return density
 
@@ -188,7 +191,7 @@ class LearnedEmitters:
         wanted = active & has_density & (emitter != None)  # noqa: E711
         number = dr.gather(mi.UInt32, self._number_of, dr.reinterpret_array(mi.UInt32, emitter), wanted)
         near = wanted & si.is_valid()
-        probability = dr.gather(mi.Float, self._probability, site * self._sources + number, near)
+        probability = self._choice.probability(self._row(site) + number, near)
         density = emitter.pdf_direction(origin, ds, near) * probability
         if self._regions:
             # A branch: few packets of paths hold one that has left the scene
