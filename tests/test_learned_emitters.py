@@ -67,7 +67,7 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(emitter):
 def test_rows_of_probabilities_are_positive_for_every_emitter_and_sum_to_one(emitter):
     """The regions of an image stand for it; what may be finer than they are is drawn by itself, too."""
     emission, _, _ = learned(mi.load_dict(closed_box(EMITTERS[emitter]() | bulbs())))
-    rows = np.array(emission._probability).reshape(-1, emission._sources)
+    rows = emission._choice.pmf.reshape(-1, emission._sources)
     np.testing.assert_allclose(rows.sum(1), 1, atol=1e-5)
     by_itself = [not e.is_environment() or emitter == "sunsky" for e in emission._scene.emitters()]
     assert (rows >= 0).all() and ((rows[:, : emission._count] > 0) == by_itself).all()

@@ -112,8 +112,8 @@ def rounded_shares(share: np.ndarray, row: np.ndarray, rows: int) -> np.ndarray:
 
     ``share`` (n,) float64: of the members of all rows, ``row`` (n,) the row of each, from 0 to ``rows`` - 1 and not
     falling; those of a row sum to one.  Numbers of 23 bits or more fall between two such sums with exactly the
-    probability that is their difference: at least 2^-23 where the share is positive (of up to 2^22 in a row), and within
-    some 1e-7 of the share.
+    probability that is their difference: at least 2^-23 where the share is positive (of up to 2^22 in a row), and
+    within some 1e-7 of the share.
     """
     positive = share > 0
     number = np.bincount(row, positive, rows)

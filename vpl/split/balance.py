@@ -34,7 +34,7 @@ _BLACK, _WORST = 0.01, 0.001
 # Cost of a path up to its second vertex, in edges of those after it
 _FIRST_EDGES = 4.0
 # Variance × cost of paths that may end, next to that of whole paths, at most: what is expected of a few is rough
-_LARGEST_PRODUCT = 0.8
+_LARGEST_PRODUCT = 0.95
 # Variance × cost with lights, next to that without, below which they are used
 _PAYS_BELOW = 1.0
 # Gather vertices of a pixel: one of so many samples, and at most so many
@@ -105,8 +105,8 @@ def judged_by(brightness: np.ndarray) -> np.ndarray:
 
 
 def importance(worth: np.ndarray, brought: np.ndarray, edges: np.ndarray, paths: int, whole: float) -> float:
-    """The multiple of ``worth`` with which paths should go on from their second vertices, so that variance × cost is
-    least; infinite where none should end, as that would hardly pay.
+    """The multiple of ``worth`` with which paths should go on from their second vertices and later ones, so that variance
+    × cost is least, as far as it depends on the second; infinite where none should end, as that would hardly pay.
 
     ``worth`` (m,) and ``brought`` (m,): what goes on is expected to bring, and what it brought, relative to the image;
     ``edges`` (m,) that it cost; ``paths``: number of all paths, with a relative variance of ``whole`` each.

@@ -97,7 +97,7 @@ def _end_by_worth(path: Path, met: Met, connects, limits: Limits, sampler) -> No
     left = dr.select(connects & ((met.flags & other_lobes) == 0), dr.clip(left, _LEAST_SURVIVAL, 1), 1)
     left = dr.select(dr.isfinite(left), left, 1)
     # Not before a surface was met that alpha shows: paths that have only passed masks are still to find one
-    judged = met.smooth & (path.scattered == 1) & path.valid
+    judged = met.smooth & (path.scattered > 0) & path.valid
     by_worth = limits.worth.survival(met.si, met.side, path.throughput, path.importance, left)
     survival = dr.select(judged, by_worth, left)
     met.goes_on &= sampler.next_1d() < survival
