@@ -271,7 +271,7 @@ def read_emitters(scene) -> Emitters:
     dropped += bad_areas
     for emitter in scene.emitters():
         name = emitter.class_name()
-        if emitter.is_environment() or name == "AreaLight":
+        if emitter.is_environment() or name == "AreaLight" or _lights_nothing(emitter):
             continue
         parameters = parameters_of(emitter)
         intensity = _constant_rgb(parameters, "irradiance" if name == "DirectionalEmitter" else "intensity")
@@ -295,6 +295,6 @@ def read_emitters(scene) -> Emitters:
         kept.append(lights)
     if dropped:
         mi.Log(mi.LogLevel.Warn, f"{dropped} emitter(s) with values that are negative or not finite were dropped.")
-    others += others_on_shapes
+    others += [row for row in others_on_shapes if not _lights_nothing(row[1])]
     others.sort(key=lambda row: (row[0], row[1].id(), str(row[1])))
     return Emitters(*kept, area, environment, others, dropped)
