@@ -70,8 +70,8 @@ def _fits_attribute(value):
 
 def read_exr(path):
     """Return the image (height, width, channels) float32, the names of its channels (sorted), and its metadata: a dict
-    of finite numbers and strings."""
-    with OpenEXR.File(str(path), separate_channels=True) as file:
+    of finite numbers and strings. Raises ValueError, besides what OpenEXR raises, for text that is not UTF-8."""
+    with _opened(path, separate_channels=True) as file:
         channels = sorted(file.channels())
         image = np.stack([file.channels()[name].pixels.astype(np.float32) for name in channels], axis=-1)
         return image, channels, _plain(file.header())
@@ -79,8 +79,16 @@ def read_exr(path):
 
 def read_exr_metadata(path):
     """Return the metadata of an EXR file without reading its pixels."""
-    with OpenEXR.File(str(path), header_only=True) as file:
+    with _opened(path, header_only=True) as file:
         return _plain(file.header())
+
+
+def _opened(path, **how):
+    try:
+        return OpenEXR.File(str(path), **how)
+    except UnicodeDecodeError as error:
+        text = error.object.decode("latin-1")
+        raise ValueError(f"'{path}' has an attribute whose text is not UTF-8: {text!r}; leave it out") from error
 
 
 def _plain(header):

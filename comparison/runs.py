@@ -81,7 +81,7 @@ def _run_of(file):
     """Return which run wrote an EXR file, None if that cannot be told."""
     try:
         return images.read_exr_metadata(file).get("run")
-    except (OSError, RuntimeError):
+    except (OSError, RuntimeError, ValueError):
         return None
 
 

@@ -112,7 +112,8 @@ class SceneComparison:
             return self._path_traced(wanted.spp or FIRST_SPP)
         reference = references.read(wanted.file_of(file.name))
         depth, known = file.integrator[1].get("max_depth", -1), reference.description.get("max_depth")
-        if known not in (None, depth):
+        # Some programs write no attributes but text
+        if known not in (None, depth, str(depth)):
             raise ValueError(f"the reference has max_depth {known}, the scene {depth}; try --max-depth {known}")
         return reference
 

@@ -122,6 +122,8 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         read_knobs(self, props)
         self.samples_per_pass = _SAMPLES_PER_PASS.read(self, props)
         self.statistics: dict = {}
+        # Whose rays `sample` gets, while this integrator and no wrapper renders
+        self._sensor = None
 
     def light(self, scene, sampler, camera: CameraPass):
         """Light the gather points of ``camera.paths``: (radiance, {channel: values}, {name: statistic}).
@@ -139,7 +141,11 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         _hear_interruptions()
         with exclusive(sensor=sensor, integrator=self):
-            return self._render(scene, sensor, seed, spp, develop, evaluate)
+            outer, self._sensor = self._sensor, sensor
+            try:
+                return self._render(scene, sensor, seed, spp, develop, evaluate)
+            finally:
+                self._sensor = outer
 
     def _render(self, *arguments):
         """What ``render`` does with its arguments."""
@@ -187,11 +193,12 @@ class GatheringIntegrator(mi.SamplingIntegrator):
     def pixel_grid(self, scene, sampler) -> PixelGrid:
         """Layout of the camera rays of this pass in the image.
 
-        Mitsuba puts the rays of a pixel next to each other. A wrapper may render in passes of its own, in which no
-        sensor has as many pixels as there would have to be: then every ray counts as a pixel, eight to a row.
+        Mitsuba puts the rays of a pixel next to each other. Whose they are is not known below a wrapper, which may
+        render in passes of its own, too: where no sensor of the scene has as many pixels as there would have to be,
+        every ray counts as a pixel, eight to a row.
         """
         samples = min(sampler.sample_count(), self.samples_per_pass)
-        for sensor in scene.sensors():
+        for sensor in [self._sensor] if self._sensor else scene.sensors():
             film = sensor.film()
             border = 2 * film.rfilter().border_size() if film.sample_border() else 0
             size = np.array(film.crop_size(), np.int64) + border

@@ -18,6 +18,7 @@ from .catalogue import (
     film,
     one_of,
     plugin,
+    rgb,
     stage,
 )  # fmt: skip
 from .conftest import render, wall
@@ -85,7 +86,7 @@ def test_every_plugin_with_every_material_alone(name, number, material):
 def test_every_way_of_direct_light_under_every_emitter(direct, emitter):
     """As virtual lights, and by adaptive sampling, with all materials in sight."""
     scene = mi.load_dict(stage(EMITTERS[emitter](), all_materials(), 16))
-    if direct == "vpl" and emitter in ("texturedspot", "projector", "directionalarea"):
+    if direct == "vpl" and emitter in ("texturedspot", "projector"):
         with pytest.raises(RuntimeError) as error:
             image_of(scene, "lightcuts", direct=direct)
         assert 'cannot become virtual lights: use direct="nee"' in str(error.value.__cause__)
@@ -147,12 +148,25 @@ def test_every_film_with_every_plugin(options, name):
     assert image_of(scene, name, max_depth=3).shape == render(scene, "path", 1).shape
 
 
-def test_an_emitter_that_cannot_be_sampled_directly_is_missing_as_in_path():
-    """A directional area has no direction that a surface could sample, here or in ``path``."""
-    lamp = EMITTERS["directionalarea"]()
-    scene = mi.load_dict(stage(lamp, {"panel": wall([0, 0, 0], [0, 1, 0], 0, 0.5)}, 16))
-    for name in ("path", "lightcuts", "adaptivedirect"):
-        assert render(scene, name, 16, max_depth=2).max() == 0
+def never_sampled(emitter, count=1):
+    """As many of an emitter of the catalogue as asked for, which ``path`` never samples."""
+    (lamp,) = EMITTERS[emitter]().values()
+    return {f"lamp{k}": lamp | {"sampling_weight": 0.0} for k in range(count)}
+
+
+@pytest.mark.parametrize(
+    "emitters",
+    [lambda: EMITTERS["directionalarea"](), lambda: never_sampled("directional") | never_sampled("projector"),
+     lambda: never_sampled("point", 40) | never_sampled("spot", 40)],
+    ids=["directionalarea", "directional, projector", "points and spots"],
+)  # fmt: skip
+def test_emitters_that_path_never_finds_light_nothing(emitters):
+    """A directional area emitter has no direction that a surface could sample; others have a weight of 0, beside one
+    lamp that has none and is out of sight."""
+    hidden = {"hidden": {"type": "point", "position": [0, -5, 0], "intensity": rgb(1.0)}}
+    scene = mi.load_dict(stage(emitters() | hidden, {"panel": wall([0, 0, 0], [0, 1, 0], 0, 0.5)}, 16))
+    for name in ("path", "manylights", "lightcuts", "adaptivedirect"):
+        assert render(scene, name, 16, max_depth=4).max() == 0
 
 
 @pytest.mark.usefixtures("restore_variant")

@@ -24,6 +24,16 @@ def test_exr_files_keep_channels_and_metadata(tmp_path, half):
     assert [file.name for file in tmp_path.iterdir()] == ["a.exr"]
 
 
+def test_text_of_another_encoding_is_named(tmp_path):
+    """OpenEXR reads nothing of such a file."""
+    file = tmp_path / "a.exr"
+    images.write_exr(file, np.ones((2, 2, 3)), "RGB", {"owner": "J?rg"})
+    file.write_bytes(file.read_bytes().replace(b"J?rg", "Jörg".encode("latin-1")))
+    for read in (images.read_exr, images.read_exr_metadata):
+        with pytest.raises(ValueError, match=f"'{file}' has an attribute whose text is not UTF-8: 'Jörg'"):
+            read(file)
+
+
 def test_failed_write_leaves_the_old_file(tmp_path):
     (tmp_path / "a.png").write_text("old")
     with pytest.raises(RuntimeError), images.replacing(tmp_path / "a.png") as temporary:

@@ -211,16 +211,32 @@ def test_samples_of_a_pixel_are_found_in_passes_crops_and_wrappers():
     assert plugin.statistics["cut_size"] < 2 * alone
 
 
-def test_a_sensor_outside_of_the_scene_is_lit_ray_by_ray():
-    scene = closed_box({"lamp": area_light()}, size=16)
-    other, given = mi.load_dict(scene["sensor"]), {"vpl_count": 500, "max_depth": 4}
+def test_a_sensor_outside_of_the_scene_is_lit_as_one_of_it():
+    given, scene = {"vpl_count": 500, "max_depth": 4}, closed_box({"lamp": area_light()}, size=16)
+    camera = mi.load_dict(scene["sensor"])
     scene["sensor"]["film"] = scene["sensor"]["film"] | {"width": 20}
-    scene = mi.load_dict(scene)
-    ours, theirs = (
-        np.array(mi.render(scene, sensor=other, integrator=mi.load_dict({"type": kind, **given}), spp=4, seed=0))
-        for kind in (NAME, "vpl")
-    )
-    assert relative_error(ours, theirs) < 0.03
+    other = mi.load_dict(scene)
+    found, sizes = [], []
+    for view in (camera, mi.load_dict(scene["sensor"]), 0):
+        plugin = mi.load_dict({"type": NAME, **given})
+        found.append(np.array(mi.render(other, sensor=view, integrator=plugin, spp=16, seed=0)))
+        sizes.append(plugin.statistics["cut_size"] / found[-1].size)
+    np.testing.assert_allclose(found[1], found[2], rtol=1e-5)
+    assert sizes[0] < 1.2 * sizes[1]
+    plugin = mi.load_dict({"type": "vpl", **given})
+    assert relative_error(found[0], np.array(mi.render(other, sensor=camera, integrator=plugin, spp=16, seed=0))) < 0.03
+
+
+def test_below_a_wrapper_a_sensor_outside_of_the_scene_is_lit_ray_by_ray():
+    """Only rays are known there, not whose they are."""
+    scene = closed_box({"lamp": area_light()}, size=16)
+    other = mi.load_dict(scene["sensor"])
+    scene["sensor"]["film"] = scene["sensor"]["film"] | {"width": 20}
+    scene, images = mi.load_dict(scene), []
+    for kind in (NAME, "vpl"):
+        plugin = {"type": "aov", "aovs": "depth:depth", "image": {"type": kind, "vpl_count": 500, "max_depth": 4}}
+        images.append(np.array(mi.render(scene, sensor=other, integrator=mi.load_dict(plugin), spp=4, seed=0)))
+    assert relative_error(*(image[..., :3] for image in images)) < 0.03
 
 
 def test_wide_filters_see_about_the_same_image():

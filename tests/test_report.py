@@ -91,10 +91,12 @@ def test_a_reference_that_hides_an_error_is_reported(tmp_path, capsys, monkeypat
 
 
 def test_references_that_are_no_use_lose_nothing_else(tmp_path, capsys):
-    """A black reference, and one that is not finite: the runs are reported, and so are the other scenes."""
+    """A black reference, and one that is not finite: the runs are reported, and so are the other scenes. A depth that
+    some program wrote as text is one."""
     for name, value in (("black", 0.0), ("bright", np.inf), ("cornell", 1.0)):
         (tmp_path / f"{name}.xml").write_text(Path(CORNELL).read_text())
-        references.write(tmp_path / f"{name}.exr", np.full((16, 16, 3), value), np.full((16, 16, 3), 0.1), {})
+        image, error, described = np.full((16, 16, 3), value), np.full((16, 16, 3), 0.1), {"max_depth": "6"}
+        references.write(tmp_path / f"{name}.exr", image, error, described)
     scenes = [str(tmp_path / f"{name}.xml") for name in ("black", "bright", "cornell")]
     out = tmp_path / "out"
     assert compare.main([*scenes, "-i", "path", "--spp", "1", "-r", str(tmp_path), "-o", str(out)]) == 1

@@ -4,6 +4,7 @@
   (``usable``, ``finite_or_zero``); rows worked off in chunks that fit in memory (``chunks``)
 - ``sampling``: seeds derived from seeds, samplers of any width, rows chosen by weight (``Choice``,
   ``find_interval``), evenly spread samples (``SpreadSamples``)
+- ``loops``: long loops of kernels, recorded once
 - ``morton``: codes and orders along a Morton curve
 - ``cones``: axes of cones around directions, and how their cosines are rounded
 - ``stages``: names of a render's stages, by which its seconds are kept

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import channel_mean, finite_or_zero
+from ..core.loops import recorded_once
 from ..core.sampling import SpreadSamples, independent_sampler
 from .emitter_sampling import emission_beyond_delta, power_heuristic
 from .site_table import SEEN, Lanes, Scenery, SiteTable
@@ -43,6 +44,7 @@ class _Site:
         return cls(*columns, mi.Float(lanes.samples), mi.Float(lanes.bsdf_samples))
 
 
+@recorded_once
 @dr.syntax
 def draw_samples(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
     """Sample the clusters of every lane's site, stratified by their probabilities, and add to its statistics."""
@@ -95,6 +97,7 @@ def draw_samples(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
     return Drawn(total, variance, rays, seen)
 
 
+@recorded_once
 @dr.syntax
 def sum_sources(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
     """One sample of every cluster of every lane's site.  ``lanes.samples`` must be 1; no variance is found."""

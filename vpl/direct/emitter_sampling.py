@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import finite_or_zero, upload_limit
+from ..core.loops import recorded_once
 from ..core.sampling import Choice, SpreadSamples, derived_seed, independent_sampler
 from ..lights.emission import bounding_sphere, other_power
 from ..lights.emitters import Emitters
@@ -102,7 +103,7 @@ def emission_beyond_delta(scene, emitters: Emitters, traits, hit, depth, max_dep
     radiance = dr.zeros(mi.UnpolarizedSpectrum, dr.width(hit.p))
     factor = dr.full(mi.UnpolarizedSpectrum, 1, dr.width(hit.p))
     going = active & hit.is_valid() & (depth < max_depth)
-    while dr.hint(going, exclude=[traits]):
+    while dr.hint(going, exclude=[scene, emitters, traits, max_depth]):
         onward, share = hit.bsdf().sample(mi.BSDFContext(), hit, sampler.next_1d(going), sampler.next_2d(going), going)
         going &= mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
         factor *= mi.unpolarized_spectrum(share)
@@ -113,6 +114,7 @@ def emission_beyond_delta(scene, emitters: Emitters, traits, hit, depth, max_dep
     return radiance
 
 
+@recorded_once
 @dr.syntax
 def direct_light(
     scene, extended: ExtendedEmitters, traits, points: GatherPoints, max_depth, samples: int, rays_per_pixel: int,
@@ -135,7 +137,10 @@ def direct_light(
     to_emitters, to_directions = (SpreadSamples.of(pixel, derived_seed(seed, stream)) for stream in (1, 2))
     radiance, rays = dr.zeros(mi.UnpolarizedSpectrum, points.count), dr.zeros(mi.UInt32, points.count)
     k = mi.UInt32(0)
-    while dr.hint(k < total, exclude=[traits]):
+    while dr.hint(
+        k < total,
+        exclude=[scene, extended, traits, points, si, bsdf, context, limit, first, total, to_emitters, to_directions],
+    ):
         # ---- Emitter sampling
         choice, *sample = to_emitters.at(first + k)
         ds, weight, density = extended.sample(si, choice, mi.Point2f(*sample), mi.Bool(True))

@@ -20,13 +20,16 @@ from .virtual_lights import VirtualLights
 
 # Shapes, besides meshes, on which Mitsuba can sample a point; of others, such as curves, it does not know the area
 SAMPLED_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
+# A call of some shapes, one by one, takes as long to record as one of so many times as many by their pointers
+_SHAPES_BY_POINTER = 4
 
 
 @dataclass
 class AreaEmitters:
     """Area emitters as rows: the shape's registry index, radiance (RGB), area; textured ones keep their object.
 
-    ``shapes``: the shapes one by one, for scenes in which some other shape cannot be sampled; see :meth:`on_shape`.
+    ``shapes``: the shapes one by one, for scenes of many other shapes, or of one that cannot be sampled; see
+    :meth:`on_shape`.
     ``spheres``: None where no shape is a sphere.
     """
 
@@ -62,8 +65,9 @@ class AreaEmitters:
     def on_shape(self, method: str, row, *arguments):
         """Call a method of the shape of each row (counted from 0); the last argument is the mask of active lanes.
 
-        A call on pointers is recorded for all shapes of a scene at once, quickly however many they are, but fails if
-        one of them, such as a curve or an instance, does not have the method.  Then only emitters are called.
+        A call on pointers is recorded for all shapes of a scene, emitters or not: quickly for each, but it fails if one
+        of them, such as a curve or an instance, does not have the method.  Then, and where most shapes are no emitters,
+        only emitters are called.
         """
         if self.shapes is not None:
             return dr.switch(mi.UInt32(row), [getattr(shape, method) for shape in self.shapes], *arguments)
@@ -199,13 +203,16 @@ def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
     radiance[bad] = 0
     shape_index = np.array(indices, np.uint32)
     area, shapes = np.zeros(len(indices), np.float32), None
-    if len(indices) and all(_can_be_sampled(shape) for shape in scene.shapes()):
+    all_shapes = scene.shapes()
+    by_pointer = _SHAPES_BY_POINTER * len(indices) > len(all_shapes)
+    if len(indices) and by_pointer and all(_can_be_sampled(shape) for shape in all_shapes):
         pointers = dr.reinterpret_array(mi.ShapePtr, upload(mi.UInt32, shape_index))
         area = download(pointers.surface_area())
     elif len(indices):
         by_index = dict(glowing)
         shapes = [by_index[index] for index in indices]
-        area = np.array([download(shape.surface_area())[0] for shape in shapes], np.float32)
+        row = dr.arange(mi.UInt32, len(shapes))
+        area = download(dr.switch(row, [shape.surface_area for shape in shapes]))
     rows = SphereRows(spheres) if any(spheres) else None
     return AreaEmitters(shape_index, radiance, area, textured, shapes, rows), int(bad.sum()), unusual
 
@@ -246,8 +253,14 @@ def _read_environment(scene):
     return environment, 0
 
 
+def _lights_nothing(emitter) -> bool:
+    """Whether no path of Mitsuba's ``path`` ends at an emitter, because none meets it by chance and none samples it."""
+    is_delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+    return emitter.class_name() == "DirectionalArea" or (is_delta and emitter.sampling_weight() == 0)
+
+
 def read_emitters(scene) -> Emitters:
-    """Read all emitters of ``scene``.
+    """Read all emitters of ``scene`` that light it in ``path``.
 
     Lights with values that are not finite or negative are dropped, counted and reported; a ValueError names an
     environment map with texels that are not finite, and emitters on shapes that cannot be sampled.
@@ -258,7 +271,7 @@ def read_emitters(scene) -> Emitters:
     dropped += bad_areas
     for emitter in scene.emitters():
         name = emitter.class_name()
-        if emitter.is_environment() or name == "AreaLight":
+        if emitter.is_environment() or name == "AreaLight" or _lights_nothing(emitter):
             continue
         parameters = parameters_of(emitter)
         intensity = _constant_rgb(parameters, "irradiance" if name == "DirectionalEmitter" else "intensity")
@@ -282,6 +295,6 @@ def read_emitters(scene) -> Emitters:
         kept.append(lights)
     if dropped:
         mi.Log(mi.LogLevel.Warn, f"{dropped} emitter(s) with values that are negative or not finite were dropped.")
-    others += others_on_shapes
+    others += [row for row in others_on_shapes if not _lights_nothing(row[1])]
     others.sort(key=lambda row: (row[0], row[1].id(), str(row[1])))
     return Emitters(*kept, area, environment, others, dropped)

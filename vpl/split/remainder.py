@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import channel_mean, select_record
+from ..core.loops import recorded_once
 from ..direct.emitter_sampling import power_heuristic
 from .floors import agrees, carried_share
 from .gather_vertices import Arrival
@@ -24,6 +25,8 @@ from .paths import CONNECTING, PAST, SEEKING, FirstEdge, Found, Gains, Gathered,
 _LEAST_SURVIVAL = 0.02
 
 
+@recorded_once
+@dr.syntax
 def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
     """Follow paths to their ends: (:class:`Found`, first gather vertices, one of the later ones, drawn by weight, and
     :class:`Arrival`), evaluated.
@@ -32,13 +35,6 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
     (:class:`vpl.split.numbers.SpreadNumbers`): choose an emitter, a place on it, a lobe, and a direction at vertices
     that scatter; ``sampler``: for all else.
     """
-    # Looking for what a loop does not change records its body, all materials of the scene, twice
-    with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
-        return _follow(scene, emission, first, numbers, sampler, limits)
-
-
-@dr.syntax
-def _follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
     context, count = mi.BSDFContext(), dr.width(first.throughput)
     path, gains, gathered = Path.of(first), Gains.none(count), Gathered.none(count)
 

@@ -1,0 +1,46 @@
+"""Loops of kernels are recorded once: where there are many shapes and materials, that takes longer than rendering."""
+
+import mitsuba as mi
+import pytest
+
+from vpl.direct import cluster_sampling, emitter_sampling
+from vpl.lights.emitters import read_emitters
+
+from .catalogue import rgb
+from .conftest import area_light, closed_box, render
+
+
+def calls_of(monkeypatch, module, name):
+    """A list that grows by 1 whenever a function of a module is called."""
+    calls, original = [], getattr(module, name)
+
+    def counted(*arguments):
+        calls.append(1)
+        return original(*arguments)
+
+    monkeypatch.setattr(module, name, counted)
+    return calls
+
+
+@pytest.mark.parametrize(
+    ("plugin", "more", "module", "name", "kernels"),
+    [
+        ("lightcuts", {"vpl_count": 100}, emitter_sampling, "_scattered_emission", 1),
+        # A pilot, and a pass
+        ("adaptivedirect", {"max_passes": 1}, cluster_sampling, "_emitter_sample", 2),
+    ],
+)
+def test_bodies_of_loops_are_recorded_once_in_a_kernel(plugin, more, module, name, kernels, monkeypatch):
+    calls = calls_of(monkeypatch, module, name)
+    render(mi.load_dict(closed_box({"lamp": area_light()}, 8)), plugin, 1, max_depth=3, **more)
+    assert len(calls) == kernels
+
+
+def test_a_few_emitters_among_many_shapes_are_called_alone():
+    """A call by pointers is recorded for every shape of the scene."""
+    balls = {f"ball{k}": {"type": "sphere", "center": [0.1 * k - 0.5, 0, 0], "radius": 0.04} for k in range(10)}
+    few, glow = closed_box({"lamp": area_light()}, 8), {"type": "area", "radiance": rgb(1.0)}
+    many = {name: ball | {"emitter": glow} for name, ball in balls.items()}
+    of_few, of_many = (read_emitters(mi.load_dict({**few, **shapes})).area for shapes in (balls, many))
+    assert len(of_few.shapes) == 1 and of_few.area == pytest.approx(0.36)
+    assert of_many.shapes is None and of_many.count == 11
