@@ -105,8 +105,8 @@ def judged_by(brightness: np.ndarray) -> np.ndarray:
 
 
 def importance(worth: np.ndarray, brought: np.ndarray, edges: np.ndarray, paths: int, whole: float) -> float:
-    """The multiple of ``worth`` with which paths should go on from their second vertices and later ones, so that variance
-    × cost is least, as far as it depends on the second; infinite where none should end, as that would hardly pay.
+    """The multiple of ``worth`` with which paths should go on from their second and later vertices, so that variance ×
+    cost is least, as far as it depends on the second; infinite where none should end, as that would hardly pay.
 
     ``worth`` (m,) and ``brought`` (m,): what goes on is expected to bring, and what it brought, relative to the image;
     ``edges`` (m,) that it cost; ``paths``: number of all paths, with a relative variance of ``whole`` each.
