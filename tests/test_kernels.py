@@ -45,3 +45,16 @@ def test_sizes_and_samples_are_in_no_kernel(name, compiled):
     if name != "matrixrecovery":  # which solves larger problems otherwise
         assert new(camera=3) <= MITSUBAS
     assert new(spp=6) <= MITSUBAS
+
+
+def test_paths_from_the_camera_and_from_lights_are_followed_by_one_kernel(lights_cost_nothing):
+    scene = mi.load_dict(closed_box({"lamp": area_light()}))
+    plugin = mi.load_dict({"type": "manylights", "max_depth": 4})
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        mi.render(scene, integrator=plugin, spp=16).numpy()
+        history = [one for one in dr.kernel_history() if one["type"] == dr.KernelType.JIT]
+    launched = {one["hash"]: one["operation_count"] for one in history}
+    assert plugin.statistics["light_paths"] > 0
+    longest = max(launched.values())
+    assert sum(operations > 0.9 * longest for operations in launched.values()) == 1

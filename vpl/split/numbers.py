@@ -48,6 +48,8 @@ class SpreadNumbers:
 
     def __init__(self, lane, samples: int, seed: int):
         count = dr.opaque(mi.UInt32, samples)
+        # One kernel follows paths, whether their lanes are counted or chosen
+        dr.eval(lane)
         self._pixel, self._number = lane // count, lane % count
         self._streams = [dr.opaque(mi.UInt32, derived_seed(seed, stream)) for stream in range(4)]
 

@@ -72,7 +72,8 @@ class FirstEdge:
         ray.maxt = dr.largest(mi.Float) + wide
         active = mi.Bool(active) & (wide == 0)
         edge = cls(
-            vertex + wide,
+            # An array of its own, even where rays begin at the vertex itself
+            vertex + dr.opaque(mi.Float, 0.0, count),
             ray,
             throughput,
             density,
