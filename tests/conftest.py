@@ -36,7 +36,7 @@ def variant():
 
 
 @pytest.fixture(scope="session")
-def threads(variant):
+def threads():
     """The number of threads that tests start with."""
     return dr.thread_count()
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from .catalogue import EMITTERS, stage
-from .conftest import relative_error, render
+from .conftest import area_light, closed_box, relative_error, render
 
 
 @pytest.fixture(autouse=True)
 def only_scenes_of_one_test():
-    """While a shape is alive that cannot be sampled, no other scene has calls on pointers to its shapes."""
+    """While a shape is alive that cannot be sampled, no scene in which many shapes are emitters can call them."""
     yield
     gc.collect()
 
@@ -58,3 +58,13 @@ def test_area_emitters_light_them_as_in_path(name, other, lamp, tmp_path):
         for direct in ("vpl", "adaptive"):
             found = render(scene, name, 4, max_depth=3, direct=direct, direct_count=500)
             assert np.isfinite(found).all() and found.mean() > 0.5 * expected.mean()
+
+
+@pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])
+def test_another_scene_is_lit_while_a_curve_is_alive(name, tmp_path):
+    """Dr.Jit records calls on pointers for the shapes of all scenes."""
+    alive = mi.load_dict(stage({}, OTHERS["curve"](tmp_path), 8))
+    scene = mi.load_dict(closed_box({"lamp": area_light()}, 8))
+    found, expected = (render(scene, plugin, 256, max_depth=2, hide_emitters=True).mean() for plugin in (name, "path"))
+    assert found == pytest.approx(expected, rel=0.03)
+    assert len(alive.shapes()) == 3
