@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import download, ones, spectrum_to_rgb, upload, upload_vectors
+from ..core.loops import recorded_once
 from ..core.sampling import derived_seed, independent_sampler
 from ..direct.emitter_sampling import power_heuristic
 from ..lights.emission import bounding_box
@@ -94,26 +95,43 @@ def _lights_along(scene, emission, lines: Lines, limits: Limits, seed: int) -> V
 
 
 def _rays_to_surfaces(scene, lines: Lines):
-    """Rays, one for every surface that a line meets, that begin shortly before it."""
+    """Rays, one for every surface that a line meets, that begin shortly before it; line by line."""
     origin, direction = (upload_vectors(mi.Point3f, x) for x in (lines.origin, lines.direction))
-    length, found = upload(mi.Float, lines.length), []
-    for _ in range(_MOST_LAYERS):
-        ray = mi.Ray3f(origin, mi.Vector3f(direction), length, 0.0, [])
-        dr.make_opaque(ray.time)
-        si = scene.ray_intersect(ray)
-        onward = si.spawn_ray(ray.d)
-        remaining = dr.select(si.is_valid(), ray.maxt - si.t, 0)
-        dr.eval(onward.o, remaining)
-        hit = dr.compress(remaining > 0)
-        if len(hit) == 0:
-            break
-        found.append([download(dr.gather(mi.Point3f, x, hit)) for x in (origin, direction)])
-        origin, direction, length = (dr.gather(type(x), x, hit) for x in (onward.o, direction, remaining))
-        dr.eval(origin, direction, length)
-    if not found:
-        return dr.zeros(mi.Ray3f, 0)
-    origin, direction = (np.concatenate(columns) for columns in zip(*found, strict=True))
-    return mi.Ray3f(upload_vectors(mi.Point3f, origin), upload_vectors(mi.Vector3f, direction))
+    direction, length = mi.Vector3f(direction), upload(mi.Float, lines.length)
+    first, starts = dr.zeros(mi.UInt32, len(lines.length)), dr.zeros(mi.Point3f, 1)
+    line = mi.UInt32(0)
+    # The same kernel counts them and finds them
+    for find in (False, True):
+        dr.make_opaque(first, starts, line)
+        number = _meet(scene, (origin, direction, length), first, dr.opaque(mi.Bool, find), starts, line)
+        if not find:
+            first, count = dr.prefix_reduce(dr.ReduceOp.Add, number), int(dr.sum(number)[0])
+            if count == 0:
+                return dr.zeros(mi.Ray3f, 0)
+            starts, line = dr.zeros(mi.Point3f, count), dr.zeros(mi.UInt32, count)
+    return mi.Ray3f(starts, dr.gather(mi.Vector3f, direction, line))
+
+
+@recorded_once
+@dr.syntax
+def _meet(scene, lines, first, find, starts, line):
+    """How many surfaces each of the ``lines`` (origin, direction, length) meets.  Where ``find`` is set, the place
+    before each and the number of its line are written to ``starts`` and ``line``, those of a line from ``first`` on."""
+    origin, direction, length = lines
+    place, remaining, number = mi.Point3f(origin), mi.Float(length), dr.zeros(mi.UInt32, dr.width(length))
+    this, active = dr.arange(mi.UInt32, dr.width(length)), length > 0
+    while dr.hint(active, exclude=[scene, origin, direction, length, first, find, this]):
+        ray = mi.Ray3f(place, direction, remaining, 0.0, [])
+        si = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=active)
+        active &= si.is_valid()
+        dr.scatter(starts, place, first + number, active & find)
+        dr.scatter(line, this, first + number, active & find)
+        number += dr.select(active, 1, 0)
+        onward = si.spawn_ray(direction)
+        place, remaining = dr.select(active, onward.o, place), remaining - si.t
+        active &= (remaining > 0) & (number < _MOST_LAYERS)
+    dr.eval(number, starts, line)
+    return number
 
 
 def _floors(scene, perturbed, rays):
