@@ -17,8 +17,8 @@ SETTINGS = {"max_depth": 4, "vpl_count": 500}
 
 
 def printed(page):
-    """The code in Python of a page of docs/."""
-    (found,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(), re.DOTALL)
+    """The first code in Python of a page of docs/."""
+    found, *_ = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(), re.DOTALL)
     return found
 
 
