@@ -2,7 +2,7 @@
 
 - ``arrays``: the only safe ways between NumPy and Dr.Jit (``upload``, ``download``); which values count as numbers
   (``usable``, ``finite_or_zero``); rows worked off in chunks that fit in memory (``chunks``)
-- ``sampling``: seeds derived from seeds, samplers of any width, rows chosen by weight (``Choice``,
+- ``sampling``: seeds derived from seeds, samplers of any width, rows chosen by weight (``Choice``, ``RowChoice``,
   ``find_interval``), evenly spread samples (``SpreadSamples``)
 - ``loops``: long loops of kernels, recorded once
 - ``morton``: codes and orders along a Morton curve
