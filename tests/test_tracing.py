@@ -1,5 +1,6 @@
 """Light paths: normalisation against closed forms, emitters against Mitsuba's own sampling, choices against pmfs."""
 
+import gc
 import math
 
 import drjit as dr
@@ -55,6 +56,8 @@ def test_depths_are_counted_in_edges_and_limited():
 
 def test_edges_are_replayed_instead_of_being_recorded_one_by_one(monkeypatch):
     """Recording goes through every shape and material of the scene."""
+    # Scenes of earlier tests that are let go meanwhile would be a reason to record anew
+    gc.collect()
     recorded, original = [], tracing.spectrum_to_rgb
     monkeypatch.setattr(tracing, "spectrum_to_rgb", lambda value: recorded.append(1) or original(value))
     found = traced(furnace(0.9)).lights
