@@ -1,5 +1,8 @@
 """What ends a render, and when that will be."""
 
+from bisect import bisect_right
+from operator import itemgetter
+
 from .convergence import ErrorGoal
 
 
@@ -38,7 +41,7 @@ class Ending:
         """Return the seconds of a sample per pixel."""
         last = self._marks[-1]
         # Of several passes not the first one
-        known = self._marks[1:-1] or self._marks[:1]
-        early = [mark for mark in known if 2 * mark[0] <= last[0]]
-        first = early[-1] if early else known[0]
+        earliest = 1 if len(self._marks) > 2 else 0
+        after = bisect_right(self._marks, last[0] / 2, earliest, len(self._marks) - 1, key=itemgetter(0))
+        first = self._marks[max(after - 1, earliest)]
         return (last[1] - first[1]) / (last[0] - first[0])

@@ -72,6 +72,11 @@ class View:
     def count(self) -> int:
         return dr.width(self.ray.o)
 
+    @property
+    def pixels(self) -> np.ndarray:
+        """Numbers of the pixels."""
+        return np.arange(-(-self.count // self.samples))
+
     def follow(self, lane, limits: Limits, *stream: int):
         """Follow the camera rays ``lane`` (UInt32): see :func:`vpl.split.remainder.follow`."""
         seed, ray = derived_seed(self.seed, *stream), self.ray
@@ -189,8 +194,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         lights = self._lights(view, pilot, chosen, clock)
         gathering, c = (EVERYWHERE, lights.smallest_distance) if lights else (NOWHERE, _WHOLE)
         limits = self._limits(view, c, self.max_depth, gathering)
-        pixels = np.arange(-(-view.count // view.samples))
-        expected = pilot.nearby(pilot.indirect, view.width, pixels) if lights else None
+        expected = pilot.nearby(pilot.indirect, view.width, view.pixels) if lights else None
         radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
         # Whole pixels at a time
         most = max(_WAVEFRONT // view.samples, 1) * view.samples
@@ -274,9 +278,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
             # The less noise there is besides, the more they are worth
             multiple *= (whole / max(chosen.noise, 1e-9)) ** 0.5
         self.statistics["worth"] = multiple
-        pixels = np.arange(-(-view.count // view.samples))
         view.worth = worth
-        view.importance = upload(mi.Float, multiple / judged_by(pilot.nearby(pilot.radiance, view.width, pixels)))
+        nearby = pilot.nearby(pilot.radiance, view.width, view.pixels)
+        view.importance = upload(mi.Float, multiple / judged_by(nearby))
 
     def _lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> LightSet | None:
         """Virtual lights and their tree; None where there are none."""
@@ -285,11 +289,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
         clock.begin(Stage.LIGHTS)
         # None is followed where they are kept
         self.statistics["light_paths"] = 0
-        if not self.keep_lights:
-            made = self._made_lights(view, pilot, chosen, clock)
-        else:
-            make = partial(self._made_lights, view, pilot, chosen, clock)
-            made = self._kept.find(view.scene, (view.seed, self.max_depth), make)
+        make = partial(self._made_lights, view, pilot, chosen, clock)
+        made = self._kept.find(view.scene, (view.seed, self.max_depth), make) if self.keep_lights else make()
         self.statistics["lights"] = {"surface": made.surface.lights.count}
         if made.group is None:
             return None

@@ -3,7 +3,7 @@
 import argparse
 import logging
 import re
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 
 from .. import machine
 from ..command_line import UsageError
@@ -46,22 +46,15 @@ def connected(wanted, threads=None):
     from .pool import Pool
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # of what becomes of workers, we tell
-    if isinstance(wanted, int):
-        with _processes(distributed, wanted) as address:
-            pool = Pool(lambda: distributed.Client(address, timeout=CONNECT_SECONDS), _share(wanted, threads))
-            try:
-                yield pool
-            finally:
-                pool.close()
-        return
-    try:
-        pool = Pool(lambda: distributed.Client(wanted, timeout=CONNECT_SECONDS), threads)
-    except OSError as error:
-        raise UsageError(f"--workers: no scheduler answers at {wanted} ({error})") from None
-    try:
-        yield pool
-    finally:
-        pool.close()
+    with ExitStack() as stack:
+        address = wanted
+        if isinstance(wanted, int):
+            address, threads = stack.enter_context(_processes(distributed, wanted)), _share(wanted, threads)
+        try:
+            pool = Pool(lambda: distributed.Client(address, timeout=CONNECT_SECONDS), threads)
+        except OSError as error:
+            raise UsageError(f"--workers: no scheduler answers at {address} ({error})") from None
+        yield stack.enter_context(closing(pool))
 
 
 @contextmanager

@@ -107,25 +107,25 @@ def find_interval(cumulative, first, last, sample):
     return low
 
 
-def rounded_shares(share: np.ndarray, row: np.ndarray, rows: int) -> np.ndarray:
+def rounded_shares(share: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Sums of the shares of a row up to each, (n,) float64: whole multiples of 2^-23.
 
-    ``share`` (n,) float64: of the members of all rows, ``row`` (n,) the row of each, from 0 to ``rows`` - 1 and not
-    falling; those of a row sum to one.  Numbers of 23 bits or more fall between two such sums with exactly the
+    ``share`` (n,) float64: of the members of all rows, one row after the other; ``length`` (rows,): members of each, at
+    least one; those of a row sum to one.  Numbers of 23 bits or more fall between two such sums with exactly the
     probability that is their difference: at least 2^-23 where the share is positive (of up to 2^22 in a row), and
     within some 1e-7 of the share.
     """
-    positive = share > 0
-    number = np.bincount(row, positive, rows)
+    row, first = np.repeat(np.arange(len(length)), length), np.cumsum(length) - length
+    positive, member = share > 0, np.arange(len(share))
+    number = np.add.reduceat(positive.astype(np.int64), first)
     # Sums that differ by a whole multiple still do when they are rounded
     least = np.minimum(2.0**-_SAMPLE_BITS, 0.5 / np.maximum(number, 1))
     total = np.cumsum((1 - least * number)[row] * share + least[row] * positive)
-    ends = np.flatnonzero(np.diff(row, append=rows))
-    before = np.concatenate([[0.0], total[ends[:-1]]])
-    total = np.round((total - before[row]) * 2.0**_SAMPLE_BITS) * 2.0**-_SAMPLE_BITS
+    total -= np.concatenate([[0.0], total])[first][row]
+    total = np.round(total * 2.0**_SAMPLE_BITS) * 2.0**-_SAMPLE_BITS
     # What is drawn last has all that is left
-    places = np.where(positive, np.arange(len(share)), -1)
-    total[np.arange(len(share)) >= np.maximum.reduceat(places, np.concatenate([[0], ends[:-1] + 1]))[row]] = 1
+    last = np.maximum.reduceat(np.where(positive, member, -1), first)
+    total[member >= last[row]] = 1
     return total
 
 
@@ -142,7 +142,7 @@ class RowChoice:
         rows, row = len(length), np.repeat(np.arange(len(length)), length)
         first = np.cumsum(length + 1) - (length + 1)
         self.place = np.arange(len(share)) + row
-        after = rounded_shares(share, row, rows)
+        after = rounded_shares(share, length)
         before = np.zeros(len(share) + rows)
         before[self.place + 1] = after
         self.pmf = after - before[self.place]
@@ -193,7 +193,7 @@ class Choice:
         total = weight.sum(dtype=np.float64)
         if not (np.isfinite(total) and total > 0):
             raise ValueError(f"weights must be finite with a positive sum, got a sum of {total}")
-        cumulative = rounded_shares(weight / total, np.zeros(len(weight), np.int64), 1)
+        cumulative = rounded_shares(weight / total, np.array([len(weight)]))
         self.pmf = np.diff(cumulative, prepend=0.0)
         # The search's kernel holds its bounds: the same for all lengths up to a power of two
         padding = (1 << len(weight).bit_length()) - len(weight)

@@ -87,9 +87,9 @@ class EnvironmentRegions:
         cells = np.zeros(self._choice.place[-1] + 1, np.int64)
         cells[self._choice.place] = order
         self._cells = upload(mi.UInt32, cells)
+        density = (share / solid_angle).astype(np.float32).view(np.uint32)
         # Side by side, so that one access to memory fetches both
-        self._found = upload(mi.UInt32, np.stack([labels.astype(np.uint32), (share / solid_angle).astype(np.float32)
-                                                  .view(np.uint32)], 1).ravel())  # fmt: skip
+        self._found = upload(mi.UInt32, np.stack([labels.astype(np.uint32), density], 1).ravel())
         self._width, self._height = (dr.opaque(mi.UInt32, size) for size in (width, height))
 
     def sample(self, region, member, sample, active):

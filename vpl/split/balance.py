@@ -62,12 +62,13 @@ def balance(radiance: np.ndarray, indirect: np.ndarray, brightness: np.ndarray, 
     if not indirect.any():
         return without_lights("no light comes by way of surfaces that virtual lights could stand for")
     whole, direct = noise(radiance, brightness), noise(radiance - indirect, brightness)
-    whole -= (1 - max(_SPREAD, samples**-0.5)) * min(direct, whole)
-    direct = min(max(_SPREAD, samples**-0.5) * direct, whole)
+    spread = max(_SPREAD, samples**-0.5)
+    whole -= (1 - spread) * min(direct, whole)
+    direct = min(spread * direct, whole)
     share = 1 - direct / max(whole, np.finfo(np.float64).tiny)
     # Relative variance of what a path from the camera brings by way of lights
-    spread = len(indirect) * np.sum(indirect**2) / np.sum(indirect) ** 2
-    wanted = np.clip(spread / _SET_ERROR**2, _SHARES[0] * paths, _SHARES[1] * paths)
+    variance = len(indirect) * np.sum(indirect**2) / np.sum(indirect) ** 2
+    wanted = np.clip(variance / _SET_ERROR**2, _SHARES[0] * paths, _SHARES[1] * paths)
     light_paths = int(np.clip(wanted, _FEWEST, _MOST))
     # The least of (noise of paths / samples + noise of cuts / rays) × (samples + rays × their cost), rays of a pixel
     rest = whole * (1 - _GAIN * share)

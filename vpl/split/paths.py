@@ -38,8 +38,8 @@ class Limits:
 
 
 @dataclass
-class FirstEdge:
-    """First edges of paths, one per lane, evaluated.
+class Edge:
+    """Edges of paths, one per lane.
 
     ``vertex``: where they begin; ``ray``; ``throughput``: unpolarized spectrum; ``density``: of the direction, per
     solid angle; ``delta``: whether it was drawn from none; ``state``: see above; ``site``: of the vertex,
@@ -55,6 +55,11 @@ class FirstEdge:
     site: object
     importance: object
     active: object
+
+
+@dataclass
+class FirstEdge(Edge):
+    """First edges of paths, evaluated."""
 
     @classmethod
     def of_camera(cls, ray, importance, active) -> FirstEdge:
@@ -88,23 +93,14 @@ class FirstEdge:
 
 
 @dataclass
-class Path:
-    """Paths on their way to their next vertices, one per lane: fields as of :class:`FirstEdge`, of their last edges.
+class Path(Edge):
+    """Paths on their way along their last edges.
 
     ``depth``: edges before; ``eta``: as in ``path``; ``scattered``: how many vertices did; ``valid``: whether a surface
     was met that the film's alpha shows.  ``carried``, ``cosine``: of what the last vertex, x1, sends on, the part that
     virtual lights carry but for w and the floor of x2; and the cosine there.
     """
 
-    vertex: object
-    ray: object
-    throughput: object
-    density: object
-    delta: object
-    state: object
-    site: object
-    importance: object
-    active: object
     depth: object
     eta: object
     scattered: object

@@ -98,26 +98,25 @@ def _rays_to_surfaces(scene, lines: Lines):
     """Rays, one for every surface that a line meets, that begin shortly before it; line by line."""
     origin, direction = (upload_vectors(mi.Point3f, x) for x in (lines.origin, lines.direction))
     direction, length = mi.Vector3f(direction), upload(mi.Float, lines.length)
-    first, starts = dr.zeros(mi.UInt32, len(lines.length)), dr.zeros(mi.Point3f, 1)
-    line = mi.UInt32(0)
+    lines = origin, direction, length
     # The same kernel counts them and finds them
-    for find in (False, True):
-        dr.make_opaque(first, starts, line)
-        number = _meet(scene, (origin, direction, length), first, dr.opaque(mi.Bool, find), starts, line)
-        if not find:
-            first, count = dr.prefix_reduce(dr.ReduceOp.Add, number), int(dr.sum(number)[0])
-            if count == 0:
-                return dr.zeros(mi.Ray3f, 0)
-            starts, line = dr.zeros(mi.Point3f, count), dr.zeros(mi.UInt32, count)
+    number = _meet(scene, lines, dr.zeros(mi.UInt32, len(length)), False, dr.zeros(mi.Point3f, 1), mi.UInt32(0))
+    count = int(dr.sum(number)[0])
+    if count == 0:
+        return dr.zeros(mi.Ray3f, 0)
+    starts, line = dr.zeros(mi.Point3f, count), dr.zeros(mi.UInt32, count)
+    _meet(scene, lines, dr.prefix_reduce(dr.ReduceOp.Add, number), True, starts, line)
     return mi.Ray3f(starts, dr.gather(mi.Vector3f, direction, line))
 
 
 @recorded_once
 @dr.syntax
-def _meet(scene, lines, first, find, starts, line):
+def _meet(scene, lines, first, find: bool, starts, line):
     """How many surfaces each of the ``lines`` (origin, direction, length) meets.  Where ``find`` is set, the place
     before each and the number of its line are written to ``starts`` and ``line``, those of a line from ``first`` on."""
     origin, direction, length = lines
+    find = dr.opaque(mi.Bool, find)
+    dr.make_opaque(first, starts, line)
     place, remaining, number = mi.Point3f(origin), mi.Float(length), dr.zeros(mi.UInt32, dr.width(length))
     this, active = dr.arange(mi.UInt32, dr.width(length)), length > 0
     while dr.hint(active, exclude=[scene, origin, direction, length, first, find, this]):
