@@ -24,6 +24,15 @@ def traced(scene, count=20_000, seed=0, deepest=math.inf, rr_depth=5, lobe_limit
     return trace_lights(scene, read_emitters(scene), count, seed, PathLimits(deepest, rr_depth, lobe_limit))
 
 
+@pytest.fixture
+def collects_often():
+    """Python's collector runs all the time."""
+    usual = gc.get_threshold()
+    gc.set_threshold(1)
+    yield
+    gc.set_threshold(*usual)
+
+
 def furnace(albedo, emitter=None, bsdf=None):
     """A point light of power 4 pi in the middle of a diffuse sphere."""
     material = bsdf or {"type": "diffuse", "reflectance": {"type": "rgb", "value": [albedo] * 3}}
@@ -56,12 +65,23 @@ def test_depths_are_counted_in_edges_and_limited():
 
 def test_edges_are_replayed_instead_of_being_recorded_one_by_one(monkeypatch):
     """Recording goes through every shape and material of the scene."""
-    # Scenes of earlier tests that are let go meanwhile would be a reason to record anew
-    gc.collect()
     recorded, original = [], tracing.spectrum_to_rgb
     monkeypatch.setattr(tracing, "spectrum_to_rgb", lambda value: recorded.append(1) or original(value))
     found = traced(furnace(0.9)).lights
     assert found.depth.max() > 20 and len(recorded) < 6
+
+
+def test_scenes_that_are_let_go_while_lights_are_traced_do_no_harm(monkeypatch, collects_often):
+    """A scene in a cycle of references lives until Python's collector finds it, which may be at any time."""
+    original, scenes = tracing.spectrum_to_rgb, [mi.load_dict(furnace(0.5)) for _ in range(20)]
+
+    def leaves_a_scene_behind(value):
+        cycle = [scenes.pop()]
+        cycle.append(cycle)
+        return original(value)
+
+    monkeypatch.setattr(tracing, "spectrum_to_rgb", leaves_a_scene_behind)
+    assert traced(furnace(0.9)).lights.count > 1000
 
 
 def test_lights_lie_on_the_surface_and_face_the_inside():

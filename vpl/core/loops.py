@@ -1,11 +1,18 @@
-"""Loops of kernels whose bodies are long."""
+"""Kernels that are long, recorded no more often than need be."""
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
+from contextlib import contextmanager
 from functools import wraps
+from threading import Lock
 
 import drjit as dr
+
+# Blocks that run with Python's collector stopped, and whether it ran before the first of them
+_STOPPED = {"blocks": 0, "ran": True}
+_LOCK = Lock()
 
 
 def recorded_once(function: Callable) -> Callable:
@@ -21,3 +28,24 @@ def recorded_once(function: Callable) -> Callable:
             return function(*arguments)
 
     return once
+
+
+@contextmanager
+def garbage_kept():
+    """Keep Python's cyclic collector from running while the block runs, in any thread.
+
+    A scene that it lets go while a frozen function is recorded ends the process, between two calls makes Dr.Jit record
+    anew, and between recording and its end is an error.
+    """
+    with _LOCK:
+        if not _STOPPED["blocks"]:
+            _STOPPED["ran"] = gc.isenabled()
+            gc.disable()
+        _STOPPED["blocks"] += 1
+    try:
+        yield
+    finally:
+        with _LOCK:
+            _STOPPED["blocks"] -= 1
+            if not _STOPPED["blocks"] and _STOPPED["ran"]:
+                gc.enable()

@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import download, even_chunks, ones, select_record, spectrum_to_rgb
+from ..core.loops import garbage_kept
 from ..core.sampling import derived_seed, independent_sampler, stratified
 from .emission import emission_groups
 from .emitters import Emitters
@@ -218,6 +219,7 @@ def _warn_of_few(walk: _Walk, lights: VirtualLights) -> None:
         )
 
 
+@garbage_kept()
 def trace_lights(
     scene, emitters: Emitters, count: int, seed: int, limits: PathLimits, focus: Focus | None = None
 ) -> TracedLights:
