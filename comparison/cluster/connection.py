@@ -54,6 +54,8 @@ def connected(wanted, threads=None):
             pool = Pool(lambda: distributed.Client(address, timeout=CONNECT_SECONDS), threads)
         except OSError as error:
             raise UsageError(f"--workers: no scheduler answers at {address} ({error})") from None
+        except TypeError as error:  # of Dask's, where its settings name no certificate
+            raise UsageError(f"--workers: {address} needs Dask's settings for TLS ({error})") from None
         yield stack.enter_context(closing(pool))
 
 
