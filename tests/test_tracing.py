@@ -68,7 +68,8 @@ def test_edges_are_replayed_instead_of_being_recorded_one_by_one(monkeypatch):
     recorded, original = [], tracing.spectrum_to_rgb
     monkeypatch.setattr(tracing, "spectrum_to_rgb", lambda value: recorded.append(1) or original(value))
     found = traced(furnace(0.9)).lights
-    assert found.depth.max() > 20 and len(recorded) < 6
+    # More than once: where as many paths are left as an array of any scene alive has entries
+    assert found.depth.max() > 60 and len(recorded) < 20
 
 
 def test_scenes_that_are_let_go_while_lights_are_traced_do_no_harm(monkeypatch, collects_often):
