@@ -180,7 +180,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         ray.o, ray.d, ray.time = ray.o + wide, ray.d + wide, ray.time + wide
         active = mi.Bool(active) & dr.full(mi.Bool, True, count)
         dr.make_opaque(ray, active)
-        emission, alike = emitters_of(scene), dr.opaque(mi.Float, 1.0, -(-count // grid.samples))
+        emission, alike = emitters_of(scene, _rays(count)), dr.opaque(mi.Float, 1.0, -(-count // grid.samples))
         size = grid.width, grid.samples
         return View(scene, emission, Perturbed(scene), ray, active, *size, seed, alike, Worth.unknown())
 
@@ -242,14 +242,13 @@ class ManyLightsIntegrator(GatheringIntegrator):
             return Pilot.of(found, vertices, arrival, lane // view.samples)
 
         pilot = followed()
-        rays = int(_LEARNING_SHARE * view.count)
-        if not view.emission.learn(*pilot.vertices, rays, derived_seed(view.seed, 6)):
+        if not view.emission.choice.learn(*pilot.vertices, _rays(view.count), derived_seed(view.seed, 6)):
             return pilot
         brightness, again = pilot.brightness(view.width), followed()
         if _LEARNED_COST * noise(again.radiance, brightness) < noise(pilot.radiance, brightness):
             return again
         # Where shadows are small, or gloss is what is noisy, sites may mislead
-        view.emission.forget()
+        view.emission.choice.forget()
         return pilot
 
     def _balance(self, view: View, pilot: Pilot) -> Balance:
@@ -346,6 +345,11 @@ class ManyLightsIntegrator(GatheringIntegrator):
         add_statistics(self.statistics, more | {"later": alone})
         # Every step-th sample stands for all
         return lit * dr.opaque(mi.Float, samples / kept)
+
+
+def _rays(paths: int) -> int:
+    """How many rays there are to learn by which emitters light a scene."""
+    return int(_LEARNING_SHARE * paths)
 
 
 mi.register_integrator("manylights", ManyLightsIntegrator)

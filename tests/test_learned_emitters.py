@@ -28,7 +28,7 @@ def learned(scene, seed=0):
     normal = unit_vectors(rng, count)
     position = rng.uniform(-0.9, 0.9, (count, 3)).astype(np.float32)
     emission = LearnedEmitters(scene)
-    emission.learn(position, normal, 1 << 18, seed)
+    emission.choice.learn(position, normal, 1 << 18, seed)
     return emission, position, normal
 
 
@@ -47,7 +47,7 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(emitter):
     si.sh_frame = mi.Frame3f(si.n)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(1, len(position))
-    site = emission.site(si, mi.Float(1))
+    site = emission.choice.site(si, mi.Float(1))
     direction, weight, density, is_point = emission.sample(
         si, site, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), mi.Bool(True)
     )
@@ -67,7 +67,7 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(emitter):
 def test_rows_of_probabilities_are_positive_for_every_emitter_and_sum_to_one(emitter):
     """The regions of an image stand for it; what may be finer than they are is drawn by itself, too."""
     emission, _, _ = learned(mi.load_dict(closed_box(EMITTERS[emitter]() | bulbs())))
-    rows = emission._choice.pmf.reshape(-1, emission._sources)
+    rows = emission.choice.pmf
     np.testing.assert_allclose(rows.sum(1), 1, atol=1e-5)
     by_itself = [not e.is_environment() or emitter == "sunsky" for e in emission._scene.emitters()]
     assert (rows >= 0).all() and ((rows[:, : emission._count] > 0) == by_itself).all()

@@ -170,6 +170,12 @@ class RowChoice:
         # Side by side: mostly one access to memory
         return dr.gather(mi.Float, self._before, place + 1, active) - dr.gather(mi.Float, self._before, place, active)
 
+    def rest(self, place, number, active=True):
+        """Uniform numbers in [0, 1), made of those by which members with these places were drawn."""
+        before = dr.gather(mi.Float, self._before, place, active)
+        rest = (number - before) / self.probability(place, active)
+        return dr.clip(rest, 0, dr.one_minus_epsilon(mi.Float))
+
     @dr.syntax
     def _search(self, low, high, number):
         table = self._before

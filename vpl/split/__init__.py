@@ -14,7 +14,9 @@ In the order to read in:
 - ``paths``: where paths begin, what they carry along, what they find
 - ``remainder``: paths as ``path`` follows them, less what virtual lights carry; ``follow``
 - ``next_event``: next-event estimation: how emitters are chosen
-- ``learned_emitters``: emitters, and regions of the environment, chosen by what vertices of a pilot see, site by site
+- ``site_choice``: a choice among sources of light by what vertices of a pilot see, site by site
+- ``learned_emitters``: emitters, and regions of the environment, chosen so
+- ``tree_emitters``: many emitters, chosen so by clusters
 - ``emitter_tree``: a tree over emitters with a place, by which one is drawn for a vertex
 - ``numbers``: random numbers that are spread well over the samples of a pixel
 - ``gather_vertices``: vertices where virtual lights are gathered, and which of the later ones are

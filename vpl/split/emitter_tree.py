@@ -7,6 +7,8 @@ down to a known emitter, and with it the probability of having drawn it, needs n
 
 from __future__ import annotations
 
+from heapq import heappop, heappush
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -19,9 +21,12 @@ _RECORD = 8
 
 
 class EmitterTree:
-    """Tree over emitters at ``position`` (n, 3), of ``radius`` (n,) around it, and ``intensity`` (n,) at a distance."""
+    """Tree over emitters at ``position`` (n, 3), of ``radius`` (n,) around it, and ``intensity`` (n,) at a distance.
 
-    def __init__(self, position: np.ndarray, radius: np.ndarray, intensity: np.ndarray):
+    ``clusters``: how many subtrees there are that a choice may begin with, of up to ``most_clusters``.
+    """
+
+    def __init__(self, position: np.ndarray, radius: np.ndarray, intensity: np.ndarray, most_clusters: int):
         self.count = len(position)
         colours = np.repeat(intensity[:, None], 3, axis=1).astype(np.float32)
         tree = build_light_tree(position.astype(np.float32), None, colours, np.random.default_rng(0))
@@ -38,6 +43,10 @@ class EmitterTree:
         node_of_emitter = np.zeros(len(position), np.uint32)
         node_of_emitter[tree.representative[leaf]] = np.flatnonzero(leaf)
         self._leaf = upload(mi.UInt32, node_of_emitter)
+        roots = _cut(tree.escape, records[:, 4], np.linalg.norm(high - low, axis=1), most_clusters)
+        self.clusters = len(roots)
+        self._root = upload(mi.UInt32, roots)
+        self._cluster = upload(mi.UInt32, np.searchsorted(roots, node_of_emitter, side="right") - 1)
 
     def _escape(self, node):
         return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._records, node * _RECORD + 5))
@@ -53,11 +62,19 @@ class EmitterTree:
         share = of_left / (of_left + of_right)
         return dr.select(dr.isfinite(share), share, 0.5)
 
+    def cluster(self, row, active):
+        """The cluster that the emitter of a row is in."""
+        return dr.gather(mi.UInt32, self._cluster, row, active)
+
+    def root(self, cluster, active):
+        """The node that a cluster is."""
+        return dr.gather(mi.UInt32, self._root, cluster, active)
+
     @dr.syntax
-    def draw(self, position, number, active):
-        """The row of an emitter for each position, by a uniform number."""
-        node = mi.UInt32(0)
-        inner = active & (self._escape(node) != 1)
+    def draw(self, node, position, number, active):
+        """The row of an emitter below a node (0: the root) for each position, by a uniform number."""
+        node = mi.UInt32(node)
+        inner = active & (self._escape(node) != node + 1)
         while dr.hint(inner, exclude=[self]):
             left = node + 1
             right = self._escape(left)
@@ -72,16 +89,33 @@ class EmitterTree:
 
     @dr.syntax
     def probability(self, row, position, active):
-        """Probability with which :meth:`draw` finds the emitter of a row."""
+        """Probabilities with which :meth:`draw` finds the emitter of a row: (from the root, from its cluster)."""
         target = dr.gather(mi.UInt32, self._leaf, row, active)
-        node, probability = mi.UInt32(0), mi.Float(1)
+        root = self.root(self.cluster(row, active), active)
+        node, probability, within = mi.UInt32(0), mi.Float(1), mi.Float(1)
         inner = active & (target != 0)
         while dr.hint(inner, exclude=[self]):
             left = node + 1
             right = self._escape(left)
             share = self._left_share(left, right, position)
             turns = target >= right
-            probability *= dr.select(turns, 1 - share, share)
+            taken = dr.select(turns, 1 - share, share)
+            probability *= taken
             node = dr.select(turns, right, left)
+            within = dr.select(node <= root, 1, within * taken)
             inner = node != target
-        return dr.select(active, probability, 0)
+        return dr.select(active, probability, 0), dr.select(active, within, 0)
+
+
+def _cut(escape: np.ndarray, intensity: np.ndarray, size: np.ndarray, most: int) -> np.ndarray:
+    """Nodes, sorted, below which all leaves are, each below one: those are divided first that are bright and large."""
+    priority = np.asarray(intensity, np.float64) * size
+    nodes, leaves = [(-priority[0], 0)], []
+    while nodes and len(nodes) + len(leaves) < most:
+        _, node = heappop(nodes)
+        if escape[node] == node + 1:
+            leaves.append(node)
+            continue
+        for child in (node + 1, escape[node + 1]):
+            heappush(nodes, (-priority[child], int(child)))
+    return np.sort(leaves + [node for _, node in nodes])

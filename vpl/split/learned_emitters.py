@@ -1,9 +1,7 @@
-"""Emitters chosen by what a pilot's vertices see of them, place by place.
+"""Emitters chosen by what a pilot's vertices see of them, place by place (:mod:`vpl.split.site_choice`).
 
-Space is divided into cubes, and the vertices in a cube by the way that they face: a site.  Sites in which the pilot's
-paths had vertices learn which emitters light them: from some of their vertices one ray goes to every emitter, and to
-every region of the environment (:mod:`vpl.direct.environment_regions`), so that a room that sees the sky through a
-window aims there.  A share of the samples is kept for Mitsuba's own choice, which is all that other sites have.
+The sources that are learned of are the emitters, one by one, and regions of the environment
+(:mod:`vpl.direct.environment_regions`), so that a room that sees the sky through a window aims there.
 """
 
 from __future__ import annotations
@@ -12,24 +10,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, download, finite_or_zero, upload, upload_vectors
-from ..core.sampling import RowChoice, independent_sampler
+from ..core.arrays import download, finite_or_zero, upload
 from ..direct.environment_regions import regions_of
-from .sites import Sites
+from .site_choice import SiteChoice
 
 # Regions of the environment, and columns of the table that they are made from
 _REGIONS, _COLUMNS = 256, 512
 # Share of the samples for which emitters have the probability that they have in Mitsuba
-_UNIFORM_SHARE = 0.3
-# Rays from a site to each emitter and region; how many of them all sites may have together
-_RAYS_EACH, _MOST_RAYS = 2, 1 << 20
-# Rays that a site's average visibility counts for
-_PRIOR = 0.5
+_USUAL_SHARE = 0.3
 
 
 class LearnedEmitters:
-    """The choice of emitters by site; before :meth:`learn`, every emitter has the same probability everywhere, or
-    that of its ``sampling_weight``."""
+    """Emitters and regions of the environment, by site; before anything is learned, every emitter has the same
+    probability everywhere, or that of its ``sampling_weight``."""
 
     def __init__(self, scene):
         self._scene, self._emitters, self._count = scene, scene.emitters_dr(), len(scene.emitters())
@@ -41,93 +34,29 @@ class LearnedEmitters:
         self._regions = None
         if weight[of_environment].any():
             self._regions = regions_of(self._environment, _REGIONS, _COLUMNS)
-        self._sources = self._count + (self._regions.count if self._regions else 0)
         registry = download(dr.reinterpret_array(mi.UInt32, self._emitters))
         numbers = np.zeros(registry.max() + 2, np.int64)
         numbers[registry] = np.arange(self._count)
         self._number_of = upload(mi.UInt32, numbers)
-        self._alike = np.zeros(self._sources)
-        self._alike[: self._count] = weight / weight.sum()
+        alike = np.zeros(self._count + (self._regions.count if self._regions else 0))
+        alike[: self._count] = weight / weight.sum()
         # What regions cannot tell apart, the environment's own sampling may
         self._both = self._regions is not None and not self._regions.fine
         if self._regions and not self._both:
             light = np.maximum(self._regions.irradiance, 0)
             light = light / light.sum() if light.sum() > 0 else np.full(len(light), 1 / len(light))
-            self._alike[self._count :] = self._alike[self._environment_number] * light
-            self._alike[self._environment_number] = 0
-        self._never = np.flatnonzero(self._alike[: self._count] == 0)
-        self.forget()
-
-    def _use(self, probability: np.ndarray) -> None:
-        """``probability`` (sites, sources) float64 of each source; rows sum to 1."""
-        self._choice = RowChoice(probability.ravel(), np.full(len(probability), self._sources))
-
-    # ---------------------- Learning ----------------------
-
-    def forget(self) -> None:
-        """Know nothing of any place."""
-        self._sites = Sites.none()
-        # Twice, because arrays of one entry make other kernels
-        self._use(np.stack([self._alike, self._alike]))
-
-    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> bool:
-        """Learn from vertices, (n, 3) each, with about so many rays at most: whether anything was learned."""
-        each = _RAYS_EACH * self._sources
-        most = min(rays, _MOST_RAYS) // each
-        if most < 1 or len(position) == 0:
-            return False
-        self._sites, site = Sites.around(position, normal, most)
-        size = np.bincount(site)[1:]
-        order, sites = np.argsort(site, kind="stable"), len(size)
-        first = upload(mi.UInt32, np.cumsum(size) - size)
-        lane = dr.arange(mi.UInt32, sites * each)
-        row = lane // dr.opaque(mi.UInt32, each)
-        source = lane // _RAYS_EACH % dr.opaque(mi.UInt32, self._sources)
-        sampler = independent_sampler(seed, len(lane))
-        number = mi.UInt32(sampler.next_1d() * mi.Float(dr.gather(mi.UInt32, upload(mi.UInt32, size), row)))
-        vertex = dr.gather(mi.UInt32, first, row) + number
-        unoccluded, seen = self._looks(*(upload_vectors(mi.Point3f, x[order]) for x in (position, normal)), vertex,
-                                       source, sampler)  # fmt: skip
-        unoccluded, seen = (
-            download(x).astype(np.float64).reshape(sites, self._sources, _RAYS_EACH) for x in (unoccluded, seen)
-        )
-        self._use(self._shares(unoccluded, seen))
-        return True
-
-    def _looks(self, positions, normals, vertex, source, sampler):
-        """(Irradiance that a source would give a vertex by one sample if nothing was between, whether nothing is)."""
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(vertex))
-        si.p, si.n = dr.gather(mi.Point3f, positions, vertex), mi.Normal3f(dr.gather(mi.Point3f, normals, vertex))
-        si.sh_frame = mi.Frame3f(si.n)
-        direction, weight, _, _, ray = self._draw(si, source, sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
-        light = channel_mean(weight) * dr.maximum(dr.dot(direction, si.n), 0)
-        seen = dr.select((light > 0) & ~self._scene.ray_test(ray, light > 0), mi.Float(1), 0)
-        dr.eval(light, seen)
-        return light, seen
-
-    def _shares(self, unoccluded: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        """Probabilities (sites + 1, sources) by root mean squares of what arrived; first where nothing is known."""
-        possible = np.nan_to_num(unoccluded, posinf=0) ** 2
-        possible[:, self._never] = 0
+            alike[self._count :] = alike[self._environment_number] * light
+            alike[self._environment_number] = 0
+        ignored = alike[: self._count] == 0
         if self._both:
             # Its regions stand for the environment
-            possible[:, self._environment_number] = 0
-        found = possible * seen
-        visible = found.sum((1, 2)) / np.maximum(possible.sum((1, 2)), np.finfo(np.float64).tiny)
-        power = (found + _PRIOR / _RAYS_EACH * visible[:, None, None] * possible).mean(2) ** 0.5
-        total = power.sum(1, keepdims=True)
-        learned = np.where(total > 0, power / np.maximum(total, np.finfo(np.float64).tiny), self._alike)
-        return np.concatenate([self._alike[None], (1 - _UNIFORM_SHARE) * learned + _UNIFORM_SHARE * self._alike])
+            ignored[self._environment_number] = True
+        self.choice = SiteChoice(scene, alike, _USUAL_SHARE, self._look, np.flatnonzero(ignored))
 
-    # ---------------------- Sampling ----------------------
-
-    def site(self, si, side):
-        """The site of a vertex; ``side``: see :func:`vpl.split.floors.side_of`."""
-        return self._sites.at(si.p, si.sh_frame.n * side)
-
-    def _row(self, site):
-        """Where the row of a site begins in the table of probabilities."""
-        return site * (self._sources + 1)
+    def _look(self, si, source, sampler):
+        """What is learned from: a direction to each source."""
+        direction, weight, _, _, ray = self._draw(si, source, sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
+        return direction, weight, ray
 
     def _draw(self, si, source, member, place, active):
         """A direction to each source: (direction, radiance over density, density of the direction, whether the source
@@ -154,8 +83,7 @@ class LearnedEmitters:
     def sample(self, si, site, chosen, member, place, active):
         """A direction to an emitter: (direction, visible radiance over density, density per solid angle, whether the
         emitter is a point or a direction)."""
-        row = self._choice.draw(site, chosen, active)
-        source, probability = row - self._row(site), self._choice.probability(row, active)
+        source, probability, _ = self.choice.draw(site, chosen, active)
         direction, weight, density, delta, ray = self._draw(si, source, member, place, active)
         whole = density * probability
         if self._both:
@@ -171,12 +99,11 @@ class LearnedEmitters:
     def _environment_density(self, si, site, direction, active):
         """Density with which a direction to the environment is drawn."""
         region, density = self._regions.find(direction, active)
-        first = self._row(site)
-        density *= self._choice.probability(first + self._count + region, active)
+        density *= self.choice.probability(site, self._count + region, active)
         if self._both:
             ds = dr.zeros(mi.DirectionSample3f)
             ds.d = direction
-            by_emitter = self._choice.probability(first + self._environment_number, active)
+            by_emitter = self.choice.probability(site, mi.UInt32(self._environment_number), active)
             density += self._environment.pdf_direction(si, ds, active) * by_emitter
         return density
 
@@ -191,7 +118,7 @@ class LearnedEmitters:
         wanted = active & has_density & (emitter != None)  # noqa: E711
         number = dr.gather(mi.UInt32, self._number_of, dr.reinterpret_array(mi.UInt32, emitter), wanted)
         near = wanted & si.is_valid()
-        probability = self._choice.probability(self._row(site) + number, near)
+        probability = self.choice.probability(site, number, near)
         density = emitter.pdf_direction(origin, ds, near) * probability
         if self._regions:
             # A branch: few packets of paths hold one that has left the scene

@@ -51,7 +51,7 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
         # Emission, by next-event estimation
         chosen, place, lobe, turn = numbers.at(path.scattered)
         path.scattered += dr.select(met.smooth, 1, 0)
-        path.site, member = emission.site(met.si, met.side), sampler.next_1d()
+        path.site, member = emission.choice.site(met.si, met.side), sampler.next_1d()
         light = emission.sample(met.si, path.site, chosen, member, place, met.smooth)
         gains.add(_lit(path, met, light, context), path.depth + 2, sampler)
         lobe = dr.select(met.smooth, lobe, sampler.next_1d())

@@ -152,7 +152,7 @@ def _irradiance(scene, emission, rays, limits: Limits, seed: int):
     sampler = independent_sampler(derived_seed(seed, 0), count)
     si = scene.ray_intersect(rays)
     side = side_of(si)
-    facing, site = si.sh_frame.n * side, emission.site(si, side)
+    facing, site = si.sh_frame.n * side, emission.choice.site(si, side)
     # ---------------------- Next-event estimation ----------------------
     toward, incident, density, is_point = emission.sample(
         si, site, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), si.is_valid()

@@ -1,0 +1,138 @@
+"""Choice among sources of light by what a pilot's vertices see of them, place by place.
+
+Space is divided into cubes, and the vertices in a cube by the way that they face: a site.  Sites in which the pilot's
+paths had vertices learn which sources light them: from some of their vertices a few rays go to every source.  A share
+of the samples is kept for the usual choice, which is all that other sites have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import channel_mean, download, upload, upload_vectors
+from ..core.sampling import RowChoice, independent_sampler
+from .sites import Sites
+
+# Rays from a site to each source; how many of them all sites may have together
+_RAYS_EACH, _MOST_RAYS = 2, 1 << 20
+# Rays that the visibility on average counts for
+_PRIOR = 1.0
+
+
+class SiteChoice:
+    """The choice of sources by site; before :meth:`learn`, the usual one everywhere.
+
+    ``usual`` (n,) float64: probabilities of sources, which sum to 1; ``share`` of the samples that keep them;
+    ``look(si, source, sampler)``: a direction to each source, (direction, radiance over density, shadow ray);
+    ``ignored``: indices of sources that nothing is learned of.
+    """
+
+    def __init__(self, scene, usual: np.ndarray, share: float, look: Callable, ignored: np.ndarray):
+        self.count, self._stride = len(usual), dr.opaque(mi.UInt32, len(usual) + 1)
+        self._scene, self._usual, self._share, self._look, self._ignored = scene, usual, share, look, ignored
+        self.forget()
+
+    def _use(self, probability: np.ndarray) -> None:
+        """``probability`` (sites, sources) float64 of each source; rows sum to 1."""
+        self._rows = RowChoice(probability.ravel(), np.full(len(probability), self.count))
+
+    @property
+    def pmf(self) -> np.ndarray:
+        """Probabilities (sites + 1, sources) with which sources are drawn; first where nothing is known."""
+        return self._rows.pmf.reshape(-1, self.count)
+
+    # ---------------------- Learning ----------------------
+
+    def forget(self) -> None:
+        """Know nothing of any place."""
+        self._sites = Sites.none()
+        # Twice, because arrays of one entry make other kernels
+        self._use(np.stack([self._usual, self._usual]))
+
+    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> bool:
+        """Learn from vertices, (n, 3) each, with about so many rays at most: whether anything was learned."""
+        each = _RAYS_EACH * self.count
+        most = min(rays, _MOST_RAYS) // each
+        if most < 1 or len(position) == 0:
+            return False
+        self._sites, site = Sites.around(position, normal, most)
+        size = np.bincount(site)[1:]
+        order, sites = np.argsort(site, kind="stable"), len(size)
+        first = upload(mi.UInt32, np.cumsum(size) - size)
+        lane = dr.arange(mi.UInt32, sites * each)
+        row = lane // dr.opaque(mi.UInt32, each)
+        source = lane // _RAYS_EACH % dr.opaque(mi.UInt32, self.count)
+        sampler = independent_sampler(seed, len(lane))
+        number = mi.UInt32(sampler.next_1d() * mi.Float(dr.gather(mi.UInt32, upload(mi.UInt32, size), row)))
+        vertex = dr.gather(mi.UInt32, first, row) + number
+        places, normals = (upload_vectors(mi.Point3f, x[order]) for x in (position, normal))
+        unoccluded, seen = (
+            download(x).astype(np.float64).reshape(sites, self.count, _RAYS_EACH)
+            for x in self._looks(places, normals, vertex, source, sampler)
+        )
+        self._use(self._shares(unoccluded, seen))
+        return True
+
+    def _looks(self, positions, normals, vertex, source, sampler):
+        """(Irradiance that a source would give a vertex by one sample if nothing was between, whether nothing is)."""
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(vertex))
+        si.p, si.n = dr.gather(mi.Point3f, positions, vertex), mi.Normal3f(dr.gather(mi.Point3f, normals, vertex))
+        si.sh_frame = mi.Frame3f(si.n)
+        direction, weight, ray = self._look(si, source, sampler)
+        light = channel_mean(weight) * dr.maximum(dr.dot(direction, si.n), 0)
+        seen = dr.select((light > 0) & ~self._scene.ray_test(ray, light > 0), mi.Float(1), 0)
+        dr.eval(light, seen)
+        return light, seen
+
+    def _shares(self, unoccluded: np.ndarray, seen: np.ndarray) -> np.ndarray:
+        """Probabilities (sites + 1, sources) by root mean squares of what arrived; first where nothing is known."""
+        possible = np.nan_to_num(unoccluded, posinf=0) ** 2
+        possible[:, self._ignored] = 0
+        found = possible * seen
+        # What a site has not seen is expected as often as it sees others, and others see that source
+        of_site, of_source, of_all = (_share(found, possible, axes) for axes in ((1, 2), (0, 2), (0, 1, 2)))
+        visible = np.minimum(of_site * of_source / max(float(of_all.squeeze()), 1e-9), 1)
+        power = (found + _PRIOR / _RAYS_EACH * visible * possible).mean(2) ** 0.5
+        total = power.sum(1, keepdims=True)
+        learned = np.where(total > 0, power / np.maximum(total, np.finfo(np.float64).tiny), self._usual)
+        return np.concatenate([self._usual[None], (1 - self._share) * learned + self._share * self._usual])
+
+    # ---------------------- Sampling ----------------------
+
+    def site(self, si, side):
+        """The site of a vertex; ``side``: see :func:`vpl.split.floors.side_of`."""
+        return self._sites.at(si.p, si.sh_frame.n * side)
+
+    def draw(self, site, number, active):
+        """A source for each site by a uniform number: (source, its probability, another uniform number)."""
+        row = self._rows.draw(site, number, active)
+        return row - self._row(site), self._rows.probability(row, active), self._rows.rest(row, number, active)
+
+    def probability(self, site, source, active):
+        """Probability of a source at each site."""
+        return self._rows.probability(self._row(site) + source, active)
+
+    def _row(self, site):
+        """Where the row of a site begins in the table of probabilities."""
+        return site * self._stride
+
+
+def _share(found: np.ndarray, possible: np.ndarray, axes: tuple) -> np.ndarray:
+    """Share of the possible rays that found light, over some axes, which are kept."""
+    return np.count_nonzero(found, axes, keepdims=True) / np.maximum(np.count_nonzero(possible, axes, keepdims=True), 1)
+
+
+class NoChoice:
+    """A choice that is everywhere the same, in the place of a :class:`SiteChoice`."""
+
+    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> bool:
+        """There is nothing to learn."""
+        return False
+
+    def site(self, si, side):
+        """The only site."""
+        return mi.UInt32(0)
