@@ -20,10 +20,12 @@ _GAIN = 0.9
 _SPREAD = 0.5
 # Relative standard error that one set of lights leaves in the mean of the image
 _SET_ERROR = 0.03
+# Relative variance that a set of lights leaves in a pixel, times the paths that it was made by
+_LIGHT_NOISE = 80.0
 # Light paths as a share of the paths from the camera, and how few and how many there may be
 _SHARES, _FEWEST, _MOST = (1 / 64, 1 / 8), 20_000, 500_000
 # Relative variance that cuts leave, times shadow rays a pixel; and the cost of one of these rays
-_CUT_NOISE, _RAY_COST = 0.2, 0.2
+_CUT_NOISE, _RAY_COST = 0.3, 0.2
 # Shadow rays for each sample of a pixel, at least and at most
 _RAYS = (0.25, 8.0)
 # Bound on a pair of clusters, relative to its pixel, with which a cut has so many rays, and how the two go together
@@ -68,10 +70,12 @@ def balance(radiance: np.ndarray, indirect: np.ndarray, brightness: np.ndarray, 
     share = 1 - direct / max(whole, np.finfo(np.float64).tiny)
     # Relative variance of what a path from the camera brings by way of lights
     variance = len(indirect) * np.sum(indirect**2) / np.sum(indirect) ** 2
-    wanted = np.clip(variance / _SET_ERROR**2, _SHARES[0] * paths, _SHARES[1] * paths)
+    rest = whole * (1 - _GAIN * share)
+    # The least of (noise of paths / samples + noise of lights / their paths) × cost
+    balanced = (_LIGHT_NOISE * samples * paths / (_LIGHT_PATH_COST * max(rest, 1e-9))) ** 0.5
+    wanted = np.clip(max(balanced, variance / _SET_ERROR**2), _SHARES[0] * paths, _SHARES[1] * paths)
     light_paths = int(np.clip(wanted, _FEWEST, _MOST))
     # The least of (noise of paths / samples + noise of cuts / rays) × (samples + rays × their cost), rays of a pixel
-    rest = whole * (1 - _GAIN * share)
     rays = samples * np.clip((_CUT_NOISE / (_RAY_COST * max(rest, 1e-9))) ** 0.5, *_RAYS)
     error = float(np.clip(_ERROR * (rays / _RAYS_AT_ERROR) ** -_SLOPE, _FINEST, _COARSEST))
     # A cut has some nodes, however few rays are wanted
