@@ -33,7 +33,7 @@ from .knobs import Boolean
 from .manual import manual_page
 
 # Camera rays of the pilot, and those that are followed at a time, which bounds memory
-_PILOT, _WAVEFRONT = 1 << 15, 1 << 21
+_PILOT, _WAVEFRONT = 1 << 15, 1 << 20
 # Rays by which emitters are learned, as a share of the camera rays
 _LEARNING_SHARE = 0.25
 # Cost of a path with emitters that were learned, more of whose shadow rays arrive, next to that of others
