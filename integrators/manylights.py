@@ -38,8 +38,8 @@ _PILOT, _WAVEFRONT = 1 << 15, 1 << 20
 _LEARNING_SHARE = 0.25
 # Cost of a path with emitters that were learned, more of whose shadow rays arrive, next to that of others
 _LEARNED_COST = 1.15
-# c of the split, as a multiple of the distance between lights
-_TAPER = 1.0
+# c of the split, as a multiple of the distance between lights: nearer, the noise of single lights would show as blotches
+_TAPER = 6.0
 # c of paths that are whole, beyond every distance, world units: nothing is left to virtual lights
 _WHOLE = 1e15
 # Pixels darker than this share of the image's mean are lit as precisely as if they had it

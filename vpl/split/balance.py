@@ -21,7 +21,7 @@ _SPREAD = 0.5
 # Relative standard error that one set of lights leaves in the mean of the image
 _SET_ERROR = 0.03
 # Relative variance that a set of lights leaves in a pixel, times the paths that it was made by
-_LIGHT_NOISE = 80.0
+_LIGHT_NOISE = 200.0
 # Light paths as a share of the paths from the camera, and how few and how many there may be
 _SHARES, _FEWEST, _MOST = (1 / 64, 1 / 8), 20_000, 500_000
 # Relative variance that cuts leave, times shadow rays a pixel; and the cost of one of these rays
