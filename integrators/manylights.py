@@ -38,7 +38,7 @@ _PILOT, _WAVEFRONT = 1 << 15, 1 << 20
 _LEARNING_SHARE = 0.25
 # Cost of a path with emitters that were learned, more of whose shadow rays arrive, next to that of others
 _LEARNED_COST = 1.15
-# c of the split, as a multiple of the distance between lights: nearer, the noise of single lights would show as blotches
+# c of the split, as a multiple of the distance between lights, below which single ones show as blotches
 _TAPER = 6.0
 # c of paths that are whole, beyond every distance, world units: nothing is left to virtual lights
 _WHOLE = 1e15
@@ -111,8 +111,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
     camera paths arrive, each with the irradiance that one path finds there. They are clustered in a light tree; those
     gather vertices of a pixel that face the same way share one light cut, as in Multidimensional Lightcuts, with a
     representative drawn anew for every pair. The second term is traced as by ``path``; most of its paths end at x2,
-    where little is left of them. w keeps lights from being bright spots in corners; c is the distance between lights.
-    See :mod:`vpl.split`.
+    where little is left of them. w keeps lights from being bright spots in corners; c is a multiple of the distance
+    between lights. See :mod:`vpl.split`.
 
     **Chooses by itself.** A pilot of some thousand paths tells where lights are wanted, how many, and whether they pay:
     where little of the noise is that of indirect light, or the image has few samples, there are none, and what is left
