@@ -34,8 +34,8 @@ def recorded_once(function: Callable) -> Callable:
 def garbage_kept():
     """Keep Python's cyclic collector from running while the block runs, in any thread.
 
-    A scene that it lets go while a frozen function is recorded ends the process, between two calls makes Dr.Jit record
-    anew, and between recording and its end is an error.
+    A scene that it lets go while a frozen function is recorded makes that fail, or ends the process; between two calls,
+    Dr.Jit records anew.
     """
     with _LOCK:
         if not _STOPPED["blocks"]:
