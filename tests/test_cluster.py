@@ -406,6 +406,14 @@ def test_a_worker_gets_the_files_that_it_lacks(tmp_path):
     assert store.place(found) == path
 
 
+def test_two_hyphens_in_a_comment_do_not_keep_a_scene_from_travelling(tmp_path):
+    """As in the hall, which says by what command it was made."""
+    scene = scene_with_files(tmp_path / "client")
+    before = [file.relative for file in scene_travel.bundle(SceneFile(scene)).files]
+    scene.write_text(f"<!-- Made by: hall.py --lights 2\n -->\n{scene.read_text()}")
+    assert [file.relative for file in scene_travel.bundle(SceneFile(scene)).files] == before
+
+
 def test_a_file_with_an_absolute_path_must_be_there(tmp_path):
     mesh = tmp_path / "client/scene/meshes/a.obj"
     found = scene_travel.bundle(SceneFile(scene_with_files(tmp_path / "client", mesh)))

@@ -73,11 +73,13 @@ def _included(xml, defines):
     other XML files, whose own are among them, and spectra."""
     found, known, waiting = {}, dict(defines), [xml]
     while waiting:
-        for element in ElementTree.parse(waiting.pop()).iter():
+        # Mitsuba reads comments with two hyphens, which XML does not allow
+        text = re.sub(rb"<!--.*?-->", b"", waiting.pop().read_bytes(), flags=re.DOTALL)
+        for element in ElementTree.fromstring(text).iter():
             if element.tag == "default":
                 known.setdefault(element.get("name"), element.get("value"))
-            for text in element.attrib.values():
-                name = re.sub(r"\$(\w+)", lambda match: known.get(match[1], match[0]), text)
+            for value in element.attrib.values():
+                name = re.sub(r"\$(\w+)", lambda match: known.get(match[1], match[0]), value)
                 file = xml.parent / name
                 if name and name not in found and len(name) < 1024 and file.is_file():
                     found[name] = file
