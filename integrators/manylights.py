@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import drjit as dr
@@ -10,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.arrays import channel_mean, download, upload
-from vpl.core.sampling import derived_seed, independent_sampler
+from vpl.core.sampling import derived_seed
 from vpl.core.stages import Stage
 from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.perturbed import Perturbed
@@ -19,12 +18,11 @@ from vpl.split.balance import Balance, balance, importance, judged_by, noise, wi
 from vpl.split.gather_vertices import drawn_later, joined
 from vpl.split.kept_lights import KeptLights, TreedLights
 from vpl.split.next_event import emitters_of
-from vpl.split.numbers import SpreadNumbers
-from vpl.split.paths import AT_FIRST, EVERYWHERE, NOWHERE, FirstEdge, Limits
+from vpl.split.paths import AT_FIRST, EVERYWHERE, NOWHERE, Limits
 from vpl.split.pilot import Pilot
 from vpl.split.pixel_clusters import PixelClusters, light_clusters
-from vpl.split.remainder import follow
 from vpl.split.surface_lights import surface_lights
+from vpl.split.view import View
 from vpl.split.worth import Worth
 from vpl.transport.evaluation import Transport
 
@@ -48,44 +46,6 @@ _DARK_FLOOR = 0.1
 _MAX_CUT = 1000
 # Surfaces as virtual lights see them: all of them block, for what passes one is traced
 _OPAQUE = SceneTraits(False, False, True, False, False, (), (), None)
-
-
-@dataclass
-class View:
-    """One call of ``sample``: the ``scene`` and how its emitters are sampled (``emission``), its shapes without a
-    floor (``perturbed``); the camera's ``ray`` and which of them are ``active``, evaluated; ``width`` of the image and
-    ``samples`` of a pixel, which lie next to each other; ``seed``; ``importance`` of radiance in each pixel, and the
-    ``worth`` of paths (:mod:`vpl.split.worth`), once they are known."""
-
-    scene: object
-    emission: object
-    perturbed: Perturbed
-    ray: object
-    active: object
-    width: int
-    samples: int
-    seed: int
-    importance: object
-    worth: Worth
-
-    @property
-    def count(self) -> int:
-        return dr.width(self.ray.o)
-
-    @property
-    def pixels(self) -> np.ndarray:
-        """Numbers of the pixels."""
-        return np.arange(-(-self.count // self.samples))
-
-    def follow(self, lane, limits: Limits, *stream: int):
-        """Follow the camera rays ``lane`` (UInt32): see :func:`vpl.split.remainder.follow`."""
-        seed, ray = derived_seed(self.seed, *stream), self.ray
-        part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
-        importance = dr.gather(mi.Float, self.importance, lane // dr.opaque(mi.UInt32, self.samples))
-        edge = FirstEdge.of_camera(part, importance, dr.gather(mi.Bool, self.active, lane))
-        numbers = SpreadNumbers(lane, self.samples, derived_seed(seed, 0))
-        sampler = independent_sampler(derived_seed(seed, 1), dr.width(lane))
-        return follow(self.scene, self.emission, edge, numbers, sampler, limits)
 
 
 @manual_page

@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable
-from contextlib import contextmanager
 from functools import wraps
-from threading import Lock
 
 import drjit as dr
-
-# Blocks that run with Python's collector stopped, and whether it ran before the first of them
-_STOPPED = {"blocks": 0, "ran": True}
-_LOCK = Lock()
 
 
 def recorded_once(function: Callable) -> Callable:
@@ -28,24 +21,3 @@ def recorded_once(function: Callable) -> Callable:
             return function(*arguments)
 
     return once
-
-
-@contextmanager
-def garbage_kept():
-    """Keep Python's cyclic collector from running while the block runs, in any thread.
-
-    A scene that it lets go while a frozen function is recorded makes that fail, or ends the process; between two calls,
-    Dr.Jit records anew.
-    """
-    with _LOCK:
-        if not _STOPPED["blocks"]:
-            _STOPPED["ran"] = gc.isenabled()
-            gc.disable()
-        _STOPPED["blocks"] += 1
-    try:
-        yield
-    finally:
-        with _LOCK:
-            _STOPPED["blocks"] -= 1
-            if not _STOPPED["blocks"] and _STOPPED["ran"]:
-                gc.enable()

@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import download, even_chunks, ones, select_record, spectrum_to_rgb
-from ..core.loops import garbage_kept
+from ..core.garbage import garbage_kept
 from ..core.sampling import derived_seed, independent_sampler, stratified
 from .emission import emission_groups
 from .emitters import Emitters

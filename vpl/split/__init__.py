@@ -19,6 +19,7 @@ In the order to read in:
 - ``tree_emitters``: many emitters, chosen so by clusters
 - ``emitter_tree``: a tree over emitters with a place, by which one is drawn for a vertex
 - ``numbers``: random numbers that are spread well over the samples of a pixel
+- ``view``: camera rays, and paths that begin with them
 - ``gather_vertices``: vertices where virtual lights are gathered, and which of the later ones are
 - ``pilot``: a few paths that tell where light is wanted
 - ``balance``: what the pilot decides: whether lights pay, how many, how finely they are clustered

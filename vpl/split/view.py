@@ -1,0 +1,54 @@
+"""View: the camera rays of one image, or of one pass of it, and what all paths that begin with them share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.sampling import derived_seed, independent_sampler
+from ..lights.perturbed import Perturbed
+from .numbers import SpreadNumbers
+from .paths import FirstEdge, Limits
+from .remainder import follow
+from .worth import Worth
+
+
+@dataclass
+class View:
+    """Camera rays: the ``scene`` and how its emitters are sampled (``emission``), its shapes without a
+    floor (``perturbed``); the camera's ``ray`` and which of them are ``active``, evaluated; ``width`` of the image and
+    ``samples`` of a pixel, which lie next to each other; ``seed``; ``importance`` of radiance in each pixel, and the
+    ``worth`` of paths (:mod:`vpl.split.worth`), once they are known."""
+
+    scene: object
+    emission: object
+    perturbed: Perturbed
+    ray: object
+    active: object
+    width: int
+    samples: int
+    seed: int
+    importance: object
+    worth: Worth
+
+    @property
+    def count(self) -> int:
+        return dr.width(self.ray.o)
+
+    @property
+    def pixels(self) -> np.ndarray:
+        """Numbers of the pixels."""
+        return np.arange(-(-self.count // self.samples))
+
+    def follow(self, lane, limits: Limits, *stream: int):
+        """Follow the camera rays ``lane`` (UInt32): see :func:`vpl.split.remainder.follow`."""
+        seed, ray = derived_seed(self.seed, *stream), self.ray
+        part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
+        importance = dr.gather(mi.Float, self.importance, lane // dr.opaque(mi.UInt32, self.samples))
+        edge = FirstEdge.of_camera(part, importance, dr.gather(mi.Bool, self.active, lane))
+        numbers = SpreadNumbers(lane, self.samples, derived_seed(seed, 0))
+        sampler = independent_sampler(derived_seed(seed, 1), dr.width(lane))
+        return follow(self.scene, self.emission, edge, numbers, sampler, limits)
