@@ -48,18 +48,17 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(emitter):
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(1, len(position))
     site = emission.choice.site(si, mi.Float(1))
-    direction, weight, density, is_point = emission.sample(
-        si, site, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), mi.Bool(True)
-    )
-    ray = si.spawn_ray(direction)
+    sample = emission.sample(si, site, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
+    weight = sample.arriving(scene, mi.Bool(True))
+    ray = si.spawn_ray(sample.direction)
     found = scene.ray_intersect(ray)
-    emitted, met = emission.met(si.p, site, ray, found, mi.Bool(True), mi.Bool(True))
-    lit = np.array((dr.max(weight) > 0) & ~is_point)
+    met = emission.met(si.p, site, ray, found, mi.Bool(True), mi.Bool(True))
+    lit = np.array((dr.max(weight) > 0) & ~sample.is_point)
     assert lit.sum() > 100
     # Directions at the very edge of a cell may be found in the next one
-    close = np.isclose(np.array(met), np.array(density), rtol=1e-2)[lit]
+    close = np.isclose(np.array(met.density), np.array(sample.density), rtol=1e-2)[lit]
     assert close.mean() > 0.99
-    same = np.isclose(np.array(emitted), np.array(weight * density), rtol=2e-2)[:, lit].all(0)
+    same = np.isclose(np.array(met.radiance), np.array(weight * sample.density), rtol=2e-2)[:, lit].all(0)
     assert same.mean() > 0.98
 
 

@@ -59,12 +59,13 @@ def emission_of(scene, rng, learns):
 
 
 def drawn(emission, si, seed):
-    """What is drawn at interactions: (site, direction, weight, density, whether it is a point or a direction)."""
+    """What is drawn at interactions: (site, sample, weight where nothing is between)."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, dr.width(si.p))
     site = emission.choice.site(si, mi.Float(1))
     numbers = sampler.next_1d(), sampler.next_1d(), sampler.next_2d()
-    return site, *emission.sample(si, site, *numbers, mi.Bool(True))
+    sample = emission.sample(si, site, *numbers, mi.Bool(True))
+    return site, sample, sample.arriving(emission._scene, mi.Bool(True))
 
 
 @pytest.mark.parametrize("learns", [False, True])
@@ -75,14 +76,14 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(sky, learns):
     del box["left"]
     scene = mi.load_dict(box)
     emission, si = emission_of(scene, rng, learns), interactions(*vertices(rng))
-    site, direction, weight, density, is_point = drawn(emission, si, 1)
-    ray = si.spawn_ray(direction)
-    emitted, met = emission.met(si.p, site, ray, scene.ray_intersect(ray), mi.Bool(True), mi.Bool(True))
-    lit = np.array((dr.max(weight) > 0) & ~is_point)
+    site, sample, weight = drawn(emission, si, 1)
+    ray, density = si.spawn_ray(sample.direction), sample.density
+    met = emission.met(si.p, site, ray, scene.ray_intersect(ray), mi.Bool(True), mi.Bool(True))
+    lit = np.array((dr.max(weight) > 0) & ~sample.is_point)
     assert lit.sum() > 100
     # Directions to the very edge of a panel may miss it, and distances along grazing ones are rounded
-    assert np.isclose(np.array(met), np.array(density), rtol=5e-2)[lit].mean() > 0.97
-    assert np.isclose(np.array(emitted), np.array(weight * density), rtol=2e-2)[:, lit].all(0).mean() > 0.97
+    assert np.isclose(np.array(met.density), np.array(density), rtol=5e-2)[lit].mean() > 0.97
+    assert np.isclose(np.array(met.radiance), np.array(weight * density), rtol=2e-2)[:, lit].all(0).mean() > 0.97
 
 
 @pytest.mark.parametrize("learns", [False, True])
@@ -93,7 +94,7 @@ def test_all_point_emitters_are_expected_to_arrive_whole(learns):
     emission, (position, normal) = emission_of(scene, rng, learns), vertices(rng, 8)
     samples = 1 << 16
     si = interactions(np.repeat(position, samples, 0), np.repeat(normal, samples, 0))
-    _, _, weight, *_ = drawn(emission, si, 3)
+    _, _, weight = drawn(emission, si, 3)
     found = np.array(weight)[0].reshape(len(position), samples)
     points = read_emitters(scene).points
     distance2 = ((points.position[None] - position[:, None]) ** 2).sum(2)
@@ -131,7 +132,7 @@ def test_what_is_behind_a_wall_is_drawn_less_where_it_was_learned():
     scene = mi.load_dict(closed_box(bulbs(COUNT, rng) | outside))
     si, lit = interactions(*vertices(rng)), []
     for learns in (False, True):
-        _, _, weight, *_ = drawn(emission_of(scene, rng, learns), si, 5)
+        _, _, weight = drawn(emission_of(scene, rng, learns), si, 5)
         lit.append(np.mean(np.array(weight)[0] > 0))
     assert lit[0] < 0.7 and lit[1] > 0.8
 

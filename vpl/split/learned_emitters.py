@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core.arrays import download, finite_or_zero, upload
 from ..direct.environment_regions import regions_of
+from .emitter_samples import EmitterSample, MetEmitter
 from .site_choice import SiteChoice
 
 # Regions of the environment, and columns of the table that they are made from
@@ -55,12 +56,10 @@ class LearnedEmitters:
 
     def _look(self, si, source, sampler):
         """What is learned from: a direction to each source."""
-        direction, weight, _, _, ray = self._draw(si, source, sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
-        return direction, weight, ray
+        return self._draw(si, source, sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
 
-    def _draw(self, si, source, member, place, active):
-        """A direction to each source: (direction, radiance over density, density of the direction, whether the source
-        is a point or a direction, shadow ray)."""
+    def _draw(self, si, source, member, place, active) -> EmitterSample:
+        """A direction to each source."""
         of_emitter = active & (source < self._count)
         emitter = dr.gather(mi.EmitterPtr, self._emitters, dr.minimum(source, self._count - 1))
         ds, weight = emitter.sample_direction(si, place, of_emitter)
@@ -78,23 +77,18 @@ class LearnedEmitters:
             weight = dr.select(of_region, arriving, weight)
             density = dr.select(of_region, region_density, density)
             ray = dr.select(of_region, si.spawn_ray(direction), ray)
-        return direction, weight, density, delta, ray
+        return EmitterSample(direction, weight, density, delta, ray)
 
-    def sample(self, si, site, chosen, member, place, active):
-        """A direction to an emitter: (direction, visible radiance over density, density per solid angle, whether the
-        emitter is a point or a direction)."""
+    def sample(self, si, site, chosen, member, place, active) -> EmitterSample:
+        """As :meth:`vpl.split.next_event.UniformEmitters.sample`."""
         source, probability, _ = self.choice.draw(site, chosen, active)
-        direction, weight, density, delta, ray = self._draw(si, source, member, place, active)
-        whole = density * probability
-        if self._both:
-            # What both the emitter and its regions may draw has the sum of their densities
-            of_environment = active & ((source >= self._count) | (source == self._environment_number))
-            both = self._environment_density(si, site, direction, of_environment)
-            whole = dr.select(of_environment, both, whole)
-        weight *= density / whole
-        arrives = active & (dr.max(weight) > 0) & (whole > 0)
-        blocked = self._scene.ray_test(ray, arrives)
-        return direction, dr.select(arrives & ~blocked, weight, 0), whole, delta
+        sample = self._draw(si, source, member, place, active)
+        if not self._both:
+            return sample.chosen_with(probability)
+        # What both the emitter and its regions may draw has the sum of their densities
+        of_environment = active & ((source >= self._count) | (source == self._environment_number))
+        both = self._environment_density(si, site, sample.direction, of_environment)
+        return sample.chosen_with(dr.select(of_environment, both / sample.density, probability))
 
     def _environment_density(self, si, site, direction, active):
         """Density with which a direction to the environment is drawn."""
@@ -107,9 +101,8 @@ class LearnedEmitters:
             density += self._environment.pdf_direction(si, ds, active) * by_emitter
         return density
 
-    def met(self, vertex, site, ray, si, has_density, active):
-        """Radiance that a ray from ``vertex`` met at ``si``, and the density with which :meth:`sample` would have drawn
-        it there."""
+    def met(self, vertex, site, ray, si, has_density, active) -> MetEmitter:
+        """As :meth:`vpl.split.next_event.UniformEmitters.met`."""
         origin = dr.zeros(mi.Interaction3f)
         origin.p = vertex
         ds = mi.DirectionSample3f(self._scene, si, origin)
@@ -128,4 +121,4 @@ class LearnedEmitters:
                 lambda origin, site, direction, density: self._environment_density(origin, site, direction, True),
                 lambda origin, site, direction, density: density,
             )
-        return emitted, density
+        return MetEmitter(emitted, density)

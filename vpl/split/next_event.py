@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..core.arrays import finite_or_zero
 from ..lights.emitters import read_emitters
+from .emitter_samples import EmitterSample, MetEmitter
 from .learned_emitters import LearnedEmitters
 from .site_choice import NoChoice
 from .tree_emitters import TreeEmitters
@@ -43,18 +44,19 @@ class UniformEmitters:
     def __init__(self, scene):
         self._scene, self.choice = scene, NoChoice()
 
-    def sample(self, si, site, chosen, member, place, active):
-        """A direction to an emitter: (direction, visible radiance over density, density per solid angle, whether the
-        emitter is a point or a direction)."""
-        ds, weight = self._scene.sample_emitter_direction(si, place, True, active)
-        return ds.d, finite_or_zero(mi.unpolarized_spectrum(weight)), ds.pdf, ds.delta
+    def sample(self, si, site, chosen, member, place, active) -> EmitterSample:
+        """A direction to an emitter of each vertex ``si`` of a ``site``: ``chosen``, ``member``, ``place``: numbers
+        that choose an emitter or part of one, a place in that part, and a place on the emitter."""
+        ds, weight = self._scene.sample_emitter_direction(si, place, False, active)
+        far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        ray = dr.select(far, si.spawn_ray(ds.d), si.spawn_ray_to(ds.p))
+        return EmitterSample(ds.d, finite_or_zero(mi.unpolarized_spectrum(weight)), ds.pdf, ds.delta, ray)
 
-    def met(self, vertex, site, ray, si, has_density, active):
-        """Radiance that a ray from ``vertex`` met at ``si``, and the density with which :meth:`sample` would have drawn
-        it there."""
+    def met(self, vertex, site, ray, si, has_density, active) -> MetEmitter:
+        """What a ray from ``vertex`` met at ``si``."""
         origin = dr.zeros(mi.Interaction3f)
         origin.p = vertex
         ds = mi.DirectionSample3f(self._scene, si, origin)
         density = self._scene.pdf_emitter_direction(origin, ds, active & has_density)
         emitted = si.emitter(self._scene, active).eval(si, active)
-        return finite_or_zero(mi.unpolarized_spectrum(emitted)) & active, density
+        return MetEmitter(finite_or_zero(mi.unpolarized_spectrum(emitted)) & active, density)

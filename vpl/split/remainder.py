@@ -17,6 +17,7 @@ import mitsuba as mi
 from ..core.arrays import channel_mean, select_record
 from ..core.loops import recorded_once
 from ..direct.emitter_sampling import power_heuristic
+from .emitter_samples import EmitterSample
 from .floors import agrees, carried_share
 from .gather_vertices import Arrival
 from .paths import CONNECTING, PAST, SEEKING, FirstEdge, Found, Gains, Gathered, Limits, Met, Path
@@ -41,10 +42,9 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
     while dr.hint(path.active, exclude=[first, numbers, limits, emission, context]):
         met = Met.by(scene, path, limits)
         # Emission, by BSDF sampling
-        emitted, other = emission.met(
-            path.vertex, path.site, path.ray, met.si, ~path.delta, path.active & ~met.hidden
-        )  # fmt: skip
-        gains.add(path.throughput * emitted * power_heuristic(path.density, other), path.depth + 1, sampler)
+        emitter = emission.met(path.vertex, path.site, path.ray, met.si, ~path.delta, path.active & ~met.hidden)
+        mis = power_heuristic(path.density, emitter.density)
+        gains.add(path.throughput * emitter.radiance * mis, path.depth + 1, sampler)
         connects = _carry(path, met, limits, gains.radiance, gathered)
         _end_by_worth(path, met, connects, limits, sampler)
         gathers, weight = gathered.add(path, met, limits, sampler)
@@ -52,8 +52,8 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
         chosen, place, lobe, turn = numbers.at(path.scattered)
         path.scattered += dr.select(met.smooth, 1, 0)
         path.site, member = emission.choice.site(met.si, met.side), sampler.next_1d()
-        light = emission.sample(met.si, path.site, chosen, member, place, met.smooth)
-        gains.add(_lit(path, met, light, context), path.depth + 2, sampler)
+        sample = emission.sample(met.si, path.site, chosen, member, place, met.smooth)
+        gains.add(_lit(path, met, sample, context) * sample.arriving(scene, met.smooth), path.depth + 2, sampler)
         lobe = dr.select(met.smooth, lobe, sampler.next_1d())
         turn = dr.select(met.smooth, turn, sampler.next_2d())
         kept = _turn(path, met, context, lobe, turn, gathers, weight)
@@ -102,15 +102,14 @@ def _end_by_worth(path: Path, met: Met, connects, limits: Limits, sampler) -> No
     path.carried /= survival
 
 
-def _lit(path: Path, met: Met, light, context):
-    """What paths bring from the emitters that were sampled, less what virtual lights carry."""
-    toward, incident, density_there, is_point = light
-    local = met.si.to_local(toward)
-    value, density_here = met.bsdf.eval_pdf(context, met.si, local, met.smooth)
+def _lit(path: Path, met: Met, sample: EmitterSample, context):
+    """What paths bring of the light of the emitters that were sampled, less what virtual lights carry."""
+    local = met.si.to_local(sample.direction)
+    value, density = met.bsdf.eval_pdf(context, met.si, local, met.smooth)
     value = path.throughput * mi.unpolarized_spectrum(value)
     value -= dr.select(local.z * met.side > 0, path.carried * dr.abs(local.z), 0)
-    mis = dr.select(is_point, 1, power_heuristic(density_there, density_here))
-    return dr.select(met.smooth & (density_there > 0), value * incident * mis, 0)
+    mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, density))
+    return dr.select(met.smooth & (sample.density > 0), value * mis, 0)
 
 
 def _turn(path: Path, met: Met, context, lobe, turn, gathers, weight):

@@ -27,7 +27,7 @@ class SiteChoice:
     """The choice of sources by site; before :meth:`learn`, the usual one everywhere.
 
     ``usual`` (n,) float64: probabilities of sources, which sum to 1; ``share`` of the samples that keep them;
-    ``look(si, source, sampler)``: a direction to each source, (direction, radiance over density, shadow ray);
+    ``look(si, source, sampler)``: a direction to each source, :class:`vpl.split.emitter_samples.EmitterSample`;
     ``ignored``: indices of sources that nothing is learned of.
     """
 
@@ -82,9 +82,9 @@ class SiteChoice:
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(vertex))
         si.p, si.n = dr.gather(mi.Point3f, positions, vertex), mi.Normal3f(dr.gather(mi.Point3f, normals, vertex))
         si.sh_frame = mi.Frame3f(si.n)
-        direction, weight, ray = self._look(si, source, sampler)
-        light = channel_mean(weight) * dr.maximum(dr.dot(direction, si.n), 0)
-        seen = dr.select((light > 0) & ~self._scene.ray_test(ray, light > 0), mi.Float(1), 0)
+        sample = self._look(si, source, sampler)
+        light = channel_mean(sample.weight) * dr.maximum(dr.dot(sample.direction, si.n), 0)
+        seen = dr.select((light > 0) & ~self._scene.ray_test(sample.ray, light > 0), mi.Float(1), 0)
         dr.eval(light, seen)
         return light, seen
 

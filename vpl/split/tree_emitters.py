@@ -7,11 +7,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import finite_or_zero, rgb_to_spectrum
+from ..core.arrays import rgb_to_spectrum
 from ..lights.emission import bounding_sphere, solid_angle_radiance
 from ..lights.emitters import Emitters, registered_shapes
 from ..lights.virtual_lights import DeviceLights, VirtualLights, spot_falloff
 from ..points.camera_paths import emitted_towards
+from .emitter_samples import EmitterSample, MetEmitter
 from .emitter_tree import EmitterTree
 from .site_choice import SiteChoice
 
@@ -117,9 +118,8 @@ class TreeEmitters:
 
     # ---------------------- Directions ----------------------
 
-    def _toward(self, si, near, row, index, place, active):
-        """A direction to each emitter: (direction, radiance over density, density, whether the emitter is a point or a
-        direction, shadow ray); the density of points and directions is 1."""
+    def _toward(self, si, near, row, index, place, active) -> EmitterSample:
+        """A direction to each emitter."""
         target, toward = mi.Point3f(si.p), mi.Vector3f(0, 0, 1)
         weight, density, is_point, far = mi.UnpolarizedSpectrum(0), mi.Float(0), mi.Bool(False), mi.Bool(False)
         if self._omni is not None:
@@ -152,30 +152,26 @@ class TreeEmitters:
             toward, far = dr.select(here, -light.direction, toward), far | here
             weight = dr.select(here, rgb_to_spectrum(light.intensity), weight)
             density, is_point = dr.select(here, 1, density), is_point | here
-        return toward, weight, density, is_point, dr.select(far, si.spawn_ray(toward), si.spawn_ray_to(target))
+        ray = dr.select(far, si.spawn_ray(toward), si.spawn_ray_to(target))
+        return EmitterSample(toward, weight, density, is_point, ray)
 
-    def _look(self, si, source, sampler):
+    def _look(self, si, source, sampler) -> EmitterSample:
         """What is learned from: a direction to each source."""
         active = mi.Bool(True)
         near, row, index = self._draw(source, si.p, sampler.next_1d(), active)
-        toward, weight, _, _, ray = self._toward(si, near, row, index, sampler.next_2d(), active)
         _, within = self._tree.probability(row, si.p, near)
-        return toward, finite_or_zero(dr.select(near, weight / within, weight)), ray
+        return self._toward(si, near, row, index, sampler.next_2d(), active).chosen_with(dr.select(near, within, 1))
 
-    def sample(self, si, site, chosen, member, place, active):
+    def sample(self, si, site, chosen, member, place, active) -> EmitterSample:
         """As :meth:`vpl.split.next_event.UniformEmitters.sample`."""
         source, _, number = self.choice.draw(site, chosen, active)
         near, row, index = self._draw(source, si.p, number, active)
-        toward, weight, density, is_point, ray = self._toward(si, near, row, index, place, active)
         probability = self._probability(row, si.p, site, near)
         if self._distant:
             probability = dr.select(near, probability, self._distant_probability(index, site, active & ~near))
-        weight, density = finite_or_zero(weight / probability), density * probability
-        arrives = active & (dr.max(weight) > 0) & (density > 0)
-        blocked = self._scene.ray_test(ray, arrives)
-        return toward, dr.select(arrives & ~blocked, weight, 0), density, is_point
+        return self._toward(si, near, row, index, place, active).chosen_with(probability)
 
-    def met(self, vertex, site, ray, si, has_density, active):
+    def met(self, vertex, site, ray, si, has_density, active) -> MetEmitter:
         """As :meth:`vpl.split.next_event.UniformEmitters.met`."""
         origin = dr.zeros(mi.Interaction3f)
         origin.p = vertex
@@ -192,4 +188,4 @@ class TreeEmitters:
             pdf = self._environment.pdf_direction(origin, ds, here)
             probability = self._distant_probability(mi.UInt32(self._distant - 1), site, here)
             density = dr.select(here, pdf * probability, density)
-        return emitted_towards(self._emitters, si, active), density
+        return MetEmitter(emitted_towards(self._emitters, si, active), density)
