@@ -23,6 +23,7 @@ from vpl.split.pilot import Pilot
 from vpl.split.pixel_clusters import PixelClusters, light_clusters
 from vpl.split.surface_lights import surface_lights
 from vpl.split.view import View
+from vpl.split.view_lights import ViewLights
 from vpl.split.worth import Worth
 from vpl.transport.evaluation import Transport
 
@@ -38,6 +39,8 @@ _LEARNING_SHARE = 0.25
 _LEARNED_COST = 1.15
 # c of the split, as a multiple of the distance between lights, below which single ones show as blotches
 _TAPER = 6.0
+# Points on area emitters where these are virtual lights, as a share of the camera rays, and how few and many
+_EMITTER_SHARE, _EMITTER_LIGHTS = 0.1, (20_000, 200_000)
 # c of paths that are whole, beyond every distance, world units: nothing is left to virtual lights
 _WHOLE = 1e15
 # Pixels darker than this share of the image's mean are lit as precisely as if they had it
@@ -152,9 +155,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
         self._judge(view, pilot, chosen)
         mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
         lights = self._lights(view, pilot, chosen, clock)
-        gathering, c = (EVERYWHERE, lights.smallest_distance) if lights else (NOWHERE, _WHOLE)
-        limits = self._limits(view, c, self.max_depth, gathering)
-        expected = pilot.nearby(pilot.indirect, view.width, view.pixels) if lights else None
+        limits = self._limits(view, lights, self.max_depth, EVERYWHERE if lights.all else NOWHERE)
+        carried = pilot.indirect * bool(lights.surfaces) + pilot.direct * bool(lights.emitters)
+        expected = pilot.nearby(carried, view.width, view.pixels)
         radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
         # Whole pixels at a time
         most = max(_WAVEFRONT // view.samples, 1) * view.samples
@@ -165,7 +168,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
             dr.eval(lane)
             clock.begin(Stage.TRACED)
             found, vertices, later, _ = view.follow(lane, limits, 4, first)
-            if lights:
+            if lights.all:
                 nearby = expected[first // view.samples :][: -(-len(lane) // view.samples)]
                 seed = derived_seed(view.seed, 5, first)
                 found.radiance += self._gather(view, lights, chosen, (vertices, later), found, nearby, seed, clock)
@@ -182,44 +185,51 @@ class ManyLightsIntegrator(GatheringIntegrator):
         self.statistics |= {"balance": chosen.reason, "dropped": dropped, "seconds": clock.seconds}
         return dr.select(finite & (self.max_depth > 0), radiance, 0), valid & (self.max_depth > 0)
 
-    def _limits(self, view: View, c: float, max_depth: float, gathering: int, rr_depth: int | None = None) -> Limits:
+    def _limits(self, view: View, lights: ViewLights, max_depth: float, gathering: int, rr_depth: int = 0) -> Limits:
+        """Limits of paths, ``rr_depth`` 0 for that of the integrator."""
         longest = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF)))
-        roulette = dr.opaque(mi.UInt32, rr_depth or self.rr_depth)
-        gathers = dr.opaque(mi.UInt32, gathering)
-        return Limits(
-            longest, roulette, dr.opaque(mi.Float, c**2), gathers, view.worth, view.perturbed, self.hide_emitters
+        squared_c, of_emitters = (
+            dr.opaque(mi.Float, (x.smallest_distance if x else _WHOLE) ** 2) for x in (lights.surfaces, lights.emitters)
         )
+        return Limits(
+            longest, dr.opaque(mi.UInt32, rr_depth or self.rr_depth), squared_c, dr.opaque(mi.UInt32, gathering),
+            dr.opaque(mi.Bool, lights.emitters is not None), of_emitters, view.worth, view.perturbed,
+            self.hide_emitters,
+        )  # fmt: skip
 
     def _pilot(self, view: View) -> Pilot:
         """The pilot, from which emitters are learned."""
-        pairs = max(min(_PILOT, view.count // 4) // 2, 1)
-        apart = max(view.count // pairs // 2 * 2, 2)
-        lane = np.minimum(np.arange(pairs)[:, None] * apart + [0, 1], view.count - 1).reshape(-1)
-        lanes, limits = upload(mi.UInt32, lane), self._limits(view, _WHOLE, self.max_depth, AT_FIRST)
-
-        def followed() -> Pilot:
-            found, vertices, _, arrival = view.follow(lanes, limits, 1)
-            return Pilot.of(found, vertices, arrival, lane // view.samples)
-
-        pilot = followed()
+        pilot = self._followed(view, ViewLights())
         if not view.emission.choice.learn(*pilot.vertices, _rays(view.count), derived_seed(view.seed, 6)):
             return pilot
-        brightness, again = pilot.brightness(view.width), followed()
+        brightness, again = pilot.brightness(view.width), self._followed(view, ViewLights())
         if _LEARNED_COST * noise(again.radiance, brightness) < noise(pilot.radiance, brightness):
             return again
         # Where shadows are small, or gloss is what is noisy, sites may mislead
         view.emission.choice.forget()
         return pilot
 
+    def _followed(self, view: View, lights: ViewLights) -> Pilot:
+        """What is found by pairs of paths all over the image, always the same ones."""
+        lane = view.pairs(_PILOT)
+        limits = self._limits(view, lights, self.max_depth, AT_FIRST)
+        found, vertices, _, arrival = view.follow(upload(mi.UInt32, lane), limits, 1)
+        return Pilot.of(found, vertices, arrival, lane // view.samples)
+
     def _balance(self, view: View, pilot: Pilot) -> Balance:
         """What the pilot leads to."""
         if not self.virtual_lights:
             return without_lights("virtual_lights is off")
-        if self.max_depth <= 2:
-            return without_lights("no light is indirect at this max_depth")
         if view.perturbed.everywhere:
             return without_lights("bump or normal maps are in shape groups")
-        return balance(pilot.radiance, pilot.indirect, pilot.brightness(view.width), view.count, view.samples)
+        left = None
+        if view.emission.lights is not None and self.max_depth > 1:
+            carried = self._followed(view, ViewLights(emitters=self._emitter_lights(view, [])))
+            left = carried.radiance, carried.indirect
+        elif self.max_depth <= 2:
+            return without_lights("no light is indirect at this max_depth")
+        brightness = pilot.brightness(view.width)
+        return balance(pilot.radiance, pilot.indirect, brightness, view.count, view.samples, left)
 
     def _judge(self, view: View, pilot: Pilot, chosen: Balance) -> None:
         """What it is worth to follow paths of a view."""
@@ -233,7 +243,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         multiple = importance(relative * expected, relative * onward.sent, onward.edges, len(pilot.radiance), whole)
         if not np.isfinite(multiple):
             return
-        if chosen.light_paths:
+        if chosen.gathers:
             # The less noise there is besides, the more they are worth
             multiple *= (whole / max(chosen.noise, 1e-9)) ** 0.5
         self.statistics["worth"] = multiple
@@ -241,10 +251,22 @@ class ManyLightsIntegrator(GatheringIntegrator):
         nearby = pilot.nearby(pilot.radiance, view.width, view.pixels)
         view.importance = upload(mi.Float, multiple / judged_by(nearby))
 
-    def _lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> LightSet | None:
-        """Virtual lights and their tree; None where there are none."""
-        if chosen.light_paths == 0:
-            return None
+    def _lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> ViewLights:
+        """Virtual lights and their trees."""
+        surfaces = self._surface_lights(view, pilot, chosen, clock) if chosen.light_paths else None
+        if not chosen.emitters:
+            return ViewLights(surfaces)
+        clock.begin(Stage.TREE)
+        groups = view.emission.lights.groups(_points_on_emitters(view), derived_seed(view.seed, 7))
+        return ViewLights(surfaces, self._emitter_lights(view, groups))
+
+    def _emitter_lights(self, view: View, groups: list) -> LightSet:
+        """Lights that stand for emitters, as far as they are known."""
+        c = _TAPER * view.emission.lights.spacing(_points_on_emitters(view))
+        return LightSet(groups, c, self.max_depth, 0, 0, {})
+
+    def _surface_lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> LightSet | None:
+        """Virtual lights on surfaces; None where there are none."""
         clock.begin(Stage.LIGHTS)
         # None is followed where they are kept
         self.statistics["light_paths"] = 0
@@ -259,7 +281,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
     def _made_lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> TreedLights:
         """Virtual lights where the pilot's paths arrived, and their tree."""
         # The path from a light is shorter by the two edges between camera and light
-        limits = self._limits(view, _WHOLE, self.max_depth - 2, NOWHERE, rr_depth=1)
+        limits = self._limits(view, ViewLights(), self.max_depth - 2, NOWHERE, rr_depth=1)
         limits.hide_emitters, limits.worth = False, Worth.unknown()
         made = surface_lights(
             view.scene, view.emission, pilot.arrivals, chosen.light_paths, limits, derived_seed(view.seed, 2)
@@ -298,8 +320,13 @@ class ManyLightsIntegrator(GatheringIntegrator):
         traced = np.nan_to_num(download(channel_mean(found.radiance)), posinf=0, neginf=0)
         level = np.add.reduceat(np.maximum(traced, 0), np.arange(0, count, samples)) / samples + expected
         level = np.maximum(level, _DARK_FLOOR * level.mean())[clusters.pixel] * kept
-        transport = Transport(view.scene, _OPAQUE, lights)
-        shadow_rays = light_clusters(transport, clusters, level, chosen.error, _MAX_CUT, seed, lit)
+        shadow_rays = sum(
+            light_clusters(
+                Transport(view.scene, _OPAQUE, carrying), clusters, level, chosen.error, _MAX_CUT,
+                derived_seed(seed, 1, number), lit,
+            )
+            for number, carrying in enumerate(lights.all)
+        )  # fmt: skip
         clock.stop()
         more = {"shadow_rays": shadow_rays, "gather_points": len(rays), "clusters": clusters.count}
         add_statistics(self.statistics, more | {"later": alone})
@@ -310,6 +337,11 @@ class ManyLightsIntegrator(GatheringIntegrator):
 def _rays(paths: int) -> int:
     """How many rays there are to learn by which emitters light a scene."""
     return int(_LEARNING_SHARE * paths)
+
+
+def _points_on_emitters(view: View) -> int:
+    """How many points there are on area emitters."""
+    return int(np.clip(_EMITTER_SHARE * view.count, *_EMITTER_LIGHTS))
 
 
 mi.register_integrator("manylights", ManyLightsIntegrator)

@@ -142,16 +142,22 @@ def _second_representatives(tree: LightTree, intensity: np.ndarray, generator) -
 
 
 def light_tree(lights: VirtualLights, seed: int) -> DeviceTree:
-    """The light tree of one kind; a spot tree's cones are widened by the cut-off angles below each node."""
-    direction = None if lights.kind == "point" else lights.direction
+    """The light tree of one kind."""
     generator = np.random.default_rng(seed)
+    tree = _tree_of(lights, generator)
+    second = _second_representatives(tree, lights.intensity.mean(1), generator)
+    return DeviceTree(lights.kind, tree, second)
+
+
+def _tree_of(lights: VirtualLights, generator) -> LightTree:
+    """The tree over lights of one kind; a spot tree's cones are widened by the cut-off angles below each node."""
+    direction = None if lights.kind == "point" else lights.direction
     tree = build_light_tree(lights.position, direction, lights.intensity, generator)
     if lights.kind == "spot":
         half_angle = np.arccos(np.clip(tree.records[:, CONE_COS].astype(np.float64), -1, 1))
         half_angle += largest_below(tree, lights.cone[:, 0])
         tree.records[:, CONE_COS] = np.maximum(np.cos(np.minimum(half_angle, np.pi)) - COSINE_ROUNDING, -1)
-    second = _second_representatives(tree, lights.intensity.mean(1), generator)
-    return DeviceTree(lights.kind, tree, second)
+    return tree
 
 
 @dataclass
@@ -170,8 +176,7 @@ class ScatteredGroup(LightGroup):
     @classmethod
     def of(cls, lights: VirtualLights, seed: int) -> ScatteredGroup:
         """Lights of one kind, with their tree."""
-        generator = np.random.default_rng(seed)
-        tree = build_light_tree(lights.position, lights.direction, lights.intensity, generator)
+        tree = _tree_of(lights, np.random.default_rng(seed))
         first, last = (upload(mi.UInt32, column) for column in _leaf_ranges(tree).T)
         intensity = lights.intensity.mean(1, dtype=np.float64)
         return cls(

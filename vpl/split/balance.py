@@ -6,7 +6,7 @@ image.  Costs are in units of one path from the camera.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,8 +16,9 @@ from .worth import survival_of
 _FIXED_COST, _LIGHT_PATH_COST = 200_000, 4.0
 # Share of the indirect light's variance that lights take away where they carry it
 _GAIN = 0.9
-# Variance of what is left that samples of a pixel, spread well, leave at best, next to that of the pilot's
-_SPREAD = 0.5
+# Variance of what is left that samples of a pixel, spread well, leave at best, next to that of the pilot's; where there
+# are more emitters than samples, these are hardly spread over them
+_SPREAD, _MANY_EMITTERS_SPREAD = 0.5, 1.0
 # Relative standard error that one set of lights leaves in the mean of the image
 _SET_ERROR = 0.03
 # Relative variance that a set of lights leaves in a pixel, times the paths that it was made by
@@ -26,6 +27,8 @@ _LIGHT_NOISE = 200.0
 _SHARES, _FEWEST, _MOST = (1 / 64, 1 / 8), 20_000, 500_000
 # Relative variance that cuts leave, times shadow rays a pixel; and the cost of one of these rays
 _CUT_NOISE, _RAY_COST = 0.3, 0.2
+# Noise and rays of cuts of lights that stand for emitters, next to those of lights on surfaces
+_EMITTER_CUTS = 0.4
 # Shadow rays for each sample of a pixel, at least and at most
 _RAYS = (0.25, 8.0)
 # Bound on a pair of clusters, relative to its pixel, with which a cut has so many rays, and how the two go together
@@ -41,57 +44,97 @@ _LARGEST_PRODUCT = 0.95
 _PAYS_BELOW = 1.0
 # Gather vertices of a pixel: one of so many samples, and at most so many
 _SAMPLES_A_VERTEX, _MOST_VERTICES = 4, 16
+_TINY = np.finfo(np.float64).tiny
 
 
 @dataclass(frozen=True)
 class Balance:
-    """``light_paths``: 0 where lights do not pay; ``error`` of cuts; ``vertices`` of a pixel that are lit;
-    ``noise`` that is left of a path from the camera, relative variance; ``reason``, in words."""
+    """``light_paths``: 0 where lights on surfaces do not pay; ``emitters``: whether lights stand for emitters, too;
+    ``error`` of cuts; ``vertices`` of a pixel that are lit; ``noise`` that is left of a path from the camera, relative
+    variance; ``reason``, in words."""
 
     light_paths: int
+    emitters: bool
     error: float
     vertices: int
     noise: float
     reason: str
 
+    @property
+    def gathers(self) -> bool:
+        """Whether there are any lights."""
+        return self.emitters or self.light_paths > 0
 
-def balance(radiance: np.ndarray, indirect: np.ndarray, brightness: np.ndarray, paths: int, samples: int) -> Balance:
+
+@dataclass
+class Noise:
+    """Relative variance of a path from the camera: ``whole``, and ``direct``: without light that came by way of
+    surfaces that virtual lights may stand for; ``clumps``: relative variance of that light alone."""
+
+    whole: float
+    direct: float
+    clumps: float
+
+    @classmethod
+    def of(cls, radiance: np.ndarray, indirect: np.ndarray, brightness: np.ndarray, spread: float) -> Noise:
+        """That of a pilot, see :func:`balance`, when samples that are spread well leave a share ``spread``."""
+        whole, direct = noise(radiance, brightness), noise(radiance - indirect, brightness)
+        whole -= (1 - spread) * min(direct, whole)
+        squares, total = np.sum(indirect**2), np.sum(indirect)
+        return cls(whole, min(spread * direct, whole), len(indirect) * squares / total**2 if total else 0.0)
+
+
+def balance(radiance, indirect, brightness: np.ndarray, paths: int, samples: int, left=None) -> Balance:
     """The balance for ``paths`` camera paths, ``samples`` a pixel.
 
     ``radiance`` (n,): what a pilot's paths found, two next to each other from one pixel; ``indirect`` (n,): the part of
-    it that came by way of surfaces that virtual lights may stand for; ``brightness`` (n,): of the image around.
+    it that came by way of surfaces that virtual lights may stand for; ``brightness`` (n,): of the image around;
+    ``left``: (radiance, indirect) of the same paths where lights stand for emitters, None if they may not.
     """
-    if not indirect.any():
+    spread = max(_SPREAD if left is None else _MANY_EMITTERS_SPREAD, samples**-0.5)
+    whole = Noise.of(radiance, indirect, brightness, spread)
+    options = [_priced(whole, False, paths, samples)] if indirect.any() else []
+    if left is not None:
+        others = Noise.of(*left, brightness, spread)
+        options += [_priced(others, True, paths, samples)] if left[1].any() else []
+        options.append(_priced(Noise(others.whole, others.whole, 0.0), True, paths, samples))
+    if not options:
         return without_lights("no light comes by way of surfaces that virtual lights could stand for")
-    whole, direct = noise(radiance, brightness), noise(radiance - indirect, brightness)
-    spread = max(_SPREAD, samples**-0.5)
-    whole -= (1 - spread) * min(direct, whole)
-    direct = min(spread * direct, whole)
-    share = 1 - direct / max(whole, np.finfo(np.float64).tiny)
-    # Relative variance of what a path from the camera brings by way of lights
-    variance = len(indirect) * np.sum(indirect**2) / np.sum(indirect) ** 2
-    rest = whole * (1 - _GAIN * share)
-    # The least of (noise of paths / samples + noise of lights / their paths) × cost
-    balanced = (_LIGHT_NOISE * samples * paths / (_LIGHT_PATH_COST * max(rest, 1e-9))) ** 0.5
-    wanted = np.clip(max(balanced, variance / _SET_ERROR**2), _SHARES[0] * paths, _SHARES[1] * paths)
-    light_paths = int(np.clip(wanted, _FEWEST, _MOST))
+    product, cost, best = min(options, key=lambda option: option[0])
+    left_over = best.noise / max(whole.whole, _TINY)
+    if product > _PAYS_BELOW * whole.whole:
+        price = f"virtual lights would cost {cost - 1:.2g} times as much as the paths"
+        return without_lights(f"{price} and leave {left_over:.0%} of the noise")
+    return replace(best, reason=f"virtual lights take {1 - left_over:.0%} of the noise away")
+
+
+def _priced(found: Noise, emitters: bool, paths: int, samples: int) -> tuple[float, float, Balance]:
+    """(Variance × cost, cost, what is best) with lights on surfaces, if these have anything to carry, and with lights
+    that stand for ``emitters``."""
+    share = 1 - found.direct / max(found.whole, _TINY)
+    rest = found.whole * (1 - _GAIN * share)
+    light_paths = 0
+    if found.clumps:
+        # The least of (noise of paths / samples + noise of lights / their paths) × cost
+        balanced = (_LIGHT_NOISE * samples * paths / (_LIGHT_PATH_COST * max(rest, 1e-9))) ** 0.5
+        wanted = np.clip(max(balanced, found.clumps / _SET_ERROR**2), _SHARES[0] * paths, _SHARES[1] * paths)
+        light_paths = int(np.clip(wanted, _FEWEST, _MOST))
     # The least of (noise of paths / samples + noise of cuts / rays) × (samples + rays × their cost), rays of a pixel
+    cuts = _EMITTER_CUTS * emitters + (light_paths > 0)
     rays = samples * np.clip((_CUT_NOISE / (_RAY_COST * max(rest, 1e-9))) ** 0.5, *_RAYS)
     error = float(np.clip(_ERROR * (rays / _RAYS_AT_ERROR) ** -_SLOPE, _FINEST, _COARSEST))
     # A cut has some nodes, however few rays are wanted
     rays = _RAYS_AT_ERROR * (error / _ERROR) ** (-1 / _SLOPE)
     fixed = (_FIXED_COST + _LIGHT_PATH_COST * light_paths) / paths
-    cost = 1 + _RAY_COST * rays / samples + fixed
-    if cost * (rest + _CUT_NOISE * samples / rays) > _PAYS_BELOW * whole:
-        price = f"virtual lights would cost {cost - 1:.2g} times as much as the paths"
-        return without_lights(f"{price} and leave {1 - _GAIN * share:.0%} of the noise")
+    cost = 1 + cuts * _RAY_COST * rays / samples + fixed
+    left = rest + cuts * _CUT_NOISE * samples / rays
     vertices = int(np.clip(samples // _SAMPLES_A_VERTEX, 1, _MOST_VERTICES))
-    return Balance(light_paths, error, vertices, rest, f"{share:.0%} of the noise is that of indirect light")
+    return cost * left, cost, Balance(light_paths, emitters, error, vertices, rest, "")
 
 
 def without_lights(reason: str) -> Balance:
     """The balance of scenes in which virtual lights do not pay."""
-    return Balance(0, 0.0, 0, 0.0, reason)
+    return Balance(0, False, 0.0, 0, 0.0, reason)
 
 
 def noise(values: np.ndarray, brightness: np.ndarray) -> float:

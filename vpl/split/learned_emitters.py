@@ -25,6 +25,9 @@ class LearnedEmitters:
     """Emitters and regions of the environment, by site; before anything is learned, every emitter has the same
     probability everywhere, or that of its ``sampling_weight``."""
 
+    # No virtual lights stand for emitters
+    lights = None
+
     def __init__(self, scene):
         self._scene, self._emitters, self._count = scene, scene.emitters_dr(), len(scene.emitters())
         # Emitters with a weight of 0 are never sampled, as in Mitsuba

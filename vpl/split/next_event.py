@@ -41,6 +41,9 @@ def _in_tree(scene, rays: int) -> TreeEmitters | None:
 class UniformEmitters:
     """Mitsuba's own choice: every emitter with the same probability."""
 
+    # No virtual lights stand for emitters
+    lights = None
+
     def __init__(self, scene):
         self._scene, self.choice = scene, NoChoice()
 

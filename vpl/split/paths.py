@@ -23,7 +23,8 @@ NOWHERE, AT_FIRST, EVERYWHERE = 0, CONNECTING, PAST
 @dataclass
 class Limits:
     """``max_depth`` (edges), ``rr_depth``: as in ``path``, UInt32; ``squared_c``: of the split, world units²;
-    ``gathering``: where lights are gathered, NOWHERE, AT_FIRST or EVERYWHERE; all opaque.
+    ``gathering``: where lights are gathered, NOWHERE, AT_FIRST or EVERYWHERE; ``emitters_carried``: whether virtual
+    lights stand for emitters, too, and ``emitters_squared_c`` of these; all opaque.
 
     ``worth`` of following paths; ``perturbed``: shapes without a floor; ``hide_emitters``: of Python.
     """
@@ -32,6 +33,8 @@ class Limits:
     rr_depth: object
     squared_c: object
     gathering: object
+    emitters_carried: object
+    emitters_squared_c: object
     worth: Worth
     perturbed: Perturbed
     hide_emitters: bool
@@ -191,7 +194,7 @@ class Gathered:
         si = met.si
         seeks = met.smooth & (path.state == SEEKING)
         gathers = (seeks | (met.smooth & (limits.gathering == EVERYWHERE))) & agrees(si, met.side)
-        gathers &= (dr.max(met.floor) > 0) & (path.depth + 2 < limits.max_depth)
+        gathers &= (dr.max(met.floor) > 0) & (limits.emitters_carried | (path.depth + 2 < limits.max_depth))
         weight = path.throughput * met.floor - path.carried
         gathers &= dr.all(dr.abs(weight) <= LARGEST_VALUE)
         weight = dr.select(gathers, weight, 0)

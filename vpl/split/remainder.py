@@ -17,7 +17,7 @@ import mitsuba as mi
 from ..core.arrays import channel_mean, select_record
 from ..core.loops import recorded_once
 from ..direct.emitter_sampling import power_heuristic
-from .emitter_samples import EmitterSample
+from .emitter_samples import EmitterSample, MetEmitter, carried_by_emitters
 from .floors import agrees, carried_share
 from .gather_vertices import Arrival
 from .paths import CONNECTING, PAST, SEEKING, FirstEdge, Found, Gains, Gathered, Limits, Met, Path
@@ -44,7 +44,7 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
         # Emission, by BSDF sampling
         emitter = emission.met(path.vertex, path.site, path.ray, met.si, ~path.delta, path.active & ~met.hidden)
         mis = power_heuristic(path.density, emitter.density)
-        gains.add(path.throughput * emitter.radiance * mis, path.depth + 1, sampler)
+        gains.add(_left_of_emitter(path, emitter, limits) * emitter.radiance * mis, path.depth + 1, sampler)
         connects = _carry(path, met, limits, gains.radiance, gathered)
         _end_by_worth(path, met, connects, limits, sampler)
         gathers, weight = gathered.add(path, met, limits, sampler)
@@ -53,7 +53,8 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
         path.scattered += dr.select(met.smooth, 1, 0)
         path.site, member = emission.choice.site(met.si, met.side), sampler.next_1d()
         sample = emission.sample(met.si, path.site, chosen, member, place, met.smooth)
-        gains.add(_lit(path, met, sample, context) * sample.arriving(scene, met.smooth), path.depth + 2, sampler)
+        lit = _lit(path, met, sample, weight, context, limits, sampler)
+        gains.add(lit * sample.arriving(scene, dr.max(dr.abs(lit)) > 0), path.depth + 2, sampler)
         lobe = dr.select(met.smooth, lobe, sampler.next_1d())
         turn = dr.select(met.smooth, turn, sampler.next_2d())
         kept = _turn(path, met, context, lobe, turn, gathers, weight)
@@ -102,12 +103,30 @@ def _end_by_worth(path: Path, met: Met, connects, limits: Limits, sampler) -> No
     path.carried /= survival
 
 
-def _lit(path: Path, met: Met, sample: EmitterSample, context):
-    """What paths bring of the light of the emitters that were sampled, less what virtual lights carry."""
+def _left_of_emitter(path: Path, emitter: MetEmitter, limits: Limits):
+    """Throughput with which an emitter is met, less what virtual lights that stand for it carry."""
+    if emitter.nearness is None:
+        return path.throughput
+    w = carried_by_emitters(emitter.nearness, limits.emitters_squared_c, path.cosine)
+    carried = limits.emitters_carried & (path.state == CONNECTING)
+    return path.throughput - dr.select(carried, path.carried * w, 0)
+
+
+def _lit(path: Path, met: Met, sample: EmitterSample, weight, context, limits: Limits, sampler):
+    """What paths bring of the light of the emitters that were sampled, less what virtual lights carry.  ``weight``: of
+    lights that are gathered here."""
     local = met.si.to_local(sample.direction)
     value, density = met.bsdf.eval_pdf(context, met.si, local, met.smooth)
-    value = path.throughput * mi.unpolarized_spectrum(value)
-    value -= dr.select(local.z * met.side > 0, path.carried * dr.abs(local.z), 0)
+    full = path.throughput * mi.unpolarized_spectrum(value)
+    cosine = dr.select(local.z * met.side > 0, dr.abs(local.z), 0)
+    value = full - path.carried * cosine
+    if sample.nearness is not None:
+        w = carried_by_emitters(sample.nearness, limits.emitters_squared_c, cosine)
+        value -= dr.select(limits.emitters_carried, weight * (w * cosine), 0)
+        # Few shadow rays, where little is left
+        left = dr.max(dr.abs(value)) / dr.max(dr.abs(full))
+        left = dr.select(limits.emitters_carried & dr.isfinite(left), dr.clip(left, _LEAST_SURVIVAL, 1), 1)
+        value = dr.select(sampler.next_1d() < left, value / left, 0)
     mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, density))
     return dr.select(met.smooth & (sample.density > 0), value * mis, 0)
 

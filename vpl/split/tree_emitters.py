@@ -7,11 +7,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import rgb_to_spectrum
+from ..core.arrays import rgb_to_spectrum, upload
 from ..lights.emission import bounding_sphere, solid_angle_radiance
 from ..lights.emitters import Emitters, registered_shapes
 from ..lights.virtual_lights import DeviceLights, VirtualLights, spot_falloff
 from ..points.camera_paths import emitted_towards
+from .emitter_lights import EmitterLights
 from .emitter_samples import EmitterSample, MetEmitter
 from .emitter_tree import EmitterTree
 from .site_choice import SiteChoice
@@ -45,8 +46,13 @@ class TreeEmitters:
         omni.kind = "spot"
         self._omni, self._areas = DeviceLights(omni) if omni.count else None, emitters.area.count
         self._first_area = omni.count
-        boxes = {index: shape.bbox() for index, shape in registered_shapes(scene) if shape.is_emitter()}
-        boxes = [boxes[int(index)] for index in emitters.area.shape_index]
+        shapes = {index: shape for index, shape in registered_shapes(scene) if shape.is_emitter()}
+        shapes = [shapes[int(index)] for index in emitters.area.shape_index]
+        boxes = [shape.bbox() for shape in shapes]
+        # With the normals of vertices, Mitsuba's densities and the sides that shine are not those of lights
+        smooth = [x.is_mesh() and x.has_vertex_normals() and not x.has_face_normals() for x in shapes]
+        self.lights = EmitterLights(emitters, omni, ~np.array(smooth, bool))
+        self._is_carried = upload(mi.UInt32, np.append(self.lights.carried, False))
         center = np.array([np.array(box.center()) for box in boxes], np.float64).reshape(-1, 3)
         radius = np.array([0.5 * np.linalg.norm(np.array(box.extents())) for box in boxes], np.float64)
         intensity = np.concatenate([omni.intensity.mean(1), emitters.area.radiance.mean(1) * emitters.area.area])
@@ -122,6 +128,7 @@ class TreeEmitters:
         """A direction to each emitter."""
         target, toward = mi.Point3f(si.p), mi.Vector3f(0, 0, 1)
         weight, density, is_point, far = mi.UnpolarizedSpectrum(0), mi.Float(0), mi.Bool(False), mi.Bool(False)
+        nearness = mi.Float(dr.inf)
         if self._omni is not None:
             here = near & (row < self._first_area)
             light = self._omni.gather(row, here)
@@ -133,6 +140,7 @@ class TreeEmitters:
             target, toward = dr.select(here, light.position, target), dr.select(here, direction, toward)
             weight = dr.select(here, rgb_to_spectrum(light.intensity) * falloff, weight)
             density, is_point = dr.select(here, 1, density), is_point | here
+            nearness = dr.select(here, 0, nearness)
         if self._areas:
             here, of_area = near & (row >= self._first_area), row - self._first_area
             ds = self._emitters.area.sample_direction(of_area, si, place, here)
@@ -140,6 +148,7 @@ class TreeEmitters:
             radiance = self._emitters.area.emitted_in_front(of_area, ds, facing)
             target, toward = dr.select(here, ds.p, target), dr.select(here, ds.d, toward)
             weight, density = dr.select(facing, radiance / ds.pdf, weight), dr.select(facing, ds.pdf, density)
+            nearness = dr.select(here, self._nearness(of_area, ds.n, ds.d, ds.dist, here), nearness)
         if self._environment is not None:
             here = active & ~near & (index == self._distant - 1)
             ds, radiance = self._environment.sample_direction(si, place, here)
@@ -153,7 +162,12 @@ class TreeEmitters:
             weight = dr.select(here, rgb_to_spectrum(light.intensity), weight)
             density, is_point = dr.select(here, 1, density), is_point | here
         ray = dr.select(far, si.spawn_ray(toward), si.spawn_ray_to(target))
-        return EmitterSample(toward, weight, density, is_point, ray)
+        return EmitterSample(toward, weight, density, is_point, ray, nearness)
+
+    def _nearness(self, row, normal, direction, distance, active):
+        """See :class:`vpl.split.emitter_samples.EmitterSample`, of area emitters."""
+        carried = dr.gather(mi.UInt32, self._is_carried, row, active) == 1
+        return dr.select(carried, dr.abs(dr.dot(normal, direction)) / dr.square(distance), dr.inf)
 
     def _look(self, si, source, sampler) -> EmitterSample:
         """What is learned from: a direction to each source."""
@@ -177,15 +191,16 @@ class TreeEmitters:
         origin.p = vertex
         ds = dr.zeros(mi.DirectionSample3f)
         ds.p, ds.n, ds.uv, ds.d, ds.dist = si.p, si.n, si.uv, ray.d, si.t
-        density = mi.Float(0)
+        density, nearness = mi.Float(0), mi.Float(dr.inf)
         if self._areas:
             found = self._emitters.area.row(si, active & has_density & si.is_valid())
             here, row = active & has_density & si.is_valid() & (found > 0), found - 1
             pdf = self._emitters.area.on_shape("pdf_direction", row, origin, ds, here)
             density = dr.select(here, pdf * self._probability(row + self._first_area, vertex, site, here), density)
+            nearness = dr.select(here, self._nearness(row, si.n, ray.d, si.t, here), nearness)
         if self._environment is not None:
             here = active & has_density & ~si.is_valid()
             pdf = self._environment.pdf_direction(origin, ds, here)
             probability = self._distant_probability(mi.UInt32(self._distant - 1), site, here)
             density = dr.select(here, pdf * probability, density)
-        return MetEmitter(emitted_towards(self._emitters, si, active), density)
+        return MetEmitter(emitted_towards(self._emitters, si, active), density, nearness)

@@ -43,6 +43,12 @@ class View:
         """Numbers of the pixels."""
         return np.arange(-(-self.count // self.samples))
 
+    def pairs(self, most: int) -> np.ndarray:
+        """Some of the rays, two next to each other at a time, evenly over the image: so many at most."""
+        pairs = max(min(most, self.count // 4) // 2, 1)
+        apart = max(self.count // pairs // 2 * 2, 2)
+        return np.minimum(np.arange(pairs)[:, None] * apart + [0, 1], self.count - 1).reshape(-1)
+
     def follow(self, lane, limits: Limits, *stream: int):
         """Follow the camera rays ``lane`` (UInt32): see :func:`vpl.split.remainder.follow`."""
         seed, ray = derived_seed(self.seed, *stream), self.ray
