@@ -258,7 +258,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
             return ViewLights(surfaces)
         clock.begin(Stage.TREE)
         groups = view.emission.lights.groups(_points_on_emitters(view), derived_seed(view.seed, 7))
-        return ViewLights(surfaces, self._emitter_lights(view, groups))
+        emitters = self._emitter_lights(view, groups)
+        self.statistics["lights"] = self.statistics.get("lights", {}) | {"emitters": emitters.count}
+        return ViewLights(surfaces, emitters)
 
     def _emitter_lights(self, view: View, groups: list) -> LightSet:
         """Lights that stand for emitters, as far as they are known."""

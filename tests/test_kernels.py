@@ -1,5 +1,7 @@
 """Kernels: another size of the image, number of samples or seed compiles none but Mitsuba's own."""
 
+import gc
+
 import drjit as dr
 import mitsuba as mi
 import pytest
@@ -16,6 +18,8 @@ SETTINGS = {"manylights": {}, "adaptivedirect": {}, "unoccludeddirect": {}}
 def compiled():
     """A function that says how many kernels were launched since it was last called that never were before."""
     seen = set()
+    # Kernels hold the code of all scenes that are alive, of which none is to be let go in between
+    gc.collect()
 
     def count():
         launched = {one["hash"] for one in dr.kernel_history() if one["type"] == dr.KernelType.JIT}

@@ -17,12 +17,15 @@ In the order to read in:
 - ``site_choice``: a choice among sources of light by what vertices of a pilot see, site by site
 - ``learned_emitters``: emitters, and regions of the environment, chosen so
 - ``tree_emitters``: many emitters, chosen so by clusters
+- ``emitter_samples``: what these choices return: directions to emitters, and emitters that were met
 - ``emitter_tree``: a tree over emitters with a place, by which one is drawn for a vertex
 - ``numbers``: random numbers that are spread well over the samples of a pixel
 - ``view``: camera rays, and paths that begin with them
 - ``gather_vertices``: vertices where virtual lights are gathered, and which of the later ones are
 - ``pilot``: a few paths that tell where light is wanted
 - ``balance``: what the pilot decides: whether lights pay, how many, how finely they are clustered
+- ``view_lights``: the lights of a view
+- ``emitter_lights``: many emitters as virtual lights, which cuts stand for instead of a sample of one
 - ``cells``: boxes where camera paths arrive, and random lines that meet surfaces in them with a known density
 - ``surface_lights``: a virtual light wherever such a line meets a surface
 - ``kept_lights``: these, for other cameras in the same scene

@@ -18,6 +18,9 @@ from ..lights.emitters import Emitters
 from ..lights.light_set import ScatteredGroup, area_lights
 from ..lights.virtual_lights import VirtualLights
 
+# Cosine of the angle by which normals of vertices may differ from that of the surface
+_SAME_NORMAL = 0.9999
+
 
 @dataclass
 class EmitterLights:
@@ -47,3 +50,20 @@ class EmitterLights:
             on_areas = area_lights(replace(self.emitters, area=area), count, derived_seed(seed, 0))
             lights.append(replace(on_areas, kind="surface", facing=on_areas.direction).without_bad()[0])
         return [ScatteredGroup.of(x, derived_seed(seed, 1, k)) for k, x in enumerate(lights) if x.count]
+
+
+def has_true_normals(shape) -> bool:
+    """Whether the normals of an emitting shape are those of its surface.  Elsewhere, on meshes with other normals at
+    their vertices, Mitsuba's densities and the sides that shine go by these: what it makes of them no light does."""
+    if not shape.is_mesh() or shape.has_face_normals() or not shape.has_vertex_normals():
+        return True
+    faces = np.array(shape.faces_buffer()).reshape(-1, 3)
+    positions, normals = (
+        np.array(buffer, np.float64).reshape(-1, 3)
+        for buffer in (shape.vertex_positions_buffer(), shape.vertex_normals_buffer())
+    )
+    corner, second, third = (positions[faces[:, k]] for k in range(3))
+    flat = np.cross(second - corner, third - corner)
+    length = np.linalg.norm(flat, axis=1)
+    cosine = np.abs((normals[faces] * flat[:, None]).sum(2)) / np.maximum(length, np.finfo(np.float64).tiny)[:, None]
+    return bool((cosine[length > 0] > _SAME_NORMAL).all())

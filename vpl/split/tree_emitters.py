@@ -12,7 +12,7 @@ from ..lights.emission import bounding_sphere, solid_angle_radiance
 from ..lights.emitters import Emitters, registered_shapes
 from ..lights.virtual_lights import DeviceLights, VirtualLights, spot_falloff
 from ..points.camera_paths import emitted_towards
-from .emitter_lights import EmitterLights
+from .emitter_lights import EmitterLights, has_true_normals
 from .emitter_samples import EmitterSample, MetEmitter
 from .emitter_tree import EmitterTree
 from .site_choice import SiteChoice
@@ -49,9 +49,7 @@ class TreeEmitters:
         shapes = {index: shape for index, shape in registered_shapes(scene) if shape.is_emitter()}
         shapes = [shapes[int(index)] for index in emitters.area.shape_index]
         boxes = [shape.bbox() for shape in shapes]
-        # With the normals of vertices, Mitsuba's densities and the sides that shine are not those of lights
-        smooth = [x.is_mesh() and x.has_vertex_normals() and not x.has_face_normals() for x in shapes]
-        self.lights = EmitterLights(emitters, omni, ~np.array(smooth, bool))
+        self.lights = EmitterLights(emitters, omni, np.array([has_true_normals(shape) for shape in shapes], bool))
         self._is_carried = upload(mi.UInt32, np.append(self.lights.carried, False))
         center = np.array([np.array(box.center()) for box in boxes], np.float64).reshape(-1, 3)
         radius = np.array([0.5 * np.linalg.norm(np.array(box.extents())) for box in boxes], np.float64)

@@ -1,0 +1,163 @@
+"""Emitters as virtual lights: what they carry and what is traced is, together, what `path` finds."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from vpl.split import balance as balances
+
+from .catalogue import EMITTERS, rgb
+from .conftest import assert_same_mean_over_seeds, closed_box, render
+from .test_tree_emitters import bulbs, emission_of, interactions, panels, vertices
+
+
+def spots(number, rng):
+    """Spot emitters in the closed box that shine wherever they happen to."""
+    found = {}
+    for i in range(number):
+        start, end = rng.uniform(-0.9, 0.9, (2, 3))
+        turn = mi.ScalarTransform4f().look_at(list(start), list(end), [0.1, 0.2, 1])
+        found[f"spot{i}"] = {"type": "spot", "to_world": turn, "intensity": rgb(float(rng.uniform(0.5, 3)))}
+    return found
+
+
+def balls(number, rng):
+    """Small spheres that shine, in the closed box."""
+    places = rng.uniform(-0.8, 0.8, (number, 3))
+    return {
+        f"ball{i}": {
+            "type": "sphere", "center": list(place), "radius": 0.03,
+            "emitter": {"type": "area", "radiance": rgb(float(rng.uniform(1, 8)))},
+        }
+        for i, place in enumerate(places)
+    }  # fmt: skip
+
+
+def smooth_tile(folder):
+    """A mesh that shines, whose vertices have normals that are not its own."""
+    mesh = mi.Mesh("tile", 4, 2, has_vertex_normals=True)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = [-0.3, 0.5, -0.3, 0.3, 0.5, -0.3, 0.3, 0.5, 0.3, -0.3, 0.5, 0.3]
+    parameters["vertex_normals"] = [-0.5, -0.8, -0.3, 0.5, -0.8, -0.3, 0.5, -0.8, 0.3, -0.5, -0.8, 0.3]
+    parameters["faces"] = [0, 1, 2, 0, 2, 3]
+    parameters.update()
+    mesh.write_ply(str(folder / "tile.ply"))
+    emitter = {"type": "area", "radiance": rgb(2.0)}
+    return {"tile": {"type": "ply", "filename": str(folder / "tile.ply"), "emitter": emitter}}
+
+
+@pytest.fixture
+def always(monkeypatch):
+    """Lights stand for emitters even in small images."""
+    priced = balances._priced
+
+    def cheap(found, emitters, paths, samples):
+        product, cost, best = priced(found, emitters, paths, samples)
+        return (product if emitters else np.inf), cost, best
+
+    monkeypatch.setattr(balances, "_priced", cheap)
+    monkeypatch.setattr(balances, "_PAYS_BELOW", np.inf)
+
+
+def assert_lights_stand_for_emitters(integrator, scene, spp):
+    mi.render(scene, integrator=integrator, spp=spp)
+    assert integrator.statistics["lights"]["emitters"] > 0
+
+
+# ---------------------- Expectation ----------------------
+
+
+@pytest.mark.parametrize("max_depth", [2, 3, -1])
+@pytest.mark.parametrize("floor", ["plastic", "diffuse"])
+def test_the_mean_over_seeds_is_that_of_path(floor, max_depth, always):
+    rng = np.random.default_rng(5)
+    box = closed_box(panels(40, rng) | spots(20, rng) | bulbs(20, rng) | balls(20, rng) | EMITTERS["envmap"](), 16)
+    box["floor"]["bsdf"] = {"type": "roughplastic", "alpha": 0.2} if floor == "plastic" else {"type": "diffuse"}
+    del box["left"]
+    scene = mi.load_dict(box)
+    integrator = mi.load_dict({"type": "manylights", "max_depth": max_depth})
+    assert_lights_stand_for_emitters(integrator, scene, 64)
+    pairs = [
+        [render(scene, name, 64, seed, max_depth=max_depth) for name in ("manylights", "path")] for seed in range(12)
+    ]
+    assert_same_mean_over_seeds(pairs)
+
+
+@pytest.mark.parametrize("integrator", [{"hide_emitters": True}, {"rr_depth": 1}])
+def test_emitters_that_are_hidden_and_paths_that_end_soon_change_no_mean(integrator, always):
+    rng = np.random.default_rng(6)
+    scene = mi.load_dict(closed_box(panels(40, rng) | balls(40, rng), 16))
+    pairs = [[render(scene, name, 64, seed, **integrator) for name in ("manylights", "path")] for seed in range(12)]
+    assert_same_mean_over_seeds(pairs)
+
+
+def test_no_lights_stand_for_emitters_with_normals_of_vertices(tmp_path, always):
+    """Of these Mitsuba's own densities are not those of the surface: what it makes of them is found by `path`'s way."""
+    rng = np.random.default_rng(7)
+    scene = mi.load_dict(closed_box(bulbs(64, rng) | smooth_tile(tmp_path), 16))
+    emission = emission_of(scene, rng, False)
+    assert emission.lights.carried.tolist() == [False]
+    assert [group.kind for group in emission.lights.groups(1000, 0)] == ["spot"]
+    pairs = [[render(scene, name, 64, seed, max_depth=3) for name in ("manylights", "path")] for seed in range(12)]
+    assert_same_mean_over_seeds(pairs)
+
+
+# ---------------------- Lights ----------------------
+
+
+@pytest.mark.parametrize("shapes, close", [(panels, 0.97), (balls, 0.9)], ids=["panels", "balls"])
+def test_who_samples_an_emitter_and_who_meets_it_agree_on_what_is_carried(shapes, close):
+    rng = np.random.default_rng(1)
+    scene = mi.load_dict(closed_box(shapes(100, rng) | bulbs(10, rng)))
+    emission, si = emission_of(scene, rng, True), interactions(*vertices(rng))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(1, dr.width(si.p))
+    site = emission.choice.site(si, mi.Float(1))
+    numbers = sampler.next_1d(), sampler.next_1d(), sampler.next_2d()
+    sample = emission.sample(si, site, *numbers, mi.Bool(True))
+    ray = si.spawn_ray(sample.direction)
+    met = emission.met(si.p, site, ray, scene.ray_intersect(ray), mi.Bool(True), mi.Bool(True))
+    lit = np.array((dr.max(sample.arriving(scene, True)) > 0) & ~sample.is_point)
+    assert lit.sum() > 100
+    # Directions to the edge of a ball meet it elsewhere
+    assert np.isclose(np.array(met.nearness), np.array(sample.nearness), rtol=5e-2)[lit].mean() > close
+    points = np.array(sample.is_point)
+    assert (np.array(sample.nearness)[points] == 0).all() and np.isinf(np.array(met.nearness)[points]).any()
+
+
+def test_lights_have_the_power_of_the_emitters_and_typical_distances():
+    rng = np.random.default_rng(2)
+    scene = mi.load_dict(closed_box(panels(100, rng) | bulbs(50, rng)))
+    lights = emission_of(scene, rng, False).lights
+    omni, areas = lights.groups(20_000, 0)
+    area = lights.emitters.area
+    assert omni.count == 50 and areas.count == 20_000
+    np.testing.assert_allclose(omni.lights.scalar_intensity.sum(), lights.omni.intensity.mean(1).sum(), rtol=1e-5)
+    np.testing.assert_allclose(areas.lights.scalar_intensity.sum(), area.power.sum() / np.pi, rtol=1e-3)
+    # Alike in size: the area of all, shared out
+    assert lights.spacing(20_000) == pytest.approx((100 * 0.04**2 / 20_000) ** 0.5, rel=1e-3)
+
+
+def test_lights_stand_for_many_emitters_and_not_for_few():
+    rng = np.random.default_rng(3)
+    few, many = (mi.load_dict(closed_box(bulbs(number, rng), 192)) for number in (10, 300))
+    integrator = mi.load_dict({"type": "manylights", "max_depth": 2})
+    assert_lights_stand_for_emitters(integrator, many, 64)
+    assert integrator.statistics["lights"] == {"emitters": 300}
+    mi.render(few, integrator=integrator, spp=64)
+    assert "lights" not in integrator.statistics
+
+
+def test_lights_that_stand_for_emitters_leave_less_noise(monkeypatch, always):
+    rng = np.random.default_rng(4)
+    scene = mi.load_dict(closed_box(bulbs(300, rng), 48))
+    integrator = mi.load_dict({"type": "manylights", "max_depth": 2})
+
+    def noise():
+        images = np.array([mi.render(scene, integrator=integrator, spp=64, seed=seed) for seed in range(4)])
+        return np.median(images.var(0) / images.mean(0) ** 2)
+
+    with_lights = noise()
+    monkeypatch.setattr("integrators.manylights.balance", lambda *_: balances.without_lights("this is a test"))
+    assert with_lights < 0.2 * noise()
