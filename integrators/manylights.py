@@ -15,7 +15,7 @@ from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.points.camera_paths import SceneTraits
 from vpl.split.balance import Balance, balance, importance, judged_by, noise, without_lights
-from vpl.split.gather_vertices import drawn_later, joined
+from vpl.split.gather_vertices import LitVertices
 from vpl.split.kept_lights import KeptLights, TreedLights
 from vpl.split.next_event import emitters_of
 from vpl.split.paths import AT_FIRST, EVERYWHERE, NOWHERE, Limits
@@ -297,43 +297,32 @@ class ManyLightsIntegrator(GatheringIntegrator):
     def _gather(self, view, lights, chosen, vertices, found, expected, seed, clock):
         """Light of virtual lights at the vertices of some pixels, per camera ray.
 
-        ``expected``: indirect light that each pixel should have, by which errors are judged together with what its
+        ``expected``: light that lights should bring to each pixel, by which errors are judged together with what its
         paths found.
         """
         clock.begin(Stage.CLUSTERS)
         samples, count = view.samples, dr.width(found.radiance)
-        step = -(-samples // chosen.vertices)
-        kept = -(-samples // step)
         lit = dr.zeros(mi.UnpolarizedSpectrum, count)
         dr.eval(lit)
-        turn = dr.arange(mi.UInt32, count) % dr.opaque(mi.UInt32, samples) % dr.opaque(mi.UInt32, step)
-        first, later = vertices
-        rays = dr.compress((turn == 0) & (dr.max(first.weight) > 0))
-        later_rays, factor = drawn_later(first, later, samples, kept, derived_seed(seed, 0))
-        alone = len(later_rays)
-        if len(rays) + alone == 0:
+        points = LitVertices.of(*vertices, samples, chosen.vertices, derived_seed(seed, 0))
+        if points.count == 0:
             return lit
-        # As many as there would be among the first vertices that are lit
-        share = dr.opaque(mi.Float, kept / samples)
-        picked = first.select(rays).and_then(later.select(later_rays, factor, share))
-        rays = joined(rays, later_rays)
-        clusters = PixelClusters(picked, rays, samples, alone)
+        clusters = PixelClusters(points, samples)
         clock.begin(Stage.CUTS)
         traced = np.nan_to_num(download(channel_mean(found.radiance)), posinf=0, neginf=0)
-        level = np.add.reduceat(np.maximum(traced, 0), np.arange(0, count, samples)) / samples + expected
-        level = np.maximum(level, _DARK_FLOOR * level.mean())[clusters.pixel] * kept
-        shadow_rays = sum(
-            light_clusters(
-                Transport(view.scene, _OPAQUE, carrying), clusters, level, chosen.error, _MAX_CUT,
-                derived_seed(seed, 1, number), lit,
-            )
-            for number, carrying in enumerate(lights.all)
-        )  # fmt: skip
+        level = np.maximum(traced, 0).reshape(-1, samples).mean(1) + expected
+        level = np.maximum(level, _DARK_FLOOR * level.mean())
+        # What a pair may add to what the vertices of a pixel bring together
+        allowed = chosen.error * points.kept * level[clusters.pixel]
+        shadow_rays = 0
+        for number, carrying in enumerate(lights.all):
+            transport, stream = Transport(view.scene, _OPAQUE, carrying), derived_seed(seed, 1, number)
+            shadow_rays += light_clusters(transport, clusters, allowed, _MAX_CUT, stream, lit)
         clock.stop()
-        more = {"shadow_rays": shadow_rays, "gather_points": len(rays), "clusters": clusters.count}
-        add_statistics(self.statistics, more | {"later": alone})
+        more = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}
+        add_statistics(self.statistics, more | {"later": points.alone})
         # Every step-th sample stands for all
-        return lit * dr.opaque(mi.Float, samples / kept)
+        return lit * dr.opaque(mi.Float, samples / points.kept)
 
 
 def _rays(paths: int) -> int:

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from vpl.core.arrays import upload_vectors
+from vpl.lights.light_set import LightSet
 from vpl.split.learned_emitters import LearnedEmitters
 from vpl.split.paths import EVERYWHERE
 from vpl.split.sites import Sites
+from vpl.split.view_lights import ViewLights
 
 from .catalogue import EMITTERS, SENSORS, film, image, rgb
 from .conftest import closed_box, render, render_with_statistics, sensor, unit_vectors
@@ -139,8 +141,8 @@ def test_the_weights_of_gather_vertices_are_finite():
     original = plugin._pilot
 
     def look(view):
-        lane = dr.arange(mi.UInt32, view.count)
-        _, first, later, _ = view.follow(lane, plugin._limits(view, 0.1, plugin.max_depth, EVERYWHERE), 9)
+        lane, lights = dr.arange(mi.UInt32, view.count), ViewLights(LightSet([], 0.1, plugin.max_depth, 0, 0, {}))
+        _, first, later, _ = view.follow(lane, plugin._limits(view, lights, plugin.max_depth, EVERYWHERE), 9)
         seen.extend(np.isfinite(np.array(x.weight)).all() for x in (first, later))
         return original(view)
 

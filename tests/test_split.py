@@ -18,7 +18,7 @@ from vpl.points.surfaces import LambertianSurface
 from vpl.split.balance import balance
 from vpl.split.cells import Cells
 from vpl.split.floors import agrees, carried_share, floor_of, side_of
-from vpl.split.gather_vertices import GatherVertices, drawn_later
+from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
 from vpl.split.numbers import SpreadNumbers
 from vpl.split.pixel_clusters import PixelClusters, Receivers
 from vpl.split.remainder import power_heuristic
@@ -289,7 +289,7 @@ def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
         position, mi.Normal3f(points(normal)), mi.Normal3f(points(normal)), mi.Color3f(points(weight)),
         dr.full(mi.UInt32, 1, count),
     )  # fmt: skip
-    clusters = PixelClusters(vertices, dr.arange(mi.UInt32, count), samples)
+    clusters = PixelClusters(LitVertices(vertices, dr.arange(mi.UInt32, count), 0, samples), samples)
     first, size = np.array(clusters.first), np.array(clusters.size)
     assert size.sum() == count and (clusters.pixel[clusters.cluster] == np.array(clusters.ray) // samples).all()
     draws = 20_000

@@ -21,8 +21,8 @@ _GAIN = 0.9
 _SPREAD, _MANY_EMITTERS_SPREAD = 0.5, 1.0
 # Relative standard error that one set of lights leaves in the mean of the image
 _SET_ERROR = 0.03
-# Relative variance that a set of lights leaves in a pixel, times the paths that it was made by
-_LIGHT_NOISE = 200.0
+# Relative variance that a set of lights leaves in a pixel, times the paths that it was made by, over that of one path
+_LIGHT_NOISE = 10.0
 # Light paths as a share of the paths from the camera, and how few and how many there may be
 _SHARES, _FEWEST, _MOST = (1 / 64, 1 / 8), 20_000, 500_000
 # Relative variance that cuts leave, times shadow rays a pixel; and the cost of one of these rays
@@ -33,7 +33,7 @@ _EMITTER_CUTS = 0.4
 _RAYS = (0.25, 8.0)
 # Bound on a pair of clusters, relative to its pixel, with which a cut has so many rays, and how the two go together
 _ERROR, _RAYS_AT_ERROR, _SLOPE = 0.05, 110, 1.6
-_FINEST, _COARSEST = 0.003, 0.5
+_FINEST, _COARSEST = 0.001, 2.0
 # Squared brightness of the image that black places are taken to have, and share of the worst that is left out
 _BLACK, _WORST = 0.01, 0.001
 # Cost of a path up to its second vertex, in edges of those after it
@@ -91,11 +91,11 @@ def balance(radiance, indirect, brightness: np.ndarray, paths: int, samples: int
     it that came by way of surfaces that virtual lights may stand for; ``brightness`` (n,): of the image around;
     ``left``: (radiance, indirect) of the same paths where lights stand for emitters, None if they may not.
     """
-    spread = max(_SPREAD if left is None else _MANY_EMITTERS_SPREAD, samples**-0.5)
-    whole = Noise.of(radiance, indirect, brightness, spread)
+    share = max(_SPREAD if left is None else _MANY_EMITTERS_SPREAD, samples**-0.5)
+    whole = Noise.of(radiance, indirect, brightness, share)
     options = [_priced(whole, False, paths, samples)] if indirect.any() else []
     if left is not None:
-        others = Noise.of(*left, brightness, spread)
+        others = Noise.of(*left, brightness, share)
         options += [_priced(others, True, paths, samples)] if left[1].any() else []
         options.append(_priced(Noise(others.whole, others.whole, 0.0), True, paths, samples))
     if not options:
@@ -116,7 +116,7 @@ def _priced(found: Noise, emitters: bool, paths: int, samples: int) -> tuple[flo
     light_paths = 0
     if found.clumps:
         # The least of (noise of paths / samples + noise of lights / their paths) × cost
-        balanced = (_LIGHT_NOISE * samples * paths / (_LIGHT_PATH_COST * max(rest, 1e-9))) ** 0.5
+        balanced = (_LIGHT_NOISE * found.clumps * samples * paths / (_LIGHT_PATH_COST * max(rest, 1e-9))) ** 0.5
         wanted = np.clip(max(balanced, found.clumps / _SET_ERROR**2), _SHARES[0] * paths, _SHARES[1] * paths)
         light_paths = int(np.clip(wanted, _FEWEST, _MOST))
     # The least of (noise of paths / samples + noise of cuts / rays) × (samples + rays × their cost), rays of a pixel

@@ -83,6 +83,35 @@ class Arrival:
         return cls(mi.Point3f(0), mi.Normal3f(0), mi.Float(0), mi.Float(0), mi.Float(0))
 
 
+@dataclass
+class LitVertices:
+    """Gather ``vertices`` that are lit, with the camera ray of each (``rays``, UInt32); ``alone``: so many, the last
+    ones, are of those after the first ones of their paths; ``kept``: samples of a pixel whose first one is lit."""
+
+    vertices: GatherVertices
+    rays: object
+    alone: int
+    kept: int
+
+    @classmethod
+    def of(cls, first: GatherVertices, later: GatherVertices, samples: int, most: int, seed: int) -> LitVertices:
+        """At most ``most`` first vertices of every pixel, and as many later ones as their light is worth."""
+        step = -(-samples // most)
+        kept = -(-samples // step)
+        lane = dr.arange(mi.UInt32, dr.width(first.weight))
+        turn = lane % dr.opaque(mi.UInt32, samples) % dr.opaque(mi.UInt32, step)
+        rays = dr.compress((turn == 0) & (dr.max(first.weight) > 0))
+        later_rays, factor = drawn_later(first, later, samples, kept, seed)
+        # As many as there would be among the first vertices that are lit
+        share = dr.opaque(mi.Float, kept / samples)
+        picked = first.select(rays).and_then(later.select(later_rays, factor, share))
+        return cls(picked, joined(rays, later_rays), len(later_rays), kept)
+
+    @property
+    def count(self) -> int:
+        return len(self.rays)
+
+
 def drawn_later(first: GatherVertices, later: GatherVertices, samples: int, most: int, seed: int):
     """Some of the ``later`` vertices of each pixel, drawn so that each has the weight that ``most`` vertices of the
     pixel would have on average if all of its light was theirs: (camera rays, ascending, factors of their weights).

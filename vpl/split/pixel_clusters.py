@@ -22,7 +22,7 @@ from ..points.bsdf_proxies import MaterialProxy
 from ..points.surfaces import LambertianSurface, Receiver
 from ..transport.evaluation import Transport, evaluate_pairs
 from .facing import WAYS, facing
-from .gather_vertices import GatherVertices
+from .gather_vertices import LitVertices
 
 
 @dataclass
@@ -61,13 +61,11 @@ class Receivers:
 
 
 class PixelClusters:
-    """Clusters of the gather vertices of pixels.
+    """Clusters of the gather vertices of pixels, of which there are some; later ones are clusters of their own.
+    ``samples``: camera rays of a pixel, next to each other."""
 
-    ``vertices``: with weight, evaluated; ``rays``: UInt32, the camera ray of each; ``samples``: camera rays of a pixel,
-    next to each other; ``alone``: so many vertices, the last ones, are clusters of their own.
-    """
-
-    def __init__(self, vertices: GatherVertices, rays, samples: int, alone: int = 0):
+    def __init__(self, lit: LitVertices, samples: int):
+        vertices, rays, alone = lit.vertices, lit.rays, lit.alone
         position, normal = download(vertices.position), download(vertices.normal)
         pixel = download(rays).astype(np.int64) // samples
         key = pixel * WAYS + facing(normal)
@@ -122,15 +120,12 @@ class PixelClusters:
         )
 
 
-def light_clusters(
-    transport: Transport, clusters: PixelClusters, level: np.ndarray, error: float, max_cut: int, seed: int, result
-):
+def light_clusters(transport: Transport, clusters: PixelClusters, allowed: np.ndarray, max_cut: int, seed: int, result):
     """Add to ``result`` (per camera ray) what virtual lights send to the clusters: shadow rays traced.
 
-    ``level``: per cluster, what the vertices of its pixel contribute together, by which bounds are judged: a pair may
-    add ``error`` of it at most.
+    ``allowed``: per cluster, by how much a pair may add to what the vertices of its pixel contribute together.
     """
-    allowed = error * level / np.maximum(clusters.weight, np.finfo(np.float64).tiny)
+    allowed = allowed / np.maximum(clusters.weight, np.finfo(np.float64).tiny)
     threshold, sizes, _ = limited_cuts(transport.lights, clusters.receivers, upload_thresholds(allowed), max_cut)
     rays = 0
     for number, chunk in enumerate(collect_cuts(transport.lights, clusters.receivers, threshold, sizes)):
