@@ -77,9 +77,14 @@ class ManyLightsIntegrator(GatheringIntegrator):
     where little is left of them. w keeps lights from being bright spots in corners; c is a multiple of the distance
     between lights. See :mod:`vpl.split`.
 
+    **Many emitters.** Where a scene has 64 of them or more, what a surface receives from emitters directly is split as
+    well, if that pays: point and spot emitters are virtual lights themselves (w = 1), and so are points on area
+    emitters, of flat meshes or shapes. A cut of a hundred stands for all of them, where ``path`` draws one. Area
+    emitters on meshes whose vertices have other normals than their surface are traced, and so are environments.
+
     **Chooses by itself.** A pilot of some thousand paths tells where lights are wanted, how many, and whether they pay:
-    where little of the noise is that of indirect light, or the image has few samples, there are none, and what is left
-    is ``path`` with well spread samples. What was chosen is in ``statistics``, in the log (level Info) and in files
+    where they would take little of the noise away, or the image has few samples, there are none, and what is left is
+    ``path`` with well spread samples. What was chosen is in ``statistics``, in the log (level Info) and in files
     that the command writes. The same seed chooses the same.
 
     **Kept lights.** With ``keep_lights`` the frames of a camera that moves, or several sensors, share their lights and
@@ -117,7 +122,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
     knobs = (
         Boolean(
             "virtual_lights", True,
-            "Whether virtual lights may carry indirect light where they pay. Without them all of it is traced.",
+            "Whether virtual lights may carry indirect light, and that of many emitters, where they pay. Without them "
+            "all of it is traced.",
         ),
         Boolean(
             "keep_lights", False,

@@ -21,8 +21,8 @@ _GAIN = 0.9
 _SPREAD, _MANY_EMITTERS_SPREAD = 0.5, 1.0
 # Relative standard error that one set of lights leaves in the mean of the image
 _SET_ERROR = 0.03
-# Relative variance that a set of lights leaves in a pixel, times the paths that it was made by, over that of one path
-_LIGHT_NOISE = 10.0
+# Relative variance that a set of lights leaves in a pixel, times the paths that it was made by
+_LIGHT_NOISE = 200.0
 # Light paths as a share of the paths from the camera, and how few and how many there may be
 _SHARES, _FEWEST, _MOST = (1 / 64, 1 / 8), 20_000, 500_000
 # Relative variance that cuts leave, times shadow rays a pixel; and the cost of one of these rays
@@ -116,7 +116,7 @@ def _priced(found: Noise, emitters: bool, paths: int, samples: int) -> tuple[flo
     light_paths = 0
     if found.clumps:
         # The least of (noise of paths / samples + noise of lights / their paths) × cost
-        balanced = (_LIGHT_NOISE * found.clumps * samples * paths / (_LIGHT_PATH_COST * max(rest, 1e-9))) ** 0.5
+        balanced = (_LIGHT_NOISE * samples * paths / (_LIGHT_PATH_COST * max(rest, 1e-9))) ** 0.5
         wanted = np.clip(max(balanced, found.clumps / _SET_ERROR**2), _SHARES[0] * paths, _SHARES[1] * paths)
         light_paths = int(np.clip(wanted, _FEWEST, _MOST))
     # The least of (noise of paths / samples + noise of cuts / rays) × (samples + rays × their cost), rays of a pixel
