@@ -1,4 +1,4 @@
-"""The image of Mitsuba's ``path``, sooner: indirect light from virtual lights, and what they leave out traced."""
+"""The image of Mitsuba's ``path``, sooner: virtual lights carry what they can, and the rest is traced."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
 
      {knobs}
 
-    The image of ``path``, with less noise in the same time. It estimates exactly what ``path`` estimates for the same
-    ``max_depth``: the mean over seeds is the same, nothing is clamped and nothing left out.
+    The image of ``path``, with less noise in the same time: the mean over seeds is the same for the same ``max_depth``,
+    nothing is clamped and nothing left out.
 
     **How.** Radiance that the camera's first surface x1 receives by way of a second one, x2, is split in two,
 
@@ -77,10 +77,11 @@ class ManyLightsIntegrator(GatheringIntegrator):
     where little is left of them. w keeps lights from being bright spots in corners; c is a multiple of the distance
     between lights. See :mod:`vpl.split`.
 
-    **Many emitters.** Where a scene has 64 of them or more, what a surface receives from emitters directly is split as
-    well, if that pays: point and spot emitters are virtual lights themselves (w = 1), and so are points on area
-    emitters, of flat meshes or shapes. A cut of a hundred stands for all of them, where ``path`` draws one. Area
-    emitters on meshes whose vertices have other normals than their surface are traced, and so are environments.
+    **Many emitters.** Where there are 64 or more, all of them with a constant radiance, what a surface receives from
+    emitters directly is split as well, if that pays: point and spot emitters are virtual lights themselves, with w = 1,
+    and area emitters have points that are. A cut of a hundred lights stands for all, where ``path`` draws one emitter.
+    Light of environments, directional emitters, and meshes whose vertices have other normals than their surface is
+    traced.
 
     **Chooses by itself.** A pilot of some thousand paths tells where lights are wanted, how many, and whether they pay:
     where they would take little of the noise away, or the image has few samples, there are none, and what is left is
@@ -89,13 +90,13 @@ class ManyLightsIntegrator(GatheringIntegrator):
 
     **Kept lights.** With ``keep_lights`` the frames of a camera that moves, or several sensors, share their lights and
     the tree over them, each seed its own, as far as these are two million. Every frame still has the mean of ``path``,
-    and a pilot of its own. It costs quality: lights are aimed at what the first camera saw, so that what others see has
-    fewer of them and more noise, and the noise of lights is the same in all frames: it stands still where it would
-    flicker, and does not average out over them. Whether the scene is still the same is asked before each pass: of
-    every object but sensors and the integrator, all that Mitsuba prints of it and the values of all parameters are
-    compared (by hashes, 10 to 40 ms in most scenes); where anything differs, lights are made anew. To change what
-    Mitsuba neither prints nor lists as a parameter, such as how a texture is filtered, takes a scene that is loaded
-    anew: give it an integrator of its own.
+    and a pilot of its own; lights that stand for emitters are made anew. It costs quality: lights are aimed at what the
+    first camera saw, so that what others see has fewer of them and more noise, and the noise of lights is the same in
+    all frames: it stands still where it would flicker, and does not average out over them. Whether the scene is still
+    the same is asked before each pass: of every object but sensors and the integrator, all that Mitsuba prints of it
+    and the values of all parameters are compared (by hashes, 10 to 40 ms in most scenes); where anything differs,
+    lights are made anew. To change what Mitsuba neither prints nor lists as a parameter, such as how a texture is
+    filtered, takes a scene that is loaded anew: give it an integrator of its own.
 
     - Values of single pixels may be negative while samples are few: what is traced is a difference.
     - Masks: the image is that of ``prb``. ``path`` (Mitsuba 3.9.1) shows black for samples that have passed nothing but
@@ -157,13 +158,16 @@ class ManyLightsIntegrator(GatheringIntegrator):
         """(Radiance of each camera ray, whether it is opaque in the film's alpha)."""
         clock, self.statistics = Clock(Stage.PILOT), {}
         pilot = self._pilot(view)
-        chosen = self._balance(view, pilot)
+        left = self._left(view)
+        chosen = self._balance(view, pilot, left)
         self._judge(view, pilot, chosen)
         mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
         lights = self._lights(view, pilot, chosen, clock)
         limits = self._limits(view, lights, self.max_depth, EVERYWHERE if lights.all else NOWHERE)
-        carried = pilot.indirect * bool(lights.surfaces) + pilot.direct * bool(lights.emitters)
-        expected = pilot.nearby(carried, view.width, view.pixels)
+        carried = pilot.indirect * bool(lights.surfaces)
+        if lights.emitters:
+            carried += pilot.radiance - left.radiance
+        expected = np.maximum(pilot.nearby(carried, view.width, view.pixels), 0)
         radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
         # Whole pixels at a time
         most = max(_WAVEFRONT // view.samples, 1) * view.samples
@@ -222,20 +226,24 @@ class ManyLightsIntegrator(GatheringIntegrator):
         found, vertices, _, arrival = view.follow(upload(mi.UInt32, lane), limits, 1)
         return Pilot.of(found, vertices, arrival, lane // view.samples)
 
-    def _balance(self, view: View, pilot: Pilot) -> Balance:
+    def _left(self, view: View) -> Pilot | None:
+        """What lights that stand for emitters would leave of the pilot's paths; None where there can be none."""
+        possible = self.virtual_lights and self.max_depth > 1 and not view.perturbed.everywhere
+        if not possible or view.emission.lights is None:
+            return None
+        return self._followed(view, ViewLights(emitters=self._emitter_lights(view, [])))
+
+    def _balance(self, view: View, pilot: Pilot, left: Pilot | None) -> Balance:
         """What the pilot leads to."""
         if not self.virtual_lights:
             return without_lights("virtual_lights is off")
         if view.perturbed.everywhere:
             return without_lights("bump or normal maps are in shape groups")
-        left = None
-        if view.emission.lights is not None and self.max_depth > 1:
-            carried = self._followed(view, ViewLights(emitters=self._emitter_lights(view, [])))
-            left = carried.radiance, carried.indirect
-        elif self.max_depth <= 2:
+        if self.max_depth <= 2 and left is None:
             return without_lights("no light is indirect at this max_depth")
+        rest = None if left is None else (left.radiance, left.indirect)
         brightness = pilot.brightness(view.width)
-        return balance(pilot.radiance, pilot.indirect, brightness, view.count, view.samples, left)
+        return balance(pilot.radiance, pilot.indirect, brightness, view.count, view.samples, rest)
 
     def _judge(self, view: View, pilot: Pilot, chosen: Balance) -> None:
         """What it is worth to follow paths of a view."""
@@ -338,7 +346,7 @@ def _rays(paths: int) -> int:
 
 def _points_on_emitters(view: View) -> int:
     """How many points there are on area emitters."""
-    return int(np.clip(_EMITTER_SHARE * view.count, *_EMITTER_LIGHTS))
+    return view.emission.lights.points(int(np.clip(_EMITTER_SHARE * view.count, *_EMITTER_LIGHTS)))
 
 
 mi.register_integrator("manylights", ManyLightsIntegrator)

@@ -1,6 +1,6 @@
 """Everything that a method needs to know about the lights of one render: virtual lights, their trees, the clamp.
 
-Emitters that have an extent become virtual lights here where that is asked for (``direct="vpl"``), as in the papers.
+Emitters that have an extent become virtual lights here where that is asked for, as in the papers.
 """
 
 from __future__ import annotations
@@ -238,14 +238,17 @@ def _spacing(found: list[VirtualLights], traced: TracedLights | None, places: np
     return spacing(on_emitters[0], on_emitters[0]) if on_emitters else 0.0
 
 
-def area_lights(emitters: Emitters, count: int, seed: int) -> VirtualLights:
-    """``count`` points on area emitters as oriented lights, chosen by power and then by area."""
+def area_lights(emitters: Emitters, count: int, seed: int, weight: np.ndarray | None = None) -> VirtualLights:
+    """``count`` points on area emitters as oriented lights: emitters chosen by ``weight`` (None: by power), points by
+    area."""
     area = emitters.area
-    choice = Choice(area.power)
+    choice = Choice(area.power if weight is None else weight)
     sampler = independent_sampler(seed, count)
     row = choice.row(stratified(sampler, count, 0, count))
     ps = area.sample_position(row, mi.Float(0), sampler.next_2d(), mi.Bool(True))
-    intensity = spectrum_to_rgb(area.emitted_in_front(row, ps)) / (ps.pdf * choice.probability(row) * count)
+    intensity = spectrum_to_rgb(area.emitted_in_front(row, ps)) / (ps.pdf * choice.probability(row))
+    # Divided on the device, where the number of lights is part of no kernel
+    intensity /= dr.opaque(mi.Float, float(count))
     return VirtualLights.of("oriented", download(ps.p), download(ps.n), download(intensity))
 
 

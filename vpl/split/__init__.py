@@ -1,6 +1,7 @@
 """Split of the image of ``path`` into a part that virtual lights carry and one that is traced: plugin ``manylights``.
 
-What a first surface receives by way of a second one is split so that nothing is left out or clamped (``floors``)::
+What a first surface receives by way of a second one, and where there are many emitters straight from these, is split
+so that nothing is left out or clamped (``floors``)::
 
     pilot -> balance -> surface_lights (cells) -> light tree
     camera rays -> remainder (next_event, numbers) -> gather vertices -> pixel_clusters -> radiance

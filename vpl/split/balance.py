@@ -69,7 +69,7 @@ class Balance:
 @dataclass
 class Noise:
     """Relative variance of a path from the camera: ``whole``, and ``direct``: without light that came by way of
-    surfaces that virtual lights may stand for; ``clumps``: relative variance of that light alone."""
+    surfaces that virtual lights may stand for; ``clumps``: mean square of that light over its squared mean."""
 
     whole: float
     direct: float
@@ -91,11 +91,11 @@ def balance(radiance, indirect, brightness: np.ndarray, paths: int, samples: int
     it that came by way of surfaces that virtual lights may stand for; ``brightness`` (n,): of the image around;
     ``left``: (radiance, indirect) of the same paths where lights stand for emitters, None if they may not.
     """
-    share = max(_SPREAD if left is None else _MANY_EMITTERS_SPREAD, samples**-0.5)
-    whole = Noise.of(radiance, indirect, brightness, share)
+    spread = max(_SPREAD if left is None else _MANY_EMITTERS_SPREAD, samples**-0.5)
+    whole = Noise.of(radiance, indirect, brightness, spread)
     options = [_priced(whole, False, paths, samples)] if indirect.any() else []
     if left is not None:
-        others = Noise.of(*left, brightness, share)
+        others = Noise.of(*left, brightness, spread)
         options += [_priced(others, True, paths, samples)] if left[1].any() else []
         options.append(_priced(Noise(others.whole, others.whole, 0.0), True, paths, samples))
     if not options:
@@ -129,7 +129,7 @@ def _priced(found: Noise, emitters: bool, paths: int, samples: int) -> tuple[flo
     cost = 1 + cuts * _RAY_COST * rays / samples + fixed
     left = rest + cuts * _CUT_NOISE * samples / rays
     vertices = int(np.clip(samples // _SAMPLES_A_VERTEX, 1, _MOST_VERTICES))
-    return cost * left, cost, Balance(light_paths, emitters, error, vertices, rest, "")
+    return cost * left, cost, Balance(light_paths, emitters, error, vertices, left, "")
 
 
 def without_lights(reason: str) -> Balance:

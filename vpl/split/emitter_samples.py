@@ -31,13 +31,9 @@ class EmitterSample:
         weight = finite_or_zero(self.weight / probability)
         return EmitterSample(self.direction, weight, self.density * probability, self.is_point, self.ray, self.nearness)
 
-    def possible(self, active):
-        """Whether anything arrives if nothing is between."""
-        return active & (dr.max(self.weight) > 0) & (self.density > 0)
-
     def arriving(self, scene, active):
         """The weight where nothing is between, 0 elsewhere."""
-        possible = self.possible(active)
+        possible = active & (dr.max(self.weight) > 0) & (self.density > 0)
         return dr.select(possible & ~scene.ray_test(self.ray, possible), self.weight, 0)
 
 
@@ -49,9 +45,3 @@ class MetEmitter:
     radiance: object
     density: object
     nearness: object = None
-
-
-def carried_by_emitters(nearness, squared_c, cosine):
-    """Share of an emitter's light that virtual lights carry to a vertex, with ``cosine`` there: w of
-    :mod:`vpl.split.floors`."""
-    return dr.rcp(1 + squared_c * nearness * cosine) & dr.isfinite(nearness)

@@ -71,3 +71,9 @@ def _direction(number, side):
 def carried_share(squared_c, cosine1, cosine2, distance2):
     """w of the split, from the cosines at both ends and the squared distance; 0 at distance 0."""
     return distance2 / (distance2 + squared_c * cosine1 * cosine2)
+
+
+def carried_share_of_emitter(squared_c, nearness, cosine):
+    """w for light straight from an emitter, by its ``nearness``: cosine there over squared distance, infinite where no
+    virtual light stands for it; ``cosine``: at the vertex."""
+    return dr.rcp(1 + squared_c * nearness * cosine) & dr.isfinite(nearness)

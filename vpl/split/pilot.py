@@ -40,11 +40,11 @@ class Onward:
 
 @dataclass
 class Pilot:
-    """Paths of which nothing was left to virtual lights, two next to each other from one pixel.
+    """Paths of which nothing was left to virtual lights on surfaces, two next to each other from one pixel.  What they
+    found may be negative where lights stand for emitters.
 
     ``arrivals``: their second vertices, where they have a floor, as their first ones have; ``pixel``, ``radiance``,
-    ``indirect``, ``direct`` (n,): the pixel of each path, what it found, the part that came by way of its second
-    vertex, and what its first one should have from emitters.
+    ``indirect`` (n,): the pixel of each path, what it found, and the part that came by way of its second vertex.
     ``vertices``: positions and normals, (m, 3) each, of both; ``onward``: what came by way of all second vertices.
     """
 
@@ -54,7 +54,6 @@ class Pilot:
     pixel: np.ndarray
     radiance: np.ndarray
     indirect: np.ndarray
-    direct: np.ndarray
 
     @classmethod
     def of(cls, found: Found, vertices: GatherVertices, arrival: Arrival, pixel: np.ndarray) -> Pilot:
@@ -71,10 +70,7 @@ class Pilot:
         first, facing, depth = (download(x) for x in (vertices.position, vertices.normal, vertices.depth))
         seen = (depth > 0) & np.isfinite(first).all(1)
         vertices = tuple(np.concatenate(x) for x in ((first[seen], position[arrived]), (facing[seen], normal[arrived])))
-        by_emitter = seen & (download(found.length) == depth + 1)
-        drawn = np.nan_to_num(download(channel_mean(found.drawn)).astype(np.float64), posinf=0, neginf=0)
-        direct = np.where(by_emitter, np.maximum(drawn, 0), 0)
-        return cls(arrivals, onward, vertices, pixel, radiance, indirect, direct)
+        return cls(arrivals, onward, vertices, pixel, radiance, indirect)
 
     def brightness(self, width: int) -> np.ndarray:
         """Mean radiance of the tile of each path, (n,)."""

@@ -6,6 +6,9 @@ BSDF of x2, in next-event estimation as well as in the throughput of the path, w
 The rest may be negative.  Russian roulette by how much is left ends most paths at x2: nearly all of them where both
 surfaces are Lambertian and far apart.  What goes on may be gathered in turn, at x2 and wherever there is a floor.
 
+Where virtual lights stand for emitters, too, light that comes straight from these is taken off in the same two ways
+wherever lights are gathered.
+
 The same kernel follows paths of which nothing is taken off: those that find the irradiance of a virtual light.
 """
 
@@ -17,12 +20,12 @@ import mitsuba as mi
 from ..core.arrays import channel_mean, select_record
 from ..core.loops import recorded_once
 from ..direct.emitter_sampling import power_heuristic
-from .emitter_samples import EmitterSample, MetEmitter, carried_by_emitters
-from .floors import agrees, carried_share
+from .emitter_samples import EmitterSample, MetEmitter
+from .floors import agrees, carried_share, carried_share_of_emitter
 from .gather_vertices import Arrival
 from .paths import CONNECTING, PAST, SEEKING, FirstEdge, Found, Gains, Gathered, Limits, Met, Path
 
-# No path is ended with more than this probability because little is left of it: what is left is known only roughly
+# Paths and shadow rays go on with this probability at least, however little is left: that is known only roughly
 _LEAST_SURVIVAL = 0.02
 
 
@@ -107,21 +110,21 @@ def _left_of_emitter(path: Path, emitter: MetEmitter, limits: Limits):
     """Throughput with which an emitter is met, less what virtual lights that stand for it carry."""
     if emitter.nearness is None:
         return path.throughput
-    w = carried_by_emitters(emitter.nearness, limits.emitters_squared_c, path.cosine)
+    w = carried_share_of_emitter(limits.emitters_squared_c, emitter.nearness, path.cosine)
     carried = limits.emitters_carried & (path.state == CONNECTING)
     return path.throughput - dr.select(carried, path.carried * w, 0)
 
 
 def _lit(path: Path, met: Met, sample: EmitterSample, weight, context, limits: Limits, sampler):
     """What paths bring of the light of the emitters that were sampled, less what virtual lights carry.  ``weight``: of
-    lights that are gathered here."""
+    the gather vertex that this is, or 0."""
     local = met.si.to_local(sample.direction)
     value, density = met.bsdf.eval_pdf(context, met.si, local, met.smooth)
     full = path.throughput * mi.unpolarized_spectrum(value)
     cosine = dr.select(local.z * met.side > 0, dr.abs(local.z), 0)
     value = full - path.carried * cosine
     if sample.nearness is not None:
-        w = carried_by_emitters(sample.nearness, limits.emitters_squared_c, cosine)
+        w = carried_share_of_emitter(limits.emitters_squared_c, sample.nearness, cosine)
         value -= dr.select(limits.emitters_carried, weight * (w * cosine), 0)
         # Few shadow rays, where little is left
         left = dr.max(dr.abs(value)) / dr.max(dr.abs(full))

@@ -157,7 +157,7 @@ def _irradiance(scene, emission, rays, limits: Limits, seed: int):
     sample = emission.sample(si, site, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), si.is_valid())
     cosine = dr.maximum(dr.dot(facing, sample.direction), 0)
     mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, cosine * dr.inv_pi))
-    nearest = sample.arriving(scene, si.is_valid()) * cosine * mis
+    nearest = dr.select(sample.density > 0, sample.arriving(scene, si.is_valid()) * cosine * mis, 0)
     # ---------------------- A path that begins with a direction drawn by the cosine ----------------------
     local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
     ray, density, draw = si.spawn_ray(mi.Frame3f(facing).to_world(local)), local.z * dr.inv_pi, sampler.next_1d()

@@ -36,7 +36,8 @@ class TreeEmitters:
     known, and for a share of the samples everywhere, the tree is walked from its root, so that near and bright ones
     come first, and those that are infinitely far away share what is left.
 
-    ``emitters``: with a constant radiance each; ``rays``: about how many there are to learn by.
+    ``emitters``: with a constant radiance each; ``rays``: about how many there are to learn by.  ``lights``: virtual
+    lights that may stand for them, or None.
     """
 
     def __init__(self, scene, emitters: Emitters, rays: int):
@@ -49,8 +50,10 @@ class TreeEmitters:
         shapes = {index: shape for index, shape in registered_shapes(scene) if shape.is_emitter()}
         shapes = [shapes[int(index)] for index in emitters.area.shape_index]
         boxes = [shape.bbox() for shape in shapes]
-        self.lights = EmitterLights(emitters, omni, np.array([has_true_normals(shape) for shape in shapes], bool))
-        self._is_carried = upload(mi.UInt32, np.append(self.lights.carried, False))
+        lights = EmitterLights(emitters, omni, np.array([has_true_normals(shape) for shape in shapes], bool))
+        self.lights = lights if lights.any else None
+        # One more, as arrays of one entry make other kernels
+        self._is_carried = upload(mi.UInt32, np.append(lights.carried, False))
         center = np.array([np.array(box.center()) for box in boxes], np.float64).reshape(-1, 3)
         radius = np.array([0.5 * np.linalg.norm(np.array(box.extents())) for box in boxes], np.float64)
         intensity = np.concatenate([omni.intensity.mean(1), emitters.area.radiance.mean(1) * emitters.area.area])
