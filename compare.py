@@ -55,10 +55,16 @@ DEMO = [
 ]  # fmt: skip
 
 
+def _name() -> str:
+    """What this command was called by."""
+    called = Path(sys.argv[0]).stem
+    return called if called == "manylights-compare" else "compare.py"
+
+
 def parse(arguments):
     """Parse the command line; return its options. Exits with status 2 and a message if it makes no sense."""
     parser = argparse.ArgumentParser(
-        prog="compare.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog=_name(), description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
     add("scenes", nargs="*", metavar="SCENE", help="scene files (XML)")
@@ -305,7 +311,7 @@ def main(arguments=None):
     """Run the command; return its exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = parse(arguments)
-    command = shlex.join(["compare.py", *arguments])
+    command = shlex.join([_name(), *arguments])
     return command_line.exit_status(
         "compare",
         lambda: run(options, command),

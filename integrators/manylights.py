@@ -40,7 +40,7 @@ _LEARNED_COST = 1.15
 # c of the split, as a multiple of the distance between lights, below which single ones show as blotches
 _TAPER = 6.0
 # Points on area emitters where these are virtual lights, as a share of the camera rays, and how few and many
-_EMITTER_SHARE, _EMITTER_LIGHTS = 0.1, (20_000, 200_000)
+_EMITTER_SHARE, _EMITTER_LIGHTS = 0.03, (10_000, 200_000)
 # c of paths that are whole, beyond every distance, world units: nothing is left to virtual lights
 _WHOLE = 1e15
 # Pixels darker than this share of the image's mean are lit as precisely as if they had it

@@ -1,5 +1,7 @@
 """Emitters as virtual lights: what they carry and what is traced is, together, what `path` finds."""
 
+import dataclasses
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -7,8 +9,8 @@ import pytest
 
 from vpl.split import balance as balances
 
-from .catalogue import EMITTERS, rgb
-from .conftest import assert_same_mean_over_seeds, closed_box, render
+from .catalogue import EMITTERS, image, rgb
+from .conftest import assert_same_mean_over_seeds, closed_box, render, wall
 from .test_tree_emitters import bulbs, emission_of, interactions, panels, vertices
 
 
@@ -103,7 +105,60 @@ def test_no_lights_stand_for_emitters_with_normals_of_vertices(tmp_path, always)
     assert_same_mean_over_seeds(pairs)
 
 
+def test_turned_covered_hollow_and_uneven_emitters_change_no_mean(always):
+    """Panels that face up, a mask, a ball that shines inwards around another one, bumps, a sun, and one bright emitter
+    among dim ones."""
+    rng = np.random.default_rng(8)
+    up = {name: one | {"flip_normals": True} for name, one in panels(30, rng).items()}
+    bump = {
+        "type": "bumpmap",
+        "bsdf": {"type": "diffuse"},
+        "arbitrary": image(rng.random((8, 8, 3)).astype(np.float32)),
+    }
+    mask = {"type": "mask", "opacity": 0.5, "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
+    hollow = {"type": "sphere", "center": [0.4, -0.4, 0], "radius": 0.3, "flip_normals": True}
+    more = {
+        "hollow": hollow | {"emitter": {"type": "area", "radiance": rgb(2.0)}},
+        "core": {"type": "sphere", "center": [0.4, -0.4, 0], "radius": 0.1, "bsdf": {"type": "diffuse"}},
+        "veil": wall([0, 0, -0.3], [0, 1, 0], 0, 0.5) | {"bsdf": mask},
+        "bright": {"type": "point", "position": [-0.5, 0.5, -0.6], "intensity": rgb(20.0)},
+        "sun": {"type": "directional", "direction": [1, -0.3, -0.2], "irradiance": rgb(1.0)},
+    }
+    box = closed_box(up | spots(20, rng) | balls(20, rng) | more, 16)
+    box["floor"]["bsdf"] = bump
+    del box["left"]
+    scene = mi.load_dict(box)
+    pairs = [[render(scene, name, 64, seed, max_depth=4) for name in ("manylights", "path")] for seed in range(12)]
+    assert_same_mean_over_seeds(pairs)
+
+
 # ---------------------- Lights ----------------------
+
+
+def test_kept_lights_and_those_that_stand_for_emitters_give_the_same_image_again(always):
+    scene = mi.load_dict(closed_box(bulbs(100, np.random.default_rng(9)), 24))
+    integrator = mi.load_dict({"type": "manylights", "max_depth": 4, "keep_lights": True})
+    first, again = (np.array(mi.render(scene, integrator=integrator, spp=64, seed=3)) for _ in range(2))
+    assert integrator.statistics["lights"]["emitters"] == 100 and integrator.statistics["light_paths"] == 0
+    np.testing.assert_allclose(again, first, rtol=1e-4, atol=1e-5)
+
+
+def test_a_dim_emitter_next_to_a_bright_one_has_points():
+    lights = emission_of(
+        mi.load_dict(closed_box(panels(64, np.random.default_rng(1)))), np.random.default_rng(0), False
+    ).lights
+    radiance = np.full_like(lights.emitters.area.radiance, 1e-6)
+    radiance[0] = 1
+    uneven = dataclasses.replace(
+        lights,
+        emitters=dataclasses.replace(
+            lights.emitters, area=dataclasses.replace(lights.emitters.area, radiance=radiance)
+        ),
+    )
+    (group,) = uneven.groups(1000, 0)
+    found = np.array(group.lights.gather(dr.arange(mi.UInt32, 1000)).intensity)[0]
+    np.testing.assert_allclose(found.sum(), uneven.emitters.area.power.sum() / np.pi, rtol=0.05)
+    assert (found < 1e-3 * found.max()).sum() == pytest.approx(500, rel=0.1)
 
 
 @pytest.mark.parametrize("shapes, close", [(panels, 0.97), (balls, 0.9)], ids=["panels", "balls"])

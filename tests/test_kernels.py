@@ -51,6 +51,31 @@ def test_sizes_and_samples_are_in_no_kernel(name, compiled):
     assert new(spp=6) <= MITSUBAS
 
 
+def test_sizes_and_samples_are_in_no_kernel_of_many_emitters(compiled, lights_cost_nothing, monkeypatch):
+    """With another number of points on them for every size."""
+    monkeypatch.setattr("integrators.manylights._EMITTER_LIGHTS", (100, 200_000))
+    lamps = {f"lamp{i}": area_light() | {"to_world": turned(0.1 * i - 4)} for i in range(80)}
+    views = {f"view_{size}": closed_box({}, size)["sensor"] for size in (32, 40, 48)}
+    scene = mi.load_dict(closed_box(lamps) | views)
+    plugin = mi.load_dict({"type": "manylights", "max_depth": 4})
+
+    def new(camera=1, spp=16, seed=0):
+        mi.render(scene, sensor=camera, integrator=plugin, spp=spp, seed=seed).numpy()
+        assert plugin.statistics["lights"]["emitters"] > 100
+        return compiled()
+
+    assert sum(new(camera, seed=seed) for camera in (1, 2) for seed in range(3)) > 2 * MITSUBAS
+    assert new(camera=3) <= MITSUBAS
+    assert new(spp=24) <= MITSUBAS
+
+
+def turned(angle):
+    """A small panel below the ceiling, somewhere."""
+    return mi.ScalarTransform4f().rotate([0, 1, 0], 40 * angle).translate([0.1 * angle, 0.8, 0.4]).rotate(
+        [1, 0, 0], 90
+    ).scale(0.05)  # fmt: skip
+
+
 def test_paths_from_the_camera_and_from_lights_are_followed_by_one_kernel(lights_cost_nothing):
     scene = mi.load_dict(closed_box({"lamp": area_light()}))
     plugin = mi.load_dict({"type": "manylights", "max_depth": 4})

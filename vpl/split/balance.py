@@ -113,21 +113,20 @@ def _priced(found: Noise, emitters: bool, paths: int, samples: int) -> tuple[flo
     that stand for ``emitters``."""
     share = 1 - found.direct / max(found.whole, _TINY)
     rest = found.whole * (1 - _GAIN * share)
-    light_paths = 0
-    if found.clumps:
-        # The least of (noise of paths / samples + noise of lights / their paths) × cost
-        balanced = (_LIGHT_NOISE * samples * paths / (_LIGHT_PATH_COST * max(rest, 1e-9))) ** 0.5
-        wanted = np.clip(max(balanced, found.clumps / _SET_ERROR**2), _SHARES[0] * paths, _SHARES[1] * paths)
-        light_paths = int(np.clip(wanted, _FEWEST, _MOST))
     # The least of (noise of paths / samples + noise of cuts / rays) × (samples + rays × their cost), rays of a pixel
-    cuts = _EMITTER_CUTS * emitters + (light_paths > 0)
+    cuts = _EMITTER_CUTS * emitters + (found.clumps > 0)
     rays = samples * np.clip((_CUT_NOISE / (_RAY_COST * max(rest, 1e-9))) ** 0.5, *_RAYS)
     error = float(np.clip(_ERROR * (rays / _RAYS_AT_ERROR) ** -_SLOPE, _FINEST, _COARSEST))
     # A cut has some nodes, however few rays are wanted
     rays = _RAYS_AT_ERROR * (error / _ERROR) ** (-1 / _SLOPE)
+    left, light_paths = rest + cuts * _CUT_NOISE * samples / rays, 0
+    if found.clumps:
+        # The least of (noise of these / samples + noise of lights / their paths) × cost
+        balanced = (_LIGHT_NOISE * samples * paths / (_LIGHT_PATH_COST * left)) ** 0.5
+        wanted = np.clip(max(balanced, found.clumps / _SET_ERROR**2), _SHARES[0] * paths, _SHARES[1] * paths)
+        light_paths = int(np.clip(wanted, _FEWEST, _MOST))
     fixed = (_FIXED_COST + _LIGHT_PATH_COST * light_paths) / paths
     cost = 1 + cuts * _RAY_COST * rays / samples + fixed
-    left = rest + cuts * _CUT_NOISE * samples / rays
     vertices = int(np.clip(samples // _SAMPLES_A_VERTEX, 1, _MOST_VERTICES))
     return cost * left, cost, Balance(light_paths, emitters, error, vertices, left, "")
 
