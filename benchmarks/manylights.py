@@ -18,6 +18,7 @@ Parts, each with both integrators in turn in one run, and with the better of the
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import re
 import subprocess
@@ -60,6 +61,7 @@ def load(name: str, width: int):
 
     One scene for all: kernels hold the code of all scenes that are alive, and are recorded at every render.
     """
+    gc.collect()
     file = scenes.scene_file(name)
     mi.file_resolver().prepend(str(file.parent))
     text = file.read_text()
@@ -137,66 +139,74 @@ def product(names, width: int, seconds: float, passes: int) -> None:
     """Print variance × time of all, and the ratio."""
     print(f"product, {width} wide, {passes} passes of about {seconds:g} s; variance × time, with samples of a pass")
     print(f"{'scene':16s} {'path':>22s} {'manylights':>22s}   ratio   bias                sets")
-    ratios = []
-    for name in names:
-        scene = load(name, width)
-        rivals = [Rival(name, scene, kind, sampler, width, seconds) for kind in KINDS for sampler in SAMPLERS]
-        for number in range(passes):
-            for rival in rivals:
-                rival.measure(100 + number)
-        scale = scale_of(name, [image for rival in rivals for image in rival.images], width)
-        best = {kind: min((r for r in rivals if r.kind == kind), key=lambda r: r.product(scale)) for kind in KINDS}
-        values = [best[kind].product(scale) for kind in KINDS]
-        ratios.append(values[0] / values[1])
-        (ours, error), (theirs, their_error) = best["manylights"].mean(), best["path"].mean()
-        sets = np.std([image.mean() for image in best["manylights"].images], ddof=1) / ours
-        columns = [
-            f"{value:.4g} ({best[kind].spp}, {best[kind].sampler[:5]})"
-            for value, kind in zip(values, KINDS, strict=True)
-        ]
-        excess, uncertain = ours / theirs - 1, np.hypot(error / ours, their_error / theirs)
-        print(
-            f"{name:16s} {columns[0]:>22s} {columns[1]:>22s} {ratios[-1]:7.2f}   {excess:+.2%} ± {uncertain:.2%}"
-            f"{sets:12.2%}   {best['manylights'].integrator.statistics.get('balance')}",
-            flush=True,
-        )
+    ratios = [product_of(name, width, seconds, passes) for name in names]
     print(f"geometric mean {scenes.geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
+
+
+def product_of(name: str, width: int, seconds: float, passes: int) -> float:
+    """Print variance × time of a scene: the ratio."""
+    scene = load(name, width)
+    rivals = [Rival(name, scene, kind, sampler, width, seconds) for kind in KINDS for sampler in SAMPLERS]
+    for number in range(passes):
+        for rival in rivals:
+            rival.measure(100 + number)
+    scale = scale_of(name, [image for rival in rivals for image in rival.images], width)
+    best = {kind: min((r for r in rivals if r.kind == kind), key=lambda r: r.product(scale)) for kind in KINDS}
+    values = [best[kind].product(scale) for kind in KINDS]
+    ratio = values[0] / values[1]
+    (ours, error), (theirs, their_error) = best["manylights"].mean(), best["path"].mean()
+    sets = np.std([image.mean() for image in best["manylights"].images], ddof=1) / ours
+    columns = [
+        f"{value:.4g} ({best[kind].spp}, {best[kind].sampler[:5]})" for value, kind in zip(values, KINDS, strict=True)
+    ]
+    excess, uncertain = ours / theirs - 1, np.hypot(error / ours, their_error / theirs)
+    print(
+        f"{name:16s} {columns[0]:>22s} {columns[1]:>22s} {ratio:7.2f}   {excess:+.2%} ± {uncertain:.2%}"
+        f"{sets:12.2%}   {best['manylights'].integrator.statistics.get('balance')}",
+        flush=True,
+    )
+    return ratio
 
 
 def denoised(names, width: int, seconds: float, passes: int) -> None:
     """Print the error through the denoiser, and how long `path` takes for that of `manylights`."""
-    from comparison.denoising import Denoiser
-
     print(f"denoised, {width} wide: error of a pass; what `path` would take for that of manylights over its time")
     ratios = []
     for name in names:
         if scenes.reference_file(name) is None:
             print(f"skipped {name}: it has no reference")
             continue
-        scene = load(name, width)
-        rivals = [Rival(name, scene, kind, "multijitter", width, seconds) for kind in KINDS]
-        for number in range(passes):
-            for rival in rivals:
-                rival.measure(100 + number)
-        truth, noise = reference_of(name)
-        scale = truth**2 + 0.01 * truth.mean() ** 2
-        points = {}
-        for rival in rivals:
-            denoiser = Denoiser(rival.scene)
-            clean = [denoiser.denoise(image, ["R", "G", "B"])[..., :3] for image in rival.images]
-            error = np.mean([((image - truth) ** 2 - noise**2) / scale for image in clean], axis=0).mean(-1)
-            error = np.sort(error.ravel())[int(TRIMMED * error.size) : int((1 - TRIMMED) * error.size)].mean()
-            points[rival.kind] = (error, float(np.median(rival.seconds)) + denoiser.filter_seconds)
-        (theirs, their_time), (ours, our_time) = (points[kind] for kind in KINDS)
-        # Denoised errors fall by 1.37 where samples double
-        ratio = their_time * (max(theirs, 1e-9) / max(ours, 1e-9)) ** (np.log(2) / np.log(1.37)) / our_time
-        ratios.append(ratio)
-        print(
-            f"{name:16s} path {theirs:.5f} ({their_time:.2f} s) manylights {ours:.5f} ({our_time:.2f} s) {ratio:7.2f}",
-            flush=True,
-        )
+        ratios.append(denoised_of(name, width, seconds, passes))
     if ratios:
         print(f"geometric mean {scenes.geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
+
+
+def denoised_of(name: str, width: int, seconds: float, passes: int) -> float:
+    """Print the errors of a scene through the denoiser, and what `path` would take: over the time of manylights."""
+    from comparison.denoising import Denoiser
+
+    scene = load(name, width)
+    rivals = [Rival(name, scene, kind, "multijitter", width, seconds) for kind in KINDS]
+    for number in range(passes):
+        for rival in rivals:
+            rival.measure(100 + number)
+    truth, noise = reference_of(name)
+    scale = truth**2 + 0.01 * truth.mean() ** 2
+    points = {}
+    for rival in rivals:
+        denoiser = Denoiser(rival.scene)
+        clean = [denoiser.denoise(image, ["R", "G", "B"])[..., :3] for image in rival.images]
+        error = np.mean([((image - truth) ** 2 - noise**2) / scale for image in clean], axis=0).mean(-1)
+        error = np.sort(error.ravel())[int(TRIMMED * error.size) : int((1 - TRIMMED) * error.size)].mean()
+        points[rival.kind] = (error, float(np.median(rival.seconds)) + denoiser.filter_seconds)
+    (theirs, their_time), (ours, our_time) = (points[kind] for kind in KINDS)
+    # Denoised errors fall by 1.37 where samples double
+    ratio = their_time * (max(theirs, 1e-9) / max(ours, 1e-9)) ** (np.log(2) / np.log(1.37)) / our_time
+    print(
+        f"{name:16s} path {theirs:.5f} ({their_time:.2f} s) manylights {ours:.5f} ({our_time:.2f} s) {ratio:7.2f}",
+        flush=True,
+    )
+    return ratio
 
 
 def cold(names, width: int) -> None:
