@@ -55,8 +55,9 @@ def always(monkeypatch):
     priced = balances._priced
 
     def cheap(found, emitters, paths, samples):
-        product, cost, best = priced(found, emitters, paths, samples)
-        return (product if emitters else np.inf), cost, best
+        _, cost, best = priced(found, emitters, paths, samples)
+        # Lights on surfaces, too, wherever there are any
+        return (np.inf if not emitters else 0.0 if best.light_paths else 1.0), cost, best
 
     monkeypatch.setattr(balances, "_priced", cheap)
     monkeypatch.setattr(balances, "_PAYS_BELOW", np.inf)

@@ -31,6 +31,8 @@ from .remainder import follow
 
 # Arrivals of average brightness that a cell is taken to have had, besides its own
 _PRIOR = 2.0
+# Samples of emitters that a light has where there are many of these
+_EMITTER_SAMPLES = 16
 # Surfaces that one line meets at most, so that an endless row of hits at one place comes to an end
 _MOST_LAYERS = 1024
 
@@ -153,12 +155,8 @@ def _irradiance(scene, emission, rays, limits: Limits, seed: int):
     si = scene.ray_intersect(rays)
     side = side_of(si)
     facing, site = si.sh_frame.n * side, emission.choice.site(si, side)
-    # ---------------------- Next-event estimation ----------------------
-    sample = emission.sample(si, site, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), si.is_valid())
-    cosine = dr.maximum(dr.dot(facing, sample.direction), 0)
-    mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, cosine * dr.inv_pi))
-    nearest = dr.select(sample.density > 0, sample.arriving(scene, si.is_valid()) * cosine * mis, 0)
-    # ---------------------- A path that begins with a direction drawn by the cosine ----------------------
+    nearest = _from_emitters(scene, emission, si, facing, site, sampler)
+    # A path that begins with a direction drawn by the cosine
     local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
     ray, density, draw = si.spawn_ray(mi.Frame3f(facing).to_world(local)), local.z * dr.inv_pi, sampler.next_1d()
     dr.eval(si.p, nearest, ray, density, draw, site)
@@ -172,3 +170,19 @@ def _irradiance(scene, emission, rays, limits: Limits, seed: int):
     one = dr.select(is_nearest, nearest, found.drawn)
     irradiance = dr.select(level + more > 0, one * (level + more) / dr.sum(one), 0)
     return irradiance, dr.select(is_nearest, mi.UInt32(1), found.length)
+
+
+@recorded_once
+@dr.syntax
+def _from_emitters(scene, emission, si, facing, site, sampler):
+    """Irradiance straight from emitters, by next-event estimation."""
+    # A light is seen by many pixels: where there are many emitters, what it has of one of them would show
+    samples = dr.opaque(mi.UInt32, _EMITTER_SAMPLES if emission.lights is not None else 1)
+    found, number = dr.zeros(mi.UnpolarizedSpectrum, dr.width(si.p)), mi.UInt32(0)
+    while dr.hint(number < samples, exclude=[scene, emission, si, facing, site, samples]):
+        sample = emission.sample(si, site, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), si.is_valid())
+        cosine = dr.maximum(dr.dot(facing, sample.direction), 0)
+        mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, cosine * dr.inv_pi))
+        found += dr.select(sample.density > 0, sample.arriving(scene, si.is_valid()) * cosine * mis, 0)
+        number += 1
+    return found / mi.Float(samples)
