@@ -39,8 +39,6 @@ _LEARNING_SHARE = 0.25
 _LEARNED_COST = 1.15
 # c of the split, as a multiple of the distance between lights, below which single ones show as blotches
 _TAPER = 6.0
-# Points on area emitters where these are virtual lights, as a share of the camera rays, and how few and many
-_EMITTER_SHARE, _EMITTER_LIGHTS = 0.03, (10_000, 200_000)
 # c of paths that are whole, beyond every distance, world units: nothing is left to virtual lights
 _WHOLE = 1e15
 # Pixels darker than this share of the image's mean are lit as precisely as if they had it
@@ -271,14 +269,16 @@ class ManyLightsIntegrator(GatheringIntegrator):
         if not chosen.emitters:
             return ViewLights(surfaces)
         clock.begin(Stage.TREE)
-        groups = view.emission.lights.groups(_points_on_emitters(view), derived_seed(view.seed, 7))
+        lights = view.emission.lights
+        groups = lights.groups(lights.points(view.count), derived_seed(view.seed, 7))
         emitters = self._emitter_lights(view, groups)
         self.statistics["lights"] = self.statistics.get("lights", {}) | {"emitters": emitters.count}
         return ViewLights(surfaces, emitters)
 
     def _emitter_lights(self, view: View, groups: list) -> LightSet:
         """Lights that stand for emitters, as far as they are known."""
-        c = _TAPER * view.emission.lights.spacing(_points_on_emitters(view))
+        lights = view.emission.lights
+        c = _TAPER * lights.spacing(lights.points(view.count))
         return LightSet(groups, c, self.max_depth, 0, 0, {})
 
     def _surface_lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> LightSet | None:
@@ -342,11 +342,6 @@ class ManyLightsIntegrator(GatheringIntegrator):
 def _rays(paths: int) -> int:
     """How many rays there are to learn by which emitters light a scene."""
     return int(_LEARNING_SHARE * paths)
-
-
-def _points_on_emitters(view: View) -> int:
-    """How many points there are on area emitters."""
-    return view.emission.lights.points(int(np.clip(_EMITTER_SHARE * view.count, *_EMITTER_LIGHTS)))
 
 
 mi.register_integrator("manylights", ManyLightsIntegrator)

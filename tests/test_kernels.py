@@ -53,7 +53,7 @@ def test_sizes_and_samples_are_in_no_kernel(name, compiled):
 
 def test_sizes_and_samples_are_in_no_kernel_of_many_emitters(compiled, lights_cost_nothing, monkeypatch):
     """With another number of points on them for every size."""
-    monkeypatch.setattr("integrators.manylights._EMITTER_LIGHTS", (100, 200_000))
+    monkeypatch.setattr("vpl.split.emitter_lights._POINTS", (100, 200_000))
     lamps = {f"lamp{i}": area_light() | {"to_world": turned(0.1 * i - 4)} for i in range(80)}
     views = {f"view_{size}": closed_box({}, size)["sensor"] for size in (32, 40, 48)}
     scene = mi.load_dict(closed_box(lamps) | views)

@@ -22,8 +22,8 @@ from ..lights.virtual_lights import VirtualLights
 _SAME_NORMAL = 0.99999
 # Share of the points that all area emitters have alike: without points the surroundings of a dim one would stay dark
 _UNIFORM_SHARE = 0.5
-# Points for each area emitter, on average, at least
-_LEAST_POINTS = 4
+# Points on area emitters, as a share of the camera rays, and how few and many; for each emitter, on average, at least
+_POINTS_SHARE, _POINTS, _LEAST_POINTS = 0.03, (10_000, 200_000), 4
 
 
 @dataclass
@@ -53,9 +53,9 @@ class EmitterLights:
             return power
         return (1 - _UNIFORM_SHARE) * power / power.sum() + _UNIFORM_SHARE / some * (power > 0)
 
-    def points(self, wanted: int) -> int:
-        """How many points there should be on area emitters, where so many are wanted."""
-        return max(wanted, _LEAST_POINTS * np.count_nonzero(self.carried))
+    def points(self, paths: int) -> int:
+        """How many points there are on area emitters, for so many camera rays."""
+        return max(int(np.clip(_POINTS_SHARE * paths, *_POINTS)), _LEAST_POINTS * np.count_nonzero(self.carried))
 
     def spacing(self, count: int) -> float:
         """Typical distance between ``count`` lights on area emitters, world units: the mean over them of the area that
