@@ -216,4 +216,4 @@ def test_lights_that_stand_for_emitters_leave_less_noise(monkeypatch, always):
 
     with_lights = noise()
     monkeypatch.setattr("integrators.manylights.balance", lambda *_: balances.without_lights("this is a test"))
-    assert with_lights < 0.2 * noise()
+    assert with_lights < 0.5 * noise()

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from vpl.lights.light_set import moments_below
 from vpl.lights.light_tree import (
     BOX_MAX,
     BOX_MIN,
@@ -481,3 +482,21 @@ def test_the_inputs_are_left_alone():
     build(*lights)
     for array, copy in zip(lights, copies, strict=True):
         assert (array == copy).all()
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+def test_moments_of_a_node_are_those_of_its_lights(weighted):
+    rng = np.random.default_rng(7)
+    position = rng.normal(size=(300, 3)) + [1000, 0, 0]
+    weight = rng.random(300) * weighted
+    tree = build_light_tree(position.astype(np.float32), None, np.ones((300, 3), np.float32), rng)
+    mean, variance = moments_below(tree, position, weight)
+    for node in range(599):
+        # The leaves below a node are those of the preorder up to its escape
+        below = [k for k in range(node, tree.escape[node]) if tree.escape[k] == k + 1]
+        lights = tree.representative[below]
+        share = weight[lights] if weighted else None
+        expected = np.average(position[lights], axis=0, weights=share)
+        np.testing.assert_allclose(mean[node], expected, rtol=1e-9)
+        squares = ((position[lights] - expected) ** 2).sum(1)
+        np.testing.assert_allclose(variance[node], np.average(squares, weights=share), rtol=1e-6, atol=1e-8)

@@ -125,6 +125,22 @@ def test_every_emitter_is_in_one_cluster_from_which_it_can_be_drawn(count, most)
     assert (np.abs(often - expected) < 5 * np.sqrt(expected / 20_000) + 1e-6).all()
 
 
+@pytest.mark.parametrize("spread", ["volume", "ceiling"])
+def test_one_draw_from_the_tree_is_nearly_in_proportion_to_what_arrives(spread):
+    """Also close to single emitters: relative second and third moments of what is drawn, over the probability."""
+    rng = np.random.default_rng(6)
+    position = rng.uniform(-1, 1, (2000, 3)) * [1, 1 if spread == "volume" else 0, 1]
+    tree = EmitterTree(position, np.zeros(2000), np.ones(2000), 96)
+    seen = rng.uniform(-1, 1, (200, 3)) * [1, 1 if spread == "volume" else 0.2, 1]
+    rows, place = dr.arange(mi.UInt32, 2000), upload_vectors(mi.Point3f, np.repeat(seen, 2000, 0).astype(np.float32))
+    probability, _ = tree.probability(dr.tile(rows, 200), place, mi.Bool(True))
+    probability = np.array(probability, np.float64).reshape(200, 2000)
+    arrives = 1 / ((position[None] - seen[:, None]) ** 2).sum(2)
+    second, third = (np.mean((arrives**k / probability ** (k - 1)).sum(1) / arrives.sum(1) ** k) for k in (2, 3))
+    assert second < 3.5
+    assert third < 40
+
+
 def test_what_is_behind_a_wall_is_drawn_less_where_it_was_learned():
     """A bright bulb outside of the box next to many dim ones in it."""
     rng = np.random.default_rng(4)

@@ -128,6 +128,25 @@ def largest_below(tree: LightTree, values: np.ndarray) -> np.ndarray:
     return np.maximum.reduceat(in_order, _leaf_ranges(tree).reshape(-1))[::2]
 
 
+def moments_below(tree: LightTree, position: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For every node, the weighted mean of the positions (n, 3) of its lights, (2n - 1, 3), and the mean of their
+    squared distance from there, (2n - 1,).  ``weight`` (n,): where all of a node are 0, they count alike."""
+    first, last = _leaf_ranges(tree).T
+    place, weight = (x[tree.leaf_order].astype(np.float64) for x in (position, weight))
+    origin = place.mean(0)
+    # Relative to the middle of all, as the squares of large numbers have no digits left for small differences
+    place = place - origin
+    squares = np.concatenate([np.ones((len(place), 1)), place, (place**2).sum(1, keepdims=True)], axis=1)
+    weighted, alike = (
+        np.diff(np.concatenate([np.zeros((1, 5)), np.cumsum(x, axis=0)])[np.stack([first, last])], axis=0)[0]
+        for x in (squares * weight[:, None], squares)
+    )
+    total = np.where(weighted[:, :1] > 0, weighted, alike)
+    total = total[:, 1:] / total[:, :1]
+    mean = total[:, :3]
+    return mean + origin, np.maximum(total[:, 3] - (mean**2).sum(1), 0)
+
+
 def _second_representatives(tree: LightTree, intensity: np.ndarray, generator) -> np.ndarray:
     """For every node, one of its lights, drawn by intensity and independently of all others: (2n - 1,).
 

@@ -14,10 +14,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import upload
-from ..lights.light_set import largest_below
+from ..lights.light_set import largest_below, moments_below
 from ..lights.light_tree import BOX_MAX, BOX_MIN, INTENSITY, build_light_tree
 
 _RECORD = 8
+# Distance that a vertex has to the emitters of a node at least, as it is taken, in standard deviations of their places.
+# Lower than their spread: a vertex that is near the middle of them is likely to be near some, which would else be drawn
+# too seldom
+_LEAST_DISTANCE = 0.6
 
 
 class EmitterTree:
@@ -32,9 +36,8 @@ class EmitterTree:
         tree = build_light_tree(position.astype(np.float32), None, colours, np.random.default_rng(0))
         low, high = tree.records[:, BOX_MIN].astype(np.float64), tree.records[:, BOX_MAX].astype(np.float64)
         records = np.zeros((len(tree.records), _RECORD), np.float32)
-        records[:, 0:3] = 0.5 * (low + high)
-        # Emitters reach beyond their places: no distance is below half the size of what a node holds
-        records[:, 3] = (0.5 * np.linalg.norm(high - low, axis=1) + largest_below(tree, radius)) ** 2
+        records[:, 0:3], variance = moments_below(tree, position, intensity)
+        records[:, 3] = _LEAST_DISTANCE**2 * variance + largest_below(tree, radius) ** 2
         leaf = tree.escape == np.arange(len(tree.records)) + 1
         records[:, 4] = tree.records[:, INTENSITY]
         records[:, 5] = tree.escape.astype(np.uint32).view(np.float32)

@@ -32,7 +32,7 @@ from .remainder import follow
 # Arrivals of average brightness that a cell is taken to have had, besides its own
 _PRIOR = 2.0
 # Samples of emitters that a light has where there are many of these
-_EMITTER_SAMPLES = 16
+_EMITTER_SAMPLES = 4
 # Surfaces that one line meets at most, so that an endless row of hits at one place comes to an end
 _MOST_LAYERS = 1024
 

@@ -24,7 +24,7 @@ _MOST_CLUSTERS, _CLUSTERS_BY_RAYS = 256, 0.25
 _USUAL_SHARE = 0.4
 # Share of the emitters in the tree that are drawn alike where that is not known: near ones may be hidden, or shine
 # elsewhere
-_UNIFORM_SHARE = 0.5
+_UNIFORM_SHARE = 0.1
 # Least share of the samples that goes to emitters with a place, and to others, where there are both
 _LEAST_SHARE = 0.1
 
