@@ -45,7 +45,7 @@ class LearnedEmitters:
         alike = np.zeros(self._count + (self._regions.count if self._regions else 0))
         alike[: self._count] = weight / weight.sum()
         # What regions cannot tell apart, the environment's own sampling may
-        self._both = self._regions is not None and not self._regions.fine
+        self._both = self._regions is not None and not self._regions.constant
         if self._regions and not self._both:
             light = np.maximum(self._regions.irradiance, 0)
             light = light / light.sum() if light.sum() > 0 else np.full(len(light), 1 / len(light))

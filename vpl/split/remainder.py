@@ -56,11 +56,16 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
         path.scattered += dr.select(met.smooth, 1, 0)
         path.site, member = emission.choice.site(met.si, met.side), sampler.next_1d()
         sample = emission.sample(met.si, path.site, chosen, member, place, met.smooth)
-        lit = _lit(path, met, sample, weight, context, limits, sampler)
-        gains.add(lit * sample.arriving(scene, dr.max(dr.abs(lit)) > 0), path.depth + 2, sampler)
         lobe = dr.select(met.smooth, lobe, sampler.next_1d())
         turn = dr.select(met.smooth, turn, sampler.next_2d())
-        kept = _turn(path, met, context, lobe, turn, gathers, weight)
+        # One call: kernels hold the code of all materials for each
+        toward = met.si.to_local(sample.direction)
+        *lit_by, turned, share = met.bsdf.eval_pdf_sample(
+            context, met.si, toward, lobe, turn, path.active & ~met.hidden
+        )  # fmt: skip
+        lit = _lit(path, met, sample, toward.z, *lit_by, weight, limits, sampler)
+        gains.add(lit * sample.arriving(scene, dr.max(dr.abs(lit)) > 0), path.depth + 2, sampler)
+        kept = _turn(path, met, turned, share, gathers, weight)
         _end_as_path(path, met, kept, limits, sampler)
         if dr.hint(limits.hide_emitters, mode="scalar"):
             _pass_hidden(path, met, first)
@@ -115,13 +120,12 @@ def _left_of_emitter(path: Path, emitter: MetEmitter, limits: Limits):
     return path.throughput - dr.select(carried, path.carried * w, 0)
 
 
-def _lit(path: Path, met: Met, sample: EmitterSample, weight, context, limits: Limits, sampler):
-    """What paths bring of the light of the emitters that were sampled, less what virtual lights carry.  ``weight``: of
-    the gather vertex that this is, or 0."""
-    local = met.si.to_local(sample.direction)
-    value, density = met.bsdf.eval_pdf(context, met.si, local, met.smooth)
+def _lit(path: Path, met: Met, sample: EmitterSample, height, value, density, weight, limits: Limits, sampler):
+    """What paths bring of the light of the emitters that were sampled, less what virtual lights carry.  ``height``: of
+    the direction above the surface, ``value`` and ``density`` that the BSDF has there; ``weight``: of the gather vertex
+    that this is, or 0."""
     full = path.throughput * mi.unpolarized_spectrum(value)
-    cosine = dr.select(local.z * met.side > 0, dr.abs(local.z), 0)
+    cosine = dr.select(height * met.side > 0, dr.abs(height), 0)
     value = full - path.carried * cosine
     if sample.nearness is not None:
         w = carried_share_of_emitter(limits.emitters_squared_c, sample.nearness, cosine)
@@ -134,10 +138,9 @@ def _lit(path: Path, met: Met, sample: EmitterSample, weight, context, limits: L
     return dr.select(met.smooth & (sample.density > 0), value * mis, 0)
 
 
-def _turn(path: Path, met: Met, context, lobe, turn, gathers, weight):
-    """Draw the next direction: how much virtual lights leave of what goes there.  ``gathers``, ``weight``: whether
-    lights are gathered here."""
-    bs, share = met.bsdf.sample(context, met.si, lobe, turn, path.active & ~met.hidden)
+def _turn(path: Path, met: Met, bs, share, gathers, weight):
+    """Take the direction that the BSDF has drawn, ``bs`` with its weight ``share``: how much virtual lights leave of
+    what goes there.  ``gathers``, ``weight``: whether lights are gathered here."""
     full = path.throughput * mi.unpolarized_spectrum(share)
     path.delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     # As in `path`, by the direction that is drawn, even where the path ends
