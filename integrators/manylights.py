@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import drjit as dr
@@ -14,7 +15,7 @@ from vpl.core.stages import Stage
 from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.points.camera_paths import SceneTraits
-from vpl.split.balance import Balance, balance, importance, judged_by, noise, without_lights
+from vpl.split.balance import Balance, Option, Seen, balance, importance, judged_by, noise, without_lights
 from vpl.split.gather_vertices import LitVertices
 from vpl.split.kept_lights import KeptLights, TreedLights
 from vpl.split.next_event import emitters_of
@@ -156,16 +157,14 @@ class ManyLightsIntegrator(GatheringIntegrator):
         """(Radiance of each camera ray, whether it is opaque in the film's alpha)."""
         clock, self.statistics = Clock(Stage.PILOT), {}
         pilot = self._pilot(view)
-        left = self._left(view)
-        chosen = self._balance(view, pilot, left)
+        chosen, options = self._balance(view, pilot)
         self._judge(view, pilot, chosen)
         mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
         lights = self._lights(view, pilot, chosen, clock)
         limits = self._limits(view, lights, self.max_depth, EVERYWHERE if lights.all else NOWHERE)
-        carried = pilot.indirect * bool(lights.surfaces)
-        if lights.emitters:
-            carried += pilot.radiance - left.radiance
-        expected = np.maximum(pilot.nearby(carried, view.width, view.pixels), 0)
+        kinds = bool(lights.surfaces), bool(lights.emitters)
+        left = next((x.radiance for x in options if (x.surfaces, x.emitters) == kinds), pilot.radiance)
+        expected = np.maximum(pilot.nearby(pilot.radiance - left, view.width, view.pixels), 0)
         radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
         # Whole pixels at a time
         most = max(_WAVEFRONT // view.samples, 1) * view.samples
@@ -218,30 +217,41 @@ class ManyLightsIntegrator(GatheringIntegrator):
         return pilot
 
     def _followed(self, view: View, lights: ViewLights) -> Pilot:
-        """What is found by pairs of paths all over the image, always the same ones."""
+        """What is found by pairs of paths all over the image, always the same ones, besides light of ``lights`` at
+        their first vertices."""
         lane = view.pairs(_PILOT)
         limits = self._limits(view, lights, self.max_depth, AT_FIRST)
         found, vertices, _, arrival = view.follow(upload(mi.UInt32, lane), limits, 1)
         return Pilot.of(found, vertices, arrival, lane // view.samples)
 
-    def _left(self, view: View) -> Pilot | None:
-        """What lights that stand for emitters would leave of the pilot's paths; None where there can be none."""
-        possible = self.virtual_lights and self.max_depth > 1 and not view.perturbed.everywhere
-        if not possible or view.emission.lights is None:
-            return None
-        return self._followed(view, ViewLights(emitters=self._emitter_lights(view, [])))
-
-    def _balance(self, view: View, pilot: Pilot, left: Pilot | None) -> Balance:
-        """What the pilot leads to."""
+    def _balance(self, view: View, pilot: Pilot) -> tuple[Balance, list[Option]]:
+        """What the pilot leads to, and the lights that were considered."""
         if not self.virtual_lights:
-            return without_lights("virtual_lights is off")
+            return without_lights("virtual_lights is off"), []
         if view.perturbed.everywhere:
-            return without_lights("bump or normal maps are in shape groups")
-        if self.max_depth <= 2 and left is None:
-            return without_lights("no light is indirect at this max_depth")
-        rest = None if left is None else (left.radiance, left.indirect)
-        brightness = pilot.brightness(view.width)
-        return balance(pilot.radiance, pilot.indirect, brightness, view.count, view.samples, rest)
+            return without_lights("bump or normal maps are in shape groups"), []
+        emitters = self._emitter_lights(view, []) if view.emission.lights is not None and self.max_depth > 1 else None
+        if self.max_depth <= 2 and emitters is None:
+            return without_lights("no light is indirect at this max_depth"), []
+        direct, brightness = pilot.radiance - pilot.indirect, pilot.brightness(view.width)
+        seen = Seen(pilot.radiance, direct, brightness, view.count, view.samples, emitters is not None)
+        options = self._with_surfaces(view, seen, pilot, None)
+        if emitters is not None:
+            left = self._followed(view, ViewLights(emitters=emitters))
+            options.append(Option(False, True, left.radiance, left.indirect))
+            options += self._with_surfaces(view, seen, left, emitters)
+        return balance(seen, options), options
+
+    def _with_surfaces(self, view: View, seen: Seen, left: Pilot, emitters: LightSet | None) -> list[Option]:
+        """The option of lights on surfaces next to those that stand for ``emitters``, which leave ``left``."""
+        if self.max_depth <= 2 or not left.indirect.any():
+            return []
+        at_best = Option(True, emitters is not None, left.radiance - left.indirect, left.indirect)
+        if not balance(seen, [at_best]).gathers:
+            return [at_best]
+        # How far from each other they are is not known yet: as near as can be
+        lights = ViewLights(LightSet([], 0.0, self.max_depth, 0, 0, {}), emitters)
+        return [replace(at_best, radiance=self._followed(view, lights).radiance)]
 
     def _judge(self, view: View, pilot: Pilot, chosen: Balance) -> None:
         """What it is worth to follow paths of a view."""

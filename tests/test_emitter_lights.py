@@ -54,10 +54,10 @@ def always(monkeypatch):
     """Lights stand for emitters even in small images."""
     priced = balances._priced
 
-    def cheap(found, emitters, paths, samples):
-        _, cost, best = priced(found, emitters, paths, samples)
+    def cheap(seen, option):
+        _, cost, best = priced(seen, option)
         # Lights on surfaces, too, wherever there are any
-        return (np.inf if not emitters else 0.0 if best.light_paths else 1.0), cost, best
+        return (np.inf if not option.emitters else 0.0 if option.surfaces else 1.0), cost, best
 
     monkeypatch.setattr(balances, "_priced", cheap)
     monkeypatch.setattr(balances, "_PAYS_BELOW", np.inf)

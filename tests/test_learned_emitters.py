@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.core.arrays import upload_vectors
+from vpl.core.arrays import upload, upload_vectors
 from vpl.lights.light_set import LightSet
 from vpl.split.learned_emitters import LearnedEmitters
 from vpl.split.paths import EVERYWHERE
@@ -72,6 +72,25 @@ def test_rows_of_probabilities_are_positive_for_every_emitter_and_sum_to_one(emi
     np.testing.assert_allclose(rows.sum(1), 1, atol=1e-5)
     by_itself = [not e.is_environment() or emitter != "constant" for e in emission._scene.emitters()]
     assert (rows >= 0).all() and ((rows[:, : emission._count] > 0) == by_itself).all()
+
+
+@pytest.mark.parametrize("learns", [False, True])
+def test_no_direction_at_the_edge_of_a_small_sun_weighs_far_too_much(learns):
+    """Half a degree wide, by Mitsuba's default: densities of directions there are not those that they were drawn by."""
+    emission, position, normal = learned(mi.load_dict({"type": "scene", **EMITTERS["sunsky"]()}))
+    if not learns:
+        emission.choice.forget()
+    si = dr.zeros(mi.SurfaceInteraction3f, len(position))
+    si.p, si.n = upload_vectors(mi.Point3f, position), upload_vectors(mi.Normal3f, normal)
+    si.sh_frame = mi.Frame3f(si.n)
+    site = emission.choice.site(si, mi.Float(1))
+    rng, heaviest, total = np.random.default_rng(0), 0.0, 0.0
+    for _ in range(20):
+        chosen, member, *place = (upload(mi.Float, rng.random(len(position))) for _ in range(4))
+        sample = emission.sample(si, site, chosen, member, mi.Point2f(*place), mi.Bool(True))
+        weight = np.array(sample.weight)[0]
+        heaviest, total = max(heaviest, weight.max()), total + weight.mean() / 20
+    assert heaviest < 20 * total
 
 
 def test_all_vertices_at_one_place_are_a_site_that_is_found_again():

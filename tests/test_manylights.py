@@ -21,7 +21,7 @@ from .test_masks_in_between import veiled_room
 from .test_small_suns import sunny
 
 # What the quick run tests
-QUICK_EMITTERS = ("point", "spot", "directional", "rectangle", "envmap", "constant")
+QUICK_EMITTERS = ("point", "spot", "directional", "rectangle", "envmap", "constant", "sunsky")
 QUICK_MATERIALS = ("roughplastic", "principled", "mask", "blendbsdf", "twosided")
 
 

@@ -15,7 +15,7 @@ from vpl.lights.light_set import ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.lights.virtual_lights import DeviceLights, VirtualLights
 from vpl.points.surfaces import LambertianSurface
-from vpl.split.balance import balance
+from vpl.split.balance import Option, Seen, balance
 from vpl.split.cells import Cells
 from vpl.split.floors import agrees, carried_share, floor_of, side_of
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
@@ -305,18 +305,32 @@ def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
 # ---------------------- Balance ----------------------
 
 
+def balanced(direct, indirect, paths, samples, left=None):
+    """The balance of an image of an even brightness; ``left``: of it with lights on surfaces, None for all direct."""
+    option = Option(True, False, direct if left is None else left, indirect)
+    return balance(Seen(direct + indirect, direct, np.ones(len(direct)), paths, samples, False), [option])
+
+
 def test_lights_pay_where_indirect_light_is_the_noise_and_only_there():
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
-    level = np.ones(10_000)
-    assert balance(indirect, indirect, level, 10**8, 64).light_paths > 0
-    assert balance(indirect, indirect, level, 10**4, 64).light_paths == 0
-    assert balance(direct, 1e-3 * indirect, level, 10**7, 64).light_paths == 0
-    assert balance(direct, 0 * indirect, level, 10**8, 64).light_paths == 0
+    none = np.zeros(10_000)
+    assert balanced(none, indirect, 10**8, 64).light_paths > 0
+    assert balanced(none, indirect, 10**4, 64).light_paths == 0
+    assert balanced(direct, 1e-3 * indirect, 10**7, 64).light_paths == 0
+    assert balance(Seen(direct, direct, none + 1, 10**8, 64, False), []).light_paths == 0
+
+
+def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
+    """As behind veils, which stop what lights shine, and let paths pass."""
+    rng = np.random.default_rng(0)
+    indirect, direct = rng.exponential(size=(2, 10_000))
+    assert balanced(0.1 * direct, indirect, 10**8, 64).light_paths > 0
+    assert balanced(0.1 * direct, indirect, 10**8, 64, left=0.95 * indirect).light_paths == 0
 
 
 def test_one_sample_has_no_noise_that_lights_could_take_away():
-    chosen = balance(np.ones(2), np.full(2, 0.5), np.ones(2), 1, 1)
+    chosen = balanced(np.full(2, 0.5), np.full(2, 0.5), 1, 1)
     assert chosen.light_paths == 0 and "nan" not in chosen.reason
 
 

@@ -14,11 +14,11 @@ from .worth import survival_of
 
 # What making lights and clusters costs besides (kernels that are traced and started, trees), and a path from a light
 _FIXED_COST, _LIGHT_PATH_COST = 200_000, 4.0
-# Share of the indirect light's variance that lights take away where they carry it
-_GAIN = 0.9
 # Variance of what is left that samples of a pixel, spread well, leave at best, next to that of the pilot's; where there
 # are more emitters than samples, these are hardly spread over them
 _SPREAD, _MANY_EMITTERS_SPREAD = 0.5, 1.0
+# Share of the noise that lights are taken to leave at least: for less, cuts would be finer than pays
+_LEAST_LEFT = 0.15
 # Relative standard error that one set of lights leaves in the mean of the image
 _SET_ERROR = 0.03
 # Relative variance that a set of lights leaves in a pixel, times the paths that it was made by
@@ -66,69 +66,82 @@ class Balance:
         return self.emitters or self.light_paths > 0
 
 
-@dataclass
-class Noise:
-    """Relative variance of a path from the camera: ``whole``, and ``direct``: without light that came by way of
-    surfaces that virtual lights may stand for; ``clumps``: mean square of that light over its squared mean."""
+@dataclass(frozen=True)
+class Option:
+    """Lights of some kinds: on ``surfaces``, or that stand for ``emitters``, or both.
 
-    whole: float
-    direct: float
-    clumps: float
-
-    @classmethod
-    def of(cls, radiance: np.ndarray, indirect: np.ndarray, brightness: np.ndarray, spread: float) -> Noise:
-        """That of a pilot, see :func:`balance`, when samples that are spread well leave a share ``spread``."""
-        whole, direct = noise(radiance, brightness), noise(radiance - indirect, brightness)
-        whole -= (1 - spread) * min(direct, whole)
-        squares, total = np.sum(indirect**2), np.sum(indirect)
-        return cls(whole, min(spread * direct, whole), len(indirect) * squares / total**2 if total else 0.0)
-
-
-def balance(radiance, indirect, brightness: np.ndarray, paths: int, samples: int, left=None) -> Balance:
-    """The balance for ``paths`` camera paths, ``samples`` a pixel.
-
-    ``radiance`` (n,): what a pilot's paths found, two next to each other from one pixel; ``indirect`` (n,): the part of
-    it that came by way of surfaces that virtual lights may stand for; ``brightness`` (n,): of the image around;
-    ``left``: (radiance, indirect) of the same paths where lights stand for emitters, None if they may not.
+    ``radiance`` (n,): what a pilot's paths find besides; ``indirect`` (n,): what comes to them by way of surfaces that
+    lights may stand for.
     """
-    spread = max(_SPREAD if left is None else _MANY_EMITTERS_SPREAD, samples**-0.5)
-    whole = Noise.of(radiance, indirect, brightness, spread)
-    options = [_priced(whole, False, paths, samples)] if indirect.any() else []
-    if left is not None:
-        others = Noise.of(*left, brightness, spread)
-        options += [_priced(others, True, paths, samples)] if left[1].any() else []
-        options.append(_priced(Noise(others.whole, others.whole, 0.0), True, paths, samples))
+
+    surfaces: bool
+    emitters: bool
+    radiance: np.ndarray
+    indirect: np.ndarray
+
+    @property
+    def clumps(self) -> float:
+        """Mean square of the indirect light over its squared mean."""
+        total = np.sum(self.indirect)
+        return len(self.indirect) * np.sum(self.indirect**2) / total**2 if total else 0.0
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a pilot tells of an image of ``paths`` camera paths, ``samples`` a pixel.
+
+    ``radiance`` (n,): what the pilot's paths found, two next to each other from one pixel; ``direct`` (n,): without
+    what came by way of surfaces that lights may stand for; ``brightness`` (n,): of the image around; ``emitters``:
+    whether lights may stand for these, which are many.
+    """
+
+    radiance: np.ndarray
+    direct: np.ndarray
+    brightness: np.ndarray
+    paths: int
+    samples: int
+    emitters: bool
+
+    def noise(self, radiance: np.ndarray) -> float:
+        """Relative variance of a path that finds ``radiance`` (n,), when samples of a pixel are spread well."""
+        spread = max(_MANY_EMITTERS_SPREAD if self.emitters else _SPREAD, self.samples**-0.5)
+        whole = noise(radiance, self.brightness)
+        return whole - (1 - spread) * min(noise(self.direct, self.brightness), whole)
+
+
+def balance(seen: Seen, options: list[Option]) -> Balance:
+    """The balance of what a pilot has seen: without lights, or with those of the best option."""
     if not options:
         return without_lights("no light comes by way of surfaces that virtual lights could stand for")
-    product, cost, best = min(options, key=lambda option: option[0])
-    left_over = best.noise / max(whole.whole, _TINY)
-    if product > _PAYS_BELOW * whole.whole:
+    whole = seen.noise(seen.radiance)
+    product, cost, best = min((_priced(seen, option) for option in options), key=lambda option: option[0])
+    left_over = best.noise / max(whole, _TINY)
+    if product > _PAYS_BELOW * whole:
         price = f"virtual lights would cost {cost - 1:.2g} times as much as the paths"
         return without_lights(f"{price} and leave {left_over:.0%} of the noise")
     return replace(best, reason=f"virtual lights take {1 - left_over:.0%} of the noise away")
 
 
-def _priced(found: Noise, emitters: bool, paths: int, samples: int) -> tuple[float, float, Balance]:
-    """(Variance × cost, cost, what is best) with lights on surfaces, if these have anything to carry, and with lights
-    that stand for ``emitters``."""
-    share = 1 - found.direct / max(found.whole, _TINY)
-    rest = found.whole * (1 - _GAIN * share)
+def _priced(seen: Seen, option: Option) -> tuple[float, float, Balance]:
+    """(Variance × cost, cost, what is best) with the lights of an option."""
+    paths, samples = seen.paths, seen.samples
+    rest = max(seen.noise(option.radiance), _LEAST_LEFT * seen.noise(seen.radiance))
     # The least of (noise of paths / samples + noise of cuts / rays) × (samples + rays × their cost), rays of a pixel
-    cuts = _EMITTER_CUTS * emitters + (found.clumps > 0)
+    cuts = _EMITTER_CUTS * option.emitters + option.surfaces
     rays = samples * np.clip((_CUT_NOISE / (_RAY_COST * max(rest, 1e-9))) ** 0.5, *_RAYS)
     error = float(np.clip(_ERROR * (rays / _RAYS_AT_ERROR) ** -_SLOPE, _FINEST, _COARSEST))
     # A cut has some nodes, however few rays are wanted
     rays = _RAYS_AT_ERROR * (error / _ERROR) ** (-1 / _SLOPE)
     left, light_paths = rest + cuts * _CUT_NOISE * samples / rays, 0
-    if found.clumps:
+    if option.surfaces:
         # The least of (noise of these / samples + noise of lights / their paths) × cost
         balanced = (_LIGHT_NOISE * samples * paths / (_LIGHT_PATH_COST * left)) ** 0.5
-        wanted = np.clip(max(balanced, found.clumps / _SET_ERROR**2), _SHARES[0] * paths, _SHARES[1] * paths)
+        wanted = np.clip(max(balanced, option.clumps / _SET_ERROR**2), _SHARES[0] * paths, _SHARES[1] * paths)
         light_paths = int(np.clip(wanted, _FEWEST, _MOST))
     fixed = (_FIXED_COST + _LIGHT_PATH_COST * light_paths) / paths
     cost = 1 + cuts * _RAY_COST * rays / samples + fixed
     vertices = int(np.clip(samples // _SAMPLES_A_VERTEX, 1, _MOST_VERTICES))
-    return cost * left, cost, Balance(light_paths, emitters, error, vertices, left, "")
+    return cost * left, cost, Balance(light_paths, option.emitters, error, vertices, left, "")
 
 
 def without_lights(reason: str) -> Balance:

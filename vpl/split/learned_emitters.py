@@ -89,20 +89,27 @@ class LearnedEmitters:
         if not self._both:
             return sample.chosen_with(probability)
         # What both the emitter and its regions may draw has the sum of their densities
-        of_environment = active & ((source >= self._count) | (source == self._environment_number))
-        both = self._environment_density(si, site, sample.direction, of_environment)
+        of_region = active & (source >= self._count)
+        of_environment = of_region | (active & (source == self._environment_number))
+        # The emitter's own density where it has drawn: asked for its direction alone, Mitsuba 3.9.1 takes directions at
+        # the edge of the sun for the sky's, a hundred thousand times less likely
+        own = dr.select(of_region, self._own_density(si, sample.direction, of_region), sample.density)
+        both = self._environment_density(site, sample.direction, own, of_environment)
         return sample.chosen_with(dr.select(of_environment, both / sample.density, probability))
 
-    def _environment_density(self, si, site, direction, active):
-        """Density with which a direction to the environment is drawn."""
+    def _own_density(self, origin, direction, active):
+        """Density with which the environment itself draws a direction."""
+        if not self._both:
+            return mi.Float(0)
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.d = direction
+        return self._environment.pdf_direction(origin, ds, active)
+
+    def _environment_density(self, site, direction, own, active):
+        """Density with which a direction to the environment is drawn; ``own``: by the environment itself."""
         region, density = self._regions.find(direction, active)
         density *= self.choice.probability(site, self._count + region, active)
-        if self._both:
-            ds = dr.zeros(mi.DirectionSample3f)
-            ds.d = direction
-            by_emitter = self.choice.probability(site, mi.UInt32(self._environment_number), active)
-            density += self._environment.pdf_direction(si, ds, active) * by_emitter
-        return density
+        return density + own * self.choice.probability(site, mi.UInt32(self._environment_number), active)
 
     def met(self, vertex, site, ray, si, has_density, active) -> MetEmitter:
         """As :meth:`vpl.split.next_event.UniformEmitters.met`."""
@@ -121,7 +128,9 @@ class LearnedEmitters:
             density = dr.if_stmt(
                 (origin, site, ray.d, density),
                 wanted & ~si.is_valid(),
-                lambda origin, site, direction, density: self._environment_density(origin, site, direction, True),
+                lambda origin, site, direction, density: self._environment_density(
+                    site, direction, self._own_density(origin, direction, True), True
+                ),
                 lambda origin, site, direction, density: density,
             )
         return MetEmitter(emitted, density)
