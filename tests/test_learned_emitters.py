@@ -206,3 +206,18 @@ def test_no_kernel_is_compiled_anew_for_another_seed(lights_cost_nothing):
         render(scene, "manylights", 16, 3, max_depth=4)
         kernels = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
     assert [kernel["size"] for kernel in kernels if not kernel["cache_hit"]] == []
+
+
+@pytest.mark.parametrize("texel", [0.0, np.nan, np.inf])
+def test_an_environment_of_no_density_spoils_no_path(texel):
+    """Mitsuba's own density of an image that is black, or has a texel that is no number, is none in any direction."""
+    pixels = np.zeros((4, 8, 3), np.float32)
+    pixels[1, 2] = texel
+    lit = closed_box(bulbs(), 12)
+    del lit["left"]
+    images = []
+    for sky in ({}, {"sky": {"type": "envmap", "bitmap": mi.Bitmap(pixels)}}):
+        image, statistics = render_with_statistics("manylights", mi.load_dict(lit | sky), 256, max_depth=3)
+        images.append(image.mean())
+        assert statistics["dropped"] == 0
+    assert images[1] == pytest.approx(images[0], rel=0.02)

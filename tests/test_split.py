@@ -15,7 +15,7 @@ from vpl.lights.light_set import ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.lights.virtual_lights import DeviceLights, VirtualLights
 from vpl.points.surfaces import LambertianSurface
-from vpl.split.balance import Option, Seen, balance
+from vpl.split.balance import Evidence, Option, balance
 from vpl.split.cells import Cells
 from vpl.split.floors import agrees, carried_share, floor_of, side_of
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
@@ -306,9 +306,9 @@ def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
 
 
 def balanced(direct, indirect, paths, samples, left=None):
-    """The balance of an image of an even brightness; ``left``: of it with lights on surfaces, None for all direct."""
-    option = Option(True, False, direct if left is None else left, indirect)
-    return balance(Seen(direct + indirect, direct, np.ones(len(direct)), paths, samples, False), [option])
+    """The balance of an image of an even brightness; ``left``: of it besides lights on surfaces, if followed."""
+    option = Option(True, False, direct + indirect, indirect, left)
+    return balance(Evidence(direct + indirect, direct, np.ones(len(direct)), paths, samples, False), [option])
 
 
 def test_lights_pay_where_indirect_light_is_the_noise_and_only_there():
@@ -318,7 +318,7 @@ def test_lights_pay_where_indirect_light_is_the_noise_and_only_there():
     assert balanced(none, indirect, 10**8, 64).light_paths > 0
     assert balanced(none, indirect, 10**4, 64).light_paths == 0
     assert balanced(direct, 1e-3 * indirect, 10**7, 64).light_paths == 0
-    assert balance(Seen(direct, direct, none + 1, 10**8, 64, False), []).light_paths == 0
+    assert balance(Evidence(direct, direct, none + 1, 10**8, 64, False), []).light_paths == 0
 
 
 def test_lights_do_not_pay_where_they_leave_what_they_should_carry():

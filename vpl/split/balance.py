@@ -17,8 +17,9 @@ _FIXED_COST, _LIGHT_PATH_COST = 200_000, 4.0
 # Variance of what is left that samples of a pixel, spread well, leave at best, next to that of the pilot's; where there
 # are more emitters than samples, these are hardly spread over them
 _SPREAD, _MANY_EMITTERS_SPREAD = 0.5, 1.0
-# Share of the noise that lights are taken to leave at least: for less, cuts would be finer than pays
-_LEAST_LEFT = 0.15
+# Share of the indirect light's variance that lights are assumed to take away, and by how many times more may be left
+# when that is followed, which is rough, too, before it is believed instead
+_GAIN, _DOUBTFUL = 0.9, 1.5
 # Relative standard error that one set of lights leaves in the mean of the image
 _SET_ERROR = 0.03
 # Relative variance that a set of lights leaves in a pixel, times the paths that it was made by
@@ -70,14 +71,21 @@ class Balance:
 class Option:
     """Lights of some kinds: on ``surfaces``, or that stand for ``emitters``, or both.
 
-    ``radiance`` (n,): what a pilot's paths find besides; ``indirect`` (n,): what comes to them by way of surfaces that
-    lights may stand for.
+    Of a pilot's paths, (n,) each: ``traced``: what they find without lights on surfaces; ``indirect``: the part of it
+    that comes by way of surfaces that lights may stand for; ``left``: what they find besides light of lights on
+    surfaces, None where that was not followed.
     """
 
     surfaces: bool
     emitters: bool
-    radiance: np.ndarray
+    traced: np.ndarray
     indirect: np.ndarray
+    left: np.ndarray | None = None
+
+    @property
+    def expected(self) -> np.ndarray:
+        """What the paths are expected to find besides light of lights, (n,)."""
+        return self.traced - self.indirect * self.surfaces
 
     @property
     def clumps(self) -> float:
@@ -85,10 +93,19 @@ class Option:
         total = np.sum(self.indirect)
         return len(self.indirect) * np.sum(self.indirect**2) / total**2 if total else 0.0
 
+    def noise(self, evidence: Evidence) -> float:
+        """Relative variance that lights leave of a path."""
+        traced = evidence.noise(self.traced)
+        if not self.surfaces:
+            return traced
+        assumed = traced - _GAIN * (traced - min(evidence.noise(self.expected), traced))
+        followed = assumed if self.left is None else evidence.noise(self.left)
+        return followed if followed > _DOUBTFUL * assumed else assumed
+
 
 @dataclass(frozen=True)
-class Seen:
-    """What a pilot tells of an image of ``paths`` camera paths, ``samples`` a pixel.
+class Evidence:
+    """Evidence of a pilot on an image of ``paths`` camera paths, ``samples`` a pixel.
 
     ``radiance`` (n,): what the pilot's paths found, two next to each other from one pixel; ``direct`` (n,): without
     what came by way of surfaces that lights may stand for; ``brightness`` (n,): of the image around; ``emitters``:
@@ -109,12 +126,12 @@ class Seen:
         return whole - (1 - spread) * min(noise(self.direct, self.brightness), whole)
 
 
-def balance(seen: Seen, options: list[Option]) -> Balance:
+def balance(evidence: Evidence, options: list[Option]) -> Balance:
     """The balance of what a pilot has seen: without lights, or with those of the best option."""
     if not options:
         return without_lights("no light comes by way of surfaces that virtual lights could stand for")
-    whole = seen.noise(seen.radiance)
-    product, cost, best = min((_priced(seen, option) for option in options), key=lambda option: option[0])
+    whole = evidence.noise(evidence.radiance)
+    product, cost, best = min((_priced(evidence, option) for option in options), key=lambda option: option[0])
     left_over = best.noise / max(whole, _TINY)
     if product > _PAYS_BELOW * whole:
         price = f"virtual lights would cost {cost - 1:.2g} times as much as the paths"
@@ -122,10 +139,9 @@ def balance(seen: Seen, options: list[Option]) -> Balance:
     return replace(best, reason=f"virtual lights take {1 - left_over:.0%} of the noise away")
 
 
-def _priced(seen: Seen, option: Option) -> tuple[float, float, Balance]:
+def _priced(evidence: Evidence, option: Option) -> tuple[float, float, Balance]:
     """(Variance × cost, cost, what is best) with the lights of an option."""
-    paths, samples = seen.paths, seen.samples
-    rest = max(seen.noise(option.radiance), _LEAST_LEFT * seen.noise(seen.radiance))
+    rest, paths, samples = option.noise(evidence), evidence.paths, evidence.samples
     # The least of (noise of paths / samples + noise of cuts / rays) × (samples + rays × their cost), rays of a pixel
     cuts = _EMITTER_CUTS * option.emitters + option.surfaces
     rays = samples * np.clip((_CUT_NOISE / (_RAY_COST * max(rest, 1e-9))) ** 0.5, *_RAYS)

@@ -92,24 +92,30 @@ class LearnedEmitters:
         of_region = active & (source >= self._count)
         of_environment = of_region | (active & (source == self._environment_number))
         # The emitter's own density where it has drawn: asked for its direction alone, Mitsuba 3.9.1 takes directions at
-        # the edge of the sun for the sky's, a hundred thousand times less likely
+        # the edge of the sun for the sky's, a hundred thousand times less likely, and as dark. Regions that draw these
+        # do not find the sun, either: it loses a thousandth of its light at most
         own = dr.select(of_region, self._own_density(si, sample.direction, of_region), sample.density)
         both = self._environment_density(site, sample.direction, own, of_environment)
         return sample.chosen_with(dr.select(of_environment, both / sample.density, probability))
 
     def _own_density(self, origin, direction, active):
-        """Density with which the environment itself draws a direction."""
-        if not self._both:
-            return mi.Float(0)
+        """Density with which the environment itself draws a direction: of a black one, Mitsuba's is no number."""
         ds = dr.zeros(mi.DirectionSample3f)
         ds.d = direction
-        return self._environment.pdf_direction(origin, ds, active)
+        return finite_or_zero(self._environment.pdf_direction(origin, ds, active))
 
     def _environment_density(self, site, direction, own, active):
         """Density with which a direction to the environment is drawn; ``own``: by the environment itself."""
         region, density = self._regions.find(direction, active)
         density *= self.choice.probability(site, self._count + region, active)
-        return density + own * self.choice.probability(site, mi.UInt32(self._environment_number), active)
+        if self._both:
+            density += own * self.choice.probability(site, mi.UInt32(self._environment_number), active)
+        return density
+
+    def _density_met(self, origin, site, direction):
+        """Density of a direction in which the environment was met."""
+        own = self._own_density(origin, direction, True) if self._both else None
+        return self._environment_density(site, direction, own, True)
 
     def met(self, vertex, site, ray, si, has_density, active) -> MetEmitter:
         """As :meth:`vpl.split.next_event.UniformEmitters.met`."""
@@ -128,9 +134,7 @@ class LearnedEmitters:
             density = dr.if_stmt(
                 (origin, site, ray.d, density),
                 wanted & ~si.is_valid(),
-                lambda origin, site, direction, density: self._environment_density(
-                    site, direction, self._own_density(origin, direction, True), True
-                ),
+                lambda origin, site, direction, density: self._density_met(origin, site, direction),
                 lambda origin, site, direction, density: density,
             )
         return MetEmitter(emitted, density)

@@ -40,8 +40,7 @@ class Onward:
 
 @dataclass
 class Pilot:
-    """Paths of which nothing was left to virtual lights on surfaces, two next to each other from one pixel.  What they
-    found may be negative where lights stand for emitters.
+    """Paths, two next to each other from one pixel.  What they found may be negative where virtual lights carry a part.
 
     ``arrivals``: their second vertices, where they have a floor, as their first ones have; ``pixel``, ``radiance``,
     ``indirect`` (n,): the pixel of each path, what it found, and the part that came by way of its second vertex.

@@ -88,9 +88,9 @@ class TreeEmitters:
 
     # ---------------------- Choice ----------------------
 
-    def _draw(self, source, position, number, active):
-        """An emitter of each source by a uniform number: (whether it has a place, its row in the tree, its index among
-        the distant ones)."""
+    def _draw(self, source, position, number, member, active):
+        """An emitter of each source by two uniform numbers, of what kind and which: (whether it has a place, its row in
+        the tree, its index among the distant ones)."""
         distant = mi.UInt32(max(self._distant - 1, 0))
         usual = source == self._clusters + self._distant
         near = active & dr.select(usual, number < self._share, source < self._clusters)
@@ -98,13 +98,11 @@ class TreeEmitters:
         if self._distant:
             among = mi.UInt32(dr.maximum(number - self._share, 0) / (1 - self._share) * self._distant)
             index = dr.minimum(dr.select(usual, among, index), distant)
-        number = dr.select(usual, number / self._share, number)
-        alike, count = usual & (number < _UNIFORM_SHARE), self._tree.count
-        by_tree = dr.select(usual, (number - _UNIFORM_SHARE) / (1 - _UNIFORM_SHARE), number)
-        by_tree = dr.clip(by_tree, 0, dr.one_minus_epsilon(mi.Float))
+        alike, count = usual & (number < self._share * _UNIFORM_SHARE), self._tree.count
         node = dr.select(usual, 0, self._tree.root(source, near & ~usual))
-        row = self._tree.draw(node, position, by_tree, near & ~alike)
-        alike_row = dr.minimum(mi.UInt32(number * (count / _UNIFORM_SHARE)), count - 1)
+        # Numbers of their own: of one that has been divided, too few bits would be left for thousands of emitters
+        row = self._tree.draw(node, position, member, near & ~alike)
+        alike_row = dr.minimum(mi.UInt32(member * count), count - 1)
         return near, dr.select(alike, alike_row, row), index
 
     def _probability(self, row, position, site, active):
@@ -173,14 +171,14 @@ class TreeEmitters:
     def _look(self, si, source, sampler) -> EmitterSample:
         """What is learned from: a direction to each source."""
         active = mi.Bool(True)
-        near, row, index = self._draw(source, si.p, sampler.next_1d(), active)
+        near, row, index = self._draw(source, si.p, sampler.next_1d(), sampler.next_1d(), active)
         _, within = self._tree.probability(row, si.p, near)
         return self._toward(si, near, row, index, sampler.next_2d(), active).chosen_with(dr.select(near, within, 1))
 
     def sample(self, si, site, chosen, member, place, active) -> EmitterSample:
         """As :meth:`vpl.split.next_event.UniformEmitters.sample`."""
         source, _, number = self.choice.draw(site, chosen, active)
-        near, row, index = self._draw(source, si.p, number, active)
+        near, row, index = self._draw(source, si.p, number, member, active)
         probability = self._probability(row, si.p, site, near)
         if self._distant:
             probability = dr.select(near, probability, self._distant_probability(index, site, active & ~near))
