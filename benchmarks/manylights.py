@@ -120,6 +120,13 @@ class Rival:
         return float(np.mean(means)), float(np.std(means, ddof=1) / np.sqrt(len(means)))
 
 
+def measure_in_turn(rivals: list[Rival], passes: int) -> None:
+    """So many passes more of each, one after the other."""
+    for number in range(passes):
+        for rival in rivals:
+            rival.measure(100 + number)
+
+
 def reference_of(name: str) -> tuple[np.ndarray, np.ndarray]:
     """The reference of a scene, 256 pixels wide, and its standard error."""
     bitmap = mi.Bitmap(str(scenes.reference_file(name)))
@@ -147,9 +154,7 @@ def product_of(name: str, width: int, seconds: float, passes: int) -> float:
     """Print variance × time of a scene: the ratio."""
     scene = load(name, width)
     rivals = [Rival(name, scene, kind, sampler, width, seconds) for kind in KINDS for sampler in SAMPLERS]
-    for number in range(passes):
-        for rival in rivals:
-            rival.measure(100 + number)
+    measure_in_turn(rivals, passes)
     scale = scale_of(name, [image for rival in rivals for image in rival.images], width)
     best = {kind: min((r for r in rivals if r.kind == kind), key=lambda r: r.product(scale)) for kind in KINDS}
     values = [best[kind].product(scale) for kind in KINDS]
@@ -187,9 +192,7 @@ def denoised_of(name: str, width: int, seconds: float, passes: int) -> float:
 
     scene = load(name, width)
     rivals = [Rival(name, scene, kind, "multijitter", width, seconds) for kind in KINDS]
-    for number in range(passes):
-        for rival in rivals:
-            rival.measure(100 + number)
+    measure_in_turn(rivals, passes)
     truth, noise = reference_of(name)
     scale = truth**2 + 0.01 * truth.mean() ** 2
     points = {}

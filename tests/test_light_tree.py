@@ -500,3 +500,12 @@ def test_moments_of_a_node_are_those_of_its_lights(weighted):
         np.testing.assert_allclose(mean[node], expected, rtol=1e-9)
         squares = ((position[lights] - expected) ** 2).sum(1)
         np.testing.assert_allclose(variance[node], np.average(squares, weights=share), rtol=1e-6, atol=1e-8)
+
+
+def test_moments_of_dim_lights_keep_their_digits_next_to_bright_ones():
+    rng = np.random.default_rng(8)
+    position, weight = rng.normal(size=(200, 3)), 10 ** rng.uniform(-8, 8, 200)
+    tree = build_light_tree(position.astype(np.float32), None, np.ones((200, 3), np.float32), rng)
+    mean, _ = moments_below(tree, position, weight)
+    leaves = np.flatnonzero(tree.escape == np.arange(399) + 1)
+    np.testing.assert_allclose(mean[leaves], position[tree.representative[leaves]], rtol=1e-9)

@@ -122,25 +122,26 @@ def _leaf_ranges(tree: LightTree) -> np.ndarray:
     return np.stack([leaves_before[node], leaves_before[tree.escape]], axis=1)
 
 
+def _reduced_below(tree: LightTree, reduce: np.ufunc, values: np.ndarray, neutral: float) -> np.ndarray:
+    """For every node, the values of its lights reduced to one: (2n - 1, ...) from (n, ...) in the lights' own order."""
+    in_order = np.concatenate([values[tree.leaf_order], np.full((1, *values.shape[1:]), neutral)])
+    return reduce.reduceat(in_order, _leaf_ranges(tree).reshape(-1))[::2]
+
+
 def largest_below(tree: LightTree, values: np.ndarray) -> np.ndarray:
     """For every node, the largest of a value over its lights: (2n - 1,) from (n,) in the lights' own order."""
-    in_order = np.append(values[tree.leaf_order], -np.inf)
-    return np.maximum.reduceat(in_order, _leaf_ranges(tree).reshape(-1))[::2]
+    return _reduced_below(tree, np.maximum, values, -np.inf)
 
 
 def moments_below(tree: LightTree, position: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For every node, the weighted mean of the positions (n, 3) of its lights, (2n - 1, 3), and the mean of their
     squared distance from there, (2n - 1,).  ``weight`` (n,): where all of a node are 0, they count alike."""
-    first, last = _leaf_ranges(tree).T
-    place, weight = (x[tree.leaf_order].astype(np.float64) for x in (position, weight))
+    place, weight = position.astype(np.float64), weight.astype(np.float64)
     origin = place.mean(0)
     # Relative to the middle of all, as the squares of large numbers have no digits left for small differences
     place = place - origin
-    squares = np.concatenate([np.ones((len(place), 1)), place, (place**2).sum(1, keepdims=True)], axis=1)
-    weighted, alike = (
-        np.diff(np.concatenate([np.zeros((1, 5)), np.cumsum(x, axis=0)])[np.stack([first, last])], axis=0)[0]
-        for x in (squares * weight[:, None], squares)
-    )
+    powers = np.concatenate([np.ones((len(place), 1)), place, (place**2).sum(1, keepdims=True)], axis=1)
+    weighted, alike = (_reduced_below(tree, np.add, x, 0.0) for x in (powers * weight[:, None], powers))
     total = np.where(weighted[:, :1] > 0, weighted, alike)
     total = total[:, 1:] / total[:, :1]
     mean = total[:, :3]

@@ -36,10 +36,7 @@ class EmitterTree:
         tree = build_light_tree(position.astype(np.float32), None, colours, np.random.default_rng(0))
         low, high = tree.records[:, BOX_MIN].astype(np.float64), tree.records[:, BOX_MAX].astype(np.float64)
         records = np.zeros((len(tree.records), _RECORD), np.float32)
-        mean, variance = moments_below(tree, position, intensity)
-        # Where intensities differ by many decades, sums of dim ones have no digits left
-        records[:, 0:3] = np.clip(mean, low, high)
-        variance = np.minimum(variance, ((high - low) ** 2).sum(1) / 4)
+        records[:, 0:3], variance = moments_below(tree, position, intensity)
         # Emitters reach beyond their places
         records[:, 3] = _LEAST_DISTANCE**2 * variance + largest_below(tree, radius) ** 2
         leaf = tree.escape == np.arange(len(tree.records)) + 1

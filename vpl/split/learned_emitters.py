@@ -105,10 +105,11 @@ class LearnedEmitters:
         return finite_or_zero(self._environment.pdf_direction(origin, ds, active))
 
     def _environment_density(self, site, direction, own, active):
-        """Density with which a direction to the environment is drawn; ``own``: by the environment itself."""
+        """Density with which a direction to the environment is drawn; ``own``: by the environment itself, None where
+        only its regions are."""
         region, density = self._regions.find(direction, active)
         density *= self.choice.probability(site, self._count + region, active)
-        if self._both:
+        if own is not None:
             density += own * self.choice.probability(site, mi.UInt32(self._environment_number), active)
         return density
 

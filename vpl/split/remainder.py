@@ -60,10 +60,10 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
         turn = dr.select(met.smooth, turn, sampler.next_2d())
         # One call: kernels hold the code of all materials for each
         toward = met.si.to_local(sample.direction)
-        *lit_by, turned, share = met.bsdf.eval_pdf_sample(
+        value, density, turned, share = met.bsdf.eval_pdf_sample(
             context, met.si, toward, lobe, turn, path.active & ~met.hidden
         )  # fmt: skip
-        lit = _lit(path, met, sample, toward.z, *lit_by, weight, limits, sampler)
+        lit = _lit(path, met, sample, toward.z, value, density, weight, limits, sampler)
         gains.add(lit * sample.arriving(scene, dr.max(dr.abs(lit)) > 0), path.depth + 2, sampler)
         kept = _turn(path, met, turned, share, gathers, weight)
         _end_as_path(path, met, kept, limits, sampler)
