@@ -9,22 +9,24 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from vpl.core.arrays import channel_mean, download, upload
+from vpl.core.arrays import channel_mean, download
 from vpl.core.sampling import derived_seed
 from vpl.core.stages import Stage
 from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.points.camera_paths import SceneTraits
-from vpl.split.balance import Balance, Evidence, Option, balance, importance, judged_by, noise, without_lights
+from vpl.split.balance import Balance
+from vpl.split.decision import Decision
 from vpl.split.gather_vertices import LitVertices
 from vpl.split.kept_lights import KeptLights, TreedLights
 from vpl.split.next_event import emitters_of
-from vpl.split.paths import AT_FIRST, EVERYWHERE, NOWHERE, Limits
-from vpl.split.pilot import Pilot
+from vpl.split.paths import EVERYWHERE, NOWHERE, Rules
+from vpl.split.pilot import Arrivals
 from vpl.split.pixel_clusters import PixelClusters, light_clusters
+from vpl.split.site_choice import learning_rays
 from vpl.split.surface_lights import surface_lights
 from vpl.split.view import View
-from vpl.split.view_lights import ViewLights
+from vpl.split.view_lights import ViewLights, spaced_lights
 from vpl.split.worth import Worth
 from vpl.transport.evaluation import Transport
 
@@ -32,16 +34,8 @@ from .gathering import Clock, GatheringIntegrator, add_statistics
 from .knobs import Boolean
 from .manual import manual_page
 
-# Camera rays of the pilot, and those that are followed at a time, which bounds memory
-_PILOT, _WAVEFRONT = 1 << 15, 1 << 20
-# Rays by which emitters are learned, as a share of the camera rays
-_LEARNING_SHARE = 0.25
-# Cost of a path with emitters that were learned, more of whose shadow rays arrive, next to that of others
-_LEARNED_COST = 1.15
-# c of the split, as a multiple of the distance between lights, below which single ones show as blotches
-_TAPER = 6.0
-# c of paths that are whole, beyond every distance, world units: nothing is left to virtual lights
-_WHOLE = 1e15
+# Camera rays that are followed at a time, which bounds memory
+_WAVEFRONT = 1 << 20
 # Pixels darker than this share of the image's mean are lit as precisely as if they had it
 _DARK_FLOOR = 0.1
 # Nodes of the cut of a cluster, at most
@@ -149,22 +143,23 @@ class ManyLightsIntegrator(GatheringIntegrator):
         ray.o, ray.d, ray.time = ray.o + wide, ray.d + wide, ray.time + wide
         active = mi.Bool(active) & dr.full(mi.Bool, True, count)
         dr.make_opaque(ray, active)
-        emission, alike = emitters_of(scene, _rays(count)), dr.opaque(mi.Float, 1.0, -(-count // grid.samples))
+        emission = emitters_of(scene, learning_rays(count))
+        alike = dr.opaque(mi.Float, 1.0, -(-count // grid.samples))
         size = grid.width, grid.samples
-        return View(scene, emission, Perturbed(scene), ray, active, *size, seed, alike, Worth.unknown())
+        rules = Rules(self.max_depth, self.rr_depth, self.hide_emitters)
+        return View(scene, emission, Perturbed(scene), rules, ray, active, *size, seed, alike, Worth.unknown())
 
     def _trace(self, view: View):
         """(Radiance of each camera ray, whether it is opaque in the film's alpha)."""
         clock, self.statistics = Clock(Stage.PILOT), {}
-        pilot = self._pilot(view)
-        chosen, options = self._balance(view, pilot)
-        self._judge(view, pilot, chosen)
+        decision = Decision.of(view, self.virtual_lights)
+        chosen, worth = decision.balance, decision.judge(view)
+        if worth is not None:
+            self.statistics["worth"] = worth
         mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
-        lights = self._lights(view, pilot, chosen, clock)
-        limits = self._limits(view, lights, self.max_depth, EVERYWHERE if lights.all else NOWHERE)
-        kinds = bool(lights.surfaces), bool(lights.emitters)
-        left = next((x.expected for x in options if (x.surfaces, x.emitters) == kinds), pilot.radiance)
-        expected = np.maximum(pilot.nearby(pilot.radiance - left, view.width, view.pixels), 0)
+        lights = self._lights(view, decision.pilot.arrivals, chosen, clock)
+        limits = view.limits(lights, EVERYWHERE if lights.all else NOWHERE)
+        expected = decision.expected_light(view, lights)
         radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
         # Whole pixels at a time
         most = max(_WAVEFRONT // view.samples, 1) * view.samples
@@ -192,127 +187,39 @@ class ManyLightsIntegrator(GatheringIntegrator):
         self.statistics |= {"balance": chosen.reason, "dropped": dropped, "seconds": clock.seconds}
         return dr.select(finite & (self.max_depth > 0), radiance, 0), valid & (self.max_depth > 0)
 
-    def _limits(self, view: View, lights: ViewLights, max_depth: float, gathering: int, rr_depth: int = 0) -> Limits:
-        """Limits of paths, ``rr_depth`` 0 for that of the integrator."""
-        longest = dr.opaque(mi.UInt32, int(min(max_depth, 0xFFFFFFFF)))
-        squared_c, of_emitters = (
-            dr.opaque(mi.Float, (x.smallest_distance if x else _WHOLE) ** 2) for x in (lights.surfaces, lights.emitters)
-        )
-        return Limits(
-            longest, dr.opaque(mi.UInt32, rr_depth or self.rr_depth), squared_c, dr.opaque(mi.UInt32, gathering),
-            dr.opaque(mi.Bool, lights.emitters is not None), of_emitters, view.worth, view.perturbed,
-            self.hide_emitters,
-        )  # fmt: skip
-
-    def _pilot(self, view: View) -> Pilot:
-        """The pilot, from which emitters are learned."""
-        pilot = self._followed(view, ViewLights())
-        if not view.emission.choice.learn(*pilot.vertices, _rays(view.count), derived_seed(view.seed, 6)):
-            return pilot
-        brightness, again = pilot.brightness(view.width), self._followed(view, ViewLights())
-        if _LEARNED_COST * noise(again.radiance, brightness) < noise(pilot.radiance, brightness):
-            return again
-        # Where shadows are small, or gloss is what is noisy, sites may mislead
-        view.emission.choice.forget()
-        return pilot
-
-    def _followed(self, view: View, lights: ViewLights) -> Pilot:
-        """What is found by pairs of paths all over the image, always the same ones, besides light of ``lights``."""
-        lane = view.pairs(_PILOT)
-        # At later vertices, few of which are lit, lights that stand for emitters alone bring noise of their own
-        limits = self._limits(view, lights, self.max_depth, EVERYWHERE if lights.surfaces else AT_FIRST)
-        found, vertices, _, arrival = view.follow(upload(mi.UInt32, lane), limits, 1)
-        return Pilot.of(found, vertices, arrival, lane // view.samples)
-
-    def _balance(self, view: View, pilot: Pilot) -> tuple[Balance, list[Option]]:
-        """What the pilot leads to, and the lights that were considered."""
-        if not self.virtual_lights:
-            return without_lights("virtual_lights is off"), []
-        if view.perturbed.everywhere:
-            return without_lights("bump or normal maps are in shape groups"), []
-        emitters = self._emitter_lights(view, []) if view.emission.lights is not None and self.max_depth > 1 else None
-        if self.max_depth <= 2 and emitters is None:
-            return without_lights("no light is indirect at this max_depth"), []
-        direct, brightness = pilot.radiance - pilot.indirect, pilot.brightness(view.width)
-        evidence = Evidence(pilot.radiance, direct, brightness, view.count, view.samples, emitters is not None)
-        options = self._with_surfaces(view, evidence, pilot, None)
-        if emitters is not None:
-            left = self._followed(view, ViewLights(emitters=emitters))
-            options.append(Option(False, True, left.radiance, left.indirect))
-            options += self._with_surfaces(view, evidence, left, emitters)
-        return balance(evidence, options), options
-
-    def _with_surfaces(self, view: View, evidence: Evidence, traced: Pilot, emitters: LightSet | None) -> list[Option]:
-        """Options, one at most, of lights on surfaces beside those that stand for ``emitters``; ``traced``: the pilot
-        without those on surfaces."""
-        if self.max_depth <= 2 or not traced.indirect.any():
-            return []
-        option = Option(True, emitters is not None, traced.radiance, traced.indirect)
-        if not balance(evidence, [option]).gathers:
-            return [option]
-        # Their distance from each other is not known yet, and with it c: with 0, they carry all that they can
-        lights = ViewLights(LightSet([], 0.0, self.max_depth, 0, 0, {}), emitters)
-        return [replace(option, left=self._followed(view, lights).radiance)]
-
-    def _judge(self, view: View, pilot: Pilot, chosen: Balance) -> None:
-        """What it is worth to follow paths of a view."""
-        onward = pilot.onward
-        if len(onward.path) == 0:
-            return
-        worth, expected = Worth.of(onward.position, onward.normal, onward.sent)
-        brightness = pilot.brightness(view.width)
-        relative = onward.throughput / judged_by(brightness)[onward.path]
-        whole = noise(pilot.radiance, brightness)
-        multiple = importance(relative * expected, relative * onward.sent, onward.edges, len(pilot.radiance), whole)
-        if not np.isfinite(multiple):
-            return
-        if chosen.gathers:
-            # The less noise there is besides, the more they are worth
-            multiple *= (whole / max(chosen.noise, 1e-9)) ** 0.5
-        self.statistics["worth"] = multiple
-        view.worth = worth
-        nearby = pilot.nearby(pilot.radiance, view.width, view.pixels)
-        view.importance = upload(mi.Float, multiple / judged_by(nearby))
-
-    def _lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> ViewLights:
+    def _lights(self, view: View, arrivals: Arrivals, chosen: Balance, clock: Clock) -> ViewLights:
         """Virtual lights and their trees."""
-        surfaces = self._surface_lights(view, pilot, chosen, clock) if chosen.light_paths else None
+        surfaces = self._surface_lights(view, arrivals, chosen, clock) if chosen.light_paths else None
         if not chosen.emitters:
             return ViewLights(surfaces)
         clock.begin(Stage.TREE)
         lights = view.emission.lights
-        groups = lights.groups(lights.points(view.count), derived_seed(view.seed, 7))
-        emitters = self._emitter_lights(view, groups)
+        points = lights.points(view.count)
+        groups = lights.groups(points, derived_seed(view.seed, 7))
+        emitters = spaced_lights(groups, lights.spacing(points), self.max_depth)
         self.statistics["lights"] = self.statistics.get("lights", {}) | {"emitters": emitters.count}
         return ViewLights(surfaces, emitters)
 
-    def _emitter_lights(self, view: View, groups: list) -> LightSet:
-        """Lights that stand for emitters, as far as they are known."""
-        lights = view.emission.lights
-        c = _TAPER * lights.spacing(lights.points(view.count))
-        return LightSet(groups, c, self.max_depth, 0, 0, {})
-
-    def _surface_lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> LightSet | None:
+    def _surface_lights(self, view: View, arrivals: Arrivals, chosen: Balance, clock: Clock) -> LightSet | None:
         """Virtual lights on surfaces; None where there are none."""
         clock.begin(Stage.LIGHTS)
         # None is followed where they are kept
         self.statistics["light_paths"] = 0
-        make = partial(self._made_lights, view, pilot, chosen, clock)
+        make = partial(self._made_lights, view, arrivals, chosen, clock)
         made = self._kept.find(view.scene, (view.seed, self.max_depth), make) if self.keep_lights else make()
         self.statistics["lights"] = {"surface": made.surface.lights.count}
         if made.group is None:
             return None
-        c = _TAPER * made.surface.spacing(pilot.arrivals)
-        return LightSet([made.group], c, self.max_depth, self.statistics["light_paths"], 0, {})
+        spacing, paths = made.surface.spacing(arrivals), self.statistics["light_paths"]
+        return spaced_lights([made.group], spacing, self.max_depth, paths)
 
-    def _made_lights(self, view: View, pilot: Pilot, chosen: Balance, clock: Clock) -> TreedLights:
+    def _made_lights(self, view: View, arrivals: Arrivals, chosen: Balance, clock: Clock) -> TreedLights:
         """Virtual lights where the pilot's paths arrived, and their tree."""
         # The path from a light is shorter by the two edges between camera and light
-        limits = self._limits(view, ViewLights(), self.max_depth - 2, NOWHERE, rr_depth=1)
-        limits.hide_emitters, limits.worth = False, Worth.unknown()
-        made = surface_lights(
-            view.scene, view.emission, pilot.arrivals, chosen.light_paths, limits, derived_seed(view.seed, 2)
-        )  # fmt: skip
+        rules = Rules(self.max_depth - 2, rr_depth=1, hide_emitters=False)
+        limits = replace(view, rules=rules, worth=Worth.unknown()).limits(ViewLights(), NOWHERE)
+        seed = derived_seed(view.seed, 2)
+        made = surface_lights(view.scene, view.emission, arrivals, chosen.light_paths, limits, seed)
         self.statistics["light_paths"] = chosen.light_paths
         if made.lights.count == 0:
             return TreedLights(made, None)
@@ -348,11 +255,6 @@ class ManyLightsIntegrator(GatheringIntegrator):
         add_statistics(self.statistics, more | {"later": points.alone})
         # Every step-th sample stands for all
         return lit * dr.opaque(mi.Float, samples / points.kept)
-
-
-def _rays(paths: int) -> int:
-    """How many rays there are to learn by which emitters light a scene."""
-    return int(_LEARNING_SHARE * paths)
 
 
 mi.register_integrator("manylights", ManyLightsIntegrator)

@@ -215,6 +215,6 @@ def test_lights_that_stand_for_emitters_leave_less_noise(monkeypatch, always):
         return np.median(images.var(0) / images.mean(0) ** 2)
 
     with_lights = noise()
-    monkeypatch.setattr("integrators.manylights.balance", lambda *_: balances.without_lights("this is a test"))
+    monkeypatch.setattr("vpl.split.decision.balance", lambda *_: balances.without_lights("this is a test"))
     # 0.29 of it, as measured
     assert with_lights < 0.5 * noise()

@@ -157,15 +157,15 @@ def test_the_weights_of_gather_vertices_are_finite():
     box["back"]["bsdf"] = mirror
     scene = mi.load_dict(box)
     plugin, seen = mi.load_dict({"type": "manylights", "max_depth": 4}), []
-    original = plugin._pilot
+    original = plugin._trace
 
     def look(view):
         lane, lights = dr.arange(mi.UInt32, view.count), ViewLights(LightSet([], 0.1, plugin.max_depth, 0, 0, {}))
-        _, first, later, _ = view.follow(lane, plugin._limits(view, lights, plugin.max_depth, EVERYWHERE), 9)
+        _, first, later, _ = view.follow(lane, view.limits(lights, EVERYWHERE), 9)
         seen.extend(np.isfinite(np.array(x.weight)).all() for x in (first, later))
         return original(view)
 
-    plugin._pilot = look
+    plugin._trace = look
     plugin.virtual_lights = False
     render(scene, plugin, 16)
     assert seen == [True, True]

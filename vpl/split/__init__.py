@@ -3,7 +3,7 @@
 What a first surface receives by way of a second one, and where there are many emitters straight from these, is split
 so that nothing is left out or clamped (``floors``)::
 
-    pilot -> balance -> surface_lights (cells) -> light tree
+    pilot -> balance (decision) -> surface_lights (cells) -> light tree
     camera rays -> remainder (next_event, numbers) -> gather vertices -> pixel_clusters -> radiance
 
 In the order to read in:
@@ -21,11 +21,12 @@ In the order to read in:
 - ``emitter_samples``: what these choices return: directions to emitters, and emitters that were met
 - ``emitter_tree``: a tree over emitters with a place, by which one is drawn for a vertex
 - ``numbers``: random numbers that are spread well over the samples of a pixel
+- ``view_lights``: the lights of a view
 - ``view``: camera rays, and paths that begin with them
 - ``gather_vertices``: vertices where virtual lights are gathered, and which of the later ones are
 - ``pilot``: a few paths that tell where light is wanted
-- ``balance``: what the pilot decides: whether lights pay, how many, how finely they are clustered
-- ``view_lights``: the lights of a view
+- ``balance``: whether lights pay, how many, how finely they are clustered
+- ``decision``: what a view is followed with: pilots, the balance that they lead to, what paths are worth
 - ``emitter_lights``: many emitters as virtual lights, which cuts stand for instead of a sample of one
 - ``cells``: boxes where camera paths arrive, and random lines that meet surfaces in them with a known density
 - ``surface_lights``: a virtual light wherever such a line meets a surface

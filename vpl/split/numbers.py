@@ -12,8 +12,20 @@ import mitsuba as mi
 
 from ..core.sampling import HASH_ROUNDS, derived_seed
 
+# Multipliers of a hash in which every bit of the result depends on all [Wellons 2018, "Prospecting for hash functions"]
+_MIXING = (0x7FEB352D, 0x846CA68B)
+# Odd, far from any simple fraction of 2^32: the golden ratio's
+_STEP = 0x9E3779B9
 # Multipliers of the hash whose every bit depends on lower ones alone [Laine and Karras 2011; Burley 2020, section 3]
 _MULTIPLIERS = (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6)
+
+
+def _mixed(bits, stream: int):
+    """32-bit numbers that have nothing to do with ``bits`` nor with those of another stream."""
+    bits = bits + (stream * _STEP & 0xFFFFFFFF)
+    bits = (bits ^ (bits >> 16)) * _MIXING[0]
+    bits = (bits ^ (bits >> 15)) * _MIXING[1]
+    return bits ^ (bits >> 16)
 
 
 def _hash_upwards(bits, seed):
@@ -51,18 +63,20 @@ class SpreadNumbers:
         # One kernel follows paths, whether their lanes are counted or chosen
         dr.eval(lane)
         self._pixel, self._number = lane // count, lane % count
-        self._streams = [dr.opaque(mi.UInt32, derived_seed(seed, stream)) for stream in range(4)]
+        # Derived, as vertices count on from it
+        self._seed = dr.opaque(mi.UInt32, derived_seed(seed, 0))
 
     def at(self, vertex):
         """Numbers that a path uses at its vertex of a number (UInt32): (number, pair, number, pair), from [0, 1)."""
         found = []
-        for stream, seed in enumerate(self._streams):
-            order, first = mi.sample_tea_32(self._pixel, seed + vertex, HASH_ROUNDS)
+        # A good hash for all, of which cheap ones make the rest
+        orders, scrambles = mi.sample_tea_32(self._pixel, self._seed + vertex, HASH_ROUNDS)
+        for stream in range(4):
             # The low bits count the samples of a pixel: what has to stay together are those with equal higher bits
-            index = _nested_scramble(self._number, order)
-            numbers = [_fraction(_nested_scramble(dr.brev(index), first))]
+            index = _nested_scramble(self._number, _mixed(orders, stream))
+            numbers = [_fraction(_nested_scramble(dr.brev(index), _mixed(scrambles, 2 * stream)))]
             if stream % 2:
-                second, _ = mi.sample_tea_32(first, order, HASH_ROUNDS)
+                second = _mixed(scrambles, 2 * stream + 1)
                 numbers.append(_fraction(_nested_scramble(_second_sobol(index), second)))
             found.append(mi.Point2f(*numbers) if stream % 2 else numbers[0])
         return tuple(found)

@@ -20,6 +20,15 @@ SEEKING, CONNECTING, PAST = range(1, 4)
 NOWHERE, AT_FIRST, EVERYWHERE = 0, CONNECTING, PAST
 
 
+@dataclass(frozen=True)
+class Rules:
+    """Rules of whole paths, as in ``path``: ``max_depth`` (edges, may be infinite), ``rr_depth``, ``hide_emitters``."""
+
+    max_depth: float
+    rr_depth: int
+    hide_emitters: bool
+
+
 @dataclass
 class Limits:
     """``max_depth`` (edges), ``rr_depth``: as in ``path``, UInt32; ``squared_c``: of the split, world units²;

@@ -17,10 +17,17 @@ from ..core.arrays import channel_mean, download, upload, upload_vectors
 from ..core.sampling import RowChoice, independent_sampler
 from .sites import Sites
 
+# Rays by which sources are learned, as a share of the camera rays
+_LEARNING_SHARE = 0.25
 # Rays from a site to each source; how many of them all sites may have together
 _RAYS_EACH, _MOST_RAYS = 2, 1 << 20
 # Rays that the visibility on average counts for
 _PRIOR = 1.0
+
+
+def learning_rays(paths: int) -> int:
+    """How many rays there are to learn by for so many camera rays."""
+    return int(_LEARNING_SHARE * paths)
 
 
 class SiteChoice:

@@ -11,21 +11,26 @@ import numpy as np
 from ..core.sampling import derived_seed, independent_sampler
 from ..lights.perturbed import Perturbed
 from .numbers import SpreadNumbers
-from .paths import FirstEdge, Limits
+from .paths import FirstEdge, Limits, Rules
 from .remainder import follow
+from .view_lights import ViewLights
 from .worth import Worth
+
+# c of paths that are whole, beyond every distance, world units: nothing is left to virtual lights
+_WHOLE = 1e15
 
 
 @dataclass
 class View:
     """Camera rays: the ``scene`` and how its emitters are sampled (``emission``), its shapes without a
-    floor (``perturbed``); the camera's ``ray`` and which of them are ``active``, evaluated; ``width`` of the image and
-    ``samples`` of a pixel, which lie next to each other; ``seed``; ``importance`` of radiance in each pixel, and the
-    ``worth`` of paths (:mod:`vpl.split.worth`), once they are known."""
+    floor (``perturbed``); the ``rules`` of its paths; the camera's ``ray`` and which of them are ``active``, evaluated;
+    ``width`` of the image and ``samples`` of a pixel, which lie next to each other; ``seed``; ``importance`` of
+    radiance in each pixel, and the ``worth`` of paths (:mod:`vpl.split.worth`), once they are known."""
 
     scene: object
     emission: object
     perturbed: Perturbed
+    rules: Rules
     ray: object
     active: object
     width: int
@@ -48,6 +53,18 @@ class View:
         pairs = max(min(most, self.count // 4) // 2, 1)
         apart = max(self.count // pairs // 2 * 2, 2)
         return np.minimum(np.arange(pairs)[:, None] * apart + [0, 1], self.count - 1).reshape(-1)
+
+    def limits(self, lights: ViewLights, gathering: int) -> Limits:
+        """Limits of camera paths of which ``lights`` carry a part; ``gathering``: see :mod:`vpl.split.paths`."""
+        longest = dr.opaque(mi.UInt32, int(min(self.rules.max_depth, 0xFFFFFFFF)))
+        squared_c, of_emitters = (
+            dr.opaque(mi.Float, (x.smallest_distance if x else _WHOLE) ** 2) for x in (lights.surfaces, lights.emitters)
+        )
+        return Limits(
+            longest, dr.opaque(mi.UInt32, self.rules.rr_depth), squared_c, dr.opaque(mi.UInt32, gathering),
+            dr.opaque(mi.Bool, lights.emitters is not None), of_emitters, self.worth, self.perturbed,
+            self.rules.hide_emitters,
+        )  # fmt: skip
 
     def follow(self, lane, limits: Limits, *stream: int):
         """Follow the camera rays ``lane`` (UInt32): see :func:`vpl.split.remainder.follow`."""

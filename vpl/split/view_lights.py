@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..lights.light_set import LightSet
+from ..lights.light_set import LightGroup, LightSet
+
+# c of the split, as a multiple of the distance between lights, below which single ones show as blotches
+_TAPER = 6.0
+
+
+def spaced_lights(groups: list[LightGroup], spacing: float, max_depth: float, paths: int = 0) -> LightSet:
+    """The light set of groups with a typical distance between lights, world units, and with it their c; ``paths``: by
+    which they were found."""
+    return LightSet(groups, _TAPER * spacing, max_depth, paths, 0, {})
 
 
 @dataclass(frozen=True)

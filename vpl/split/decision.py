@@ -1,0 +1,142 @@
+"""Decision: what a view is followed with, from a pilot of some thousand of its paths.
+
+The pilot's paths are followed a second time where emitters were learned from them, once more with lights on surfaces
+where these seem to pay, and so again where lights may stand for emitters.  They are always the same paths, and nothing
+depends on the clock: the same seed decides the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import upload
+from ..core.sampling import derived_seed
+from ..lights.light_set import LightSet
+from .balance import Balance, Evidence, Option, balance, importance, judged_by, noise, without_lights
+from .paths import AT_FIRST, EVERYWHERE
+from .pilot import Pilot
+from .site_choice import learning_rays
+from .view import View
+from .view_lights import ViewLights, spaced_lights
+from .worth import Worth
+
+# Camera rays of the pilot
+_PILOT = 1 << 15
+# Cost of a path with emitters that were learned, more of whose shadow rays arrive, next to that of others
+_LEARNED_COST = 1.15
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The ``balance`` that a ``pilot`` led to, and the ``options`` that were considered."""
+
+    pilot: Pilot
+    balance: Balance
+    options: list[Option]
+
+    @classmethod
+    def of(cls, view: View, virtual_lights: bool) -> Decision:
+        """The decision for a view, whose emitters are learned from the pilot; ``virtual_lights``: whether there may be
+        any."""
+        pilot = _learning_pilot(view)
+        refusal = _refusal(view, virtual_lights)
+        if refusal:
+            return cls(pilot, without_lights(refusal), [])
+        evidence, options = _considered(view, pilot)
+        return cls(pilot, balance(evidence, options), options)
+
+    def expected_light(self, view: View, lights: ViewLights) -> np.ndarray:
+        """Light that ``lights`` are expected to bring to each pixel of the view, (pixels,)."""
+        kinds = bool(lights.surfaces), bool(lights.emitters)
+        whole = self.pilot.radiance
+        left = next((x.expected for x in self.options if (x.surfaces, x.emitters) == kinds), whole)
+        return np.maximum(self.pilot.nearby(whole - left, view.width, view.pixels), 0)
+
+    def judge(self, view: View) -> float | None:
+        """Tell the view what it is worth to follow its paths: the multiple of that by which they go on, see
+        :func:`vpl.split.balance.importance`; None where all do."""
+        pilot, onward = self.pilot, self.pilot.onward
+        if len(onward.path) == 0:
+            return None
+        worth, expected = Worth.of(onward.position, onward.normal, onward.sent)
+        brightness = pilot.brightness(view.width)
+        relative = onward.throughput / judged_by(brightness)[onward.path]
+        whole = noise(pilot.radiance, brightness)
+        multiple = importance(relative * expected, relative * onward.sent, onward.edges, len(pilot.radiance), whole)
+        if not np.isfinite(multiple):
+            return None
+        if self.balance.gathers:
+            # The less noise there is besides, the more they are worth
+            multiple *= (whole / max(self.balance.noise, 1e-9)) ** 0.5
+        view.worth = worth
+        nearby = pilot.nearby(pilot.radiance, view.width, view.pixels)
+        view.importance = upload(mi.Float, multiple / judged_by(nearby))
+        return multiple
+
+
+def _learning_pilot(view: View) -> Pilot:
+    """The pilot, from which emitters are learned."""
+    pilot = _followed(view, ViewLights())
+    if not view.emission.choice.learn(*pilot.vertices, learning_rays(view.count), derived_seed(view.seed, 6)):
+        return pilot
+    brightness, again = pilot.brightness(view.width), _followed(view, ViewLights())
+    if _LEARNED_COST * noise(again.radiance, brightness) < noise(pilot.radiance, brightness):
+        return again
+    # Where shadows are small, or gloss is what is noisy, sites may mislead
+    view.emission.choice.forget()
+    return pilot
+
+
+def _followed(view: View, lights: ViewLights) -> Pilot:
+    """What is found by pairs of paths all over the image, always the same ones, besides light of ``lights``."""
+    lane = view.pairs(_PILOT)
+    # At later vertices, few of which are lit, lights that stand for emitters alone bring noise of their own
+    limits = view.limits(lights, EVERYWHERE if lights.surfaces else AT_FIRST)
+    found, vertices, _, arrival = view.follow(upload(mi.UInt32, lane), limits, 1)
+    return Pilot.of(found, vertices, arrival, lane // view.samples)
+
+
+def _refusal(view: View, virtual_lights: bool) -> str:
+    """Why there are to be no lights, whatever the pilot found; empty where there may be."""
+    if not virtual_lights:
+        return "virtual_lights is off"
+    if view.perturbed.everywhere:
+        return "bump or normal maps are in shape groups"
+    if view.rules.max_depth <= 2 and not _may_carry_emitters(view):
+        return "no light is indirect at this max_depth"
+    return ""
+
+
+def _may_carry_emitters(view: View) -> bool:
+    return view.emission.lights is not None and view.rules.max_depth > 1
+
+
+def _considered(view: View, pilot: Pilot) -> tuple[Evidence, list[Option]]:
+    """Lights that may pay, with what the pilot's paths find besides."""
+    direct, brightness = pilot.radiance - pilot.indirect, pilot.brightness(view.width)
+    carries_emitters = _may_carry_emitters(view)
+    evidence = Evidence(pilot.radiance, direct, brightness, view.count, view.samples, carries_emitters)
+    options = _with_surfaces(view, evidence, pilot, None)
+    if carries_emitters:
+        lights = view.emission.lights
+        emitters = spaced_lights([], lights.spacing(lights.points(view.count)), view.rules.max_depth)
+        left = _followed(view, ViewLights(emitters=emitters))
+        options.append(Option(False, True, left.radiance, left.indirect))
+        options += _with_surfaces(view, evidence, left, emitters)
+    return evidence, options
+
+
+def _with_surfaces(view: View, evidence: Evidence, traced: Pilot, emitters: LightSet | None) -> list[Option]:
+    """Options, one at most, of lights on surfaces beside those that stand for ``emitters``; ``traced``: the pilot
+    without those on surfaces."""
+    if view.rules.max_depth <= 2 or not traced.indirect.any():
+        return []
+    option = Option(True, emitters is not None, traced.radiance, traced.indirect)
+    if not balance(evidence, [option]).gathers:
+        return [option]
+    # Their distance from each other is not known yet, and with it c: with 0, they carry all that they can
+    lights = ViewLights(spaced_lights([], 0.0, view.rules.max_depth), emitters)
+    return [replace(option, left=_followed(view, lights).radiance)]
