@@ -39,7 +39,7 @@ NAMES = (*scenes.NAMES, "classroom", "hall")
 KINDS, SAMPLERS = ("path", "manylights"), ("independent", "multijitter")
 DEPTH, TRIMMED, COLD_SPP = 6, 0.001, 16
 # Samples of one pass, at most: it bounds memory
-LARGEST_PASS = 1 << 22
+LARGEST_PASS = 1 << 24
 _COLD = """
 import resource, sys, time
 start = time.perf_counter()

@@ -7,6 +7,7 @@ import mitsuba as mi
 import pytest
 
 import integrators
+from vpl.core.registry import RegistryTable
 
 from .conftest import area_light, closed_box
 
@@ -87,3 +88,17 @@ def test_paths_from_the_camera_and_from_lights_are_followed_by_one_kernel(lights
     assert plugin.statistics["light_paths"] > 0
     longest = max(launched.values())
     assert sum(operations > 0.9 * longest for operations in launched.values()) == 1
+
+
+def test_places_in_the_registry_are_in_no_kernel(compiled):
+    """Shapes are loaded in parallel, so that they have other ones in every process."""
+    shapes = mi.load_dict(closed_box({"lamp": area_light()})).shapes_dr()
+    indices = dr.reinterpret_array(mi.UInt32, shapes).numpy()
+    compiled()
+    few = RegistryTable(indices[:2], [7, 8]).at(shapes).numpy()
+    assert compiled() > 0
+    all_and_more = RegistryTable([*indices, 5000], 3).at(shapes).numpy()
+    assert compiled() == 0
+    assert few.tolist() == [7, 8] + [0] * (len(indices) - 2)
+    assert (all_and_more == 3).all()
+    assert (RegistryTable(indices, 3).at(shapes, False).numpy() == 0).all()

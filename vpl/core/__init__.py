@@ -10,6 +10,7 @@
 - ``cones``: axes of cones around directions, and how their cosines are rounded
 - ``stages``: names of a render's stages, by which its seconds are kept
 - ``parameters``: parameters of scene objects, read without ``mitsuba.traverse``
+- ``registry``: a number for each of some shapes or emitters
 - ``exclusive``: objects that serve one thread at a time
 - ``backend``: what has to be right underneath Mitsuba, checked before it goes wrong
 """

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core.arrays import LARGEST_VALUE, download, finite_or_zero, rgb_to_spectrum, upload, usable
 from ..core.parameters import matrix_of, numbers, parameters_of
+from ..core.registry import RegistryTable
 from .spheres import SphereRows
 from .virtual_lights import VirtualLights
 
@@ -50,17 +51,13 @@ class AreaEmitters:
         return np.pi * self.area.astype(np.float64) * self.radiance.mean(1, dtype=np.float64)
 
     def __post_init__(self):
-        size = int(self.shape_index.max(initial=0)) + 1
-        rows = np.zeros(size, np.uint32)
-        rows[self.shape_index] = np.arange(1, self.count + 1)
-        self._row_of_shape = upload(mi.UInt32, rows)
+        self._row_of_shape = RegistryTable(self.shape_index, np.arange(1, self.count + 1))
         self._radiance = upload(mi.Float, self.radiance)
         self._shapes = upload(mi.UInt32, self.shape_index)
 
     def row(self, si, active=True):
         """Row of the emitter that a hit (surface interaction or preliminary) lies on, plus one; 0 where on none."""
-        index = dr.reinterpret_array(mi.UInt32, si.shape)
-        return dr.gather(mi.UInt32, self._row_of_shape, index, active & (index < dr.width(self._row_of_shape)))
+        return self._row_of_shape.at(si.shape, active)
 
     def on_shape(self, method: str, row, *arguments):
         """Call a method of the shape of each row (counted from 0); the last argument is the mask of active lanes.

@@ -16,7 +16,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, finite_or_zero, upload
+from ..core.arrays import channel_mean, finite_or_zero
+from ..core.registry import RegistryTable
 from .emitters import registered_shapes
 
 # As Mitsuba prints them
@@ -37,31 +38,24 @@ class Perturbed:
     """Shapes whose material shades with a normal of its own.
 
     ``exist``: whether there are any; ``everywhere``: whether they cannot be told from others, as in shape groups.
-    The fields of a dataclass, unlike those of other classes, may be given to functions that Dr.Jit freezes.
     """
 
     exist: bool
     everywhere: bool
-    _table: object
+    _table: RegistryTable | None
 
     def __init__(self, scene):
         shapes = perturbed_shapes(scene)
         groups = (shape for shape in scene.shapes() if shape.class_name() in ("Instance", "ShapeGroup"))
         self.everywhere = any(name in str(shape) for shape in groups for name in _MAPS)
         self.exist = self.everywhere or len(shapes) > 0
-        self._table = None
-        if shapes:
-            table = np.zeros(max(shapes) + 1, np.uint32)
-            table[list(shapes)] = 1
-            self._table = upload(mi.UInt32, table)
+        self._table = RegistryTable(shapes, 1) if shapes else None
 
     def at(self, si, active):
         """Whether ``si`` lies on one of them."""
         if self.everywhere or self._table is None:
             return mi.Bool(self.everywhere)
-        index = dr.reinterpret_array(mi.UInt32, si.shape)
-        known = active & (index < dr.width(self._table))
-        return dr.gather(mi.UInt32, self._table, index, known) == 1
+        return self._table.at(si.shape, active) == 1
 
 
 @dataclass

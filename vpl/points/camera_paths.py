@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core.arrays import add_at, channel_mean, download, finite_or_zero, ones, upload, upload_limit
 from ..core.morton import morton_order
+from ..core.registry import RegistryTable
 from ..core.sampling import derived_seed, independent_sampler
 from ..lights.emitters import Emitters, registered_shapes
 from ..lights.perturbed import perturbed_shapes
@@ -50,10 +51,7 @@ class SceneTraits:
 
 def shape_in(shape, indices: tuple):
     """Whether shapes (a pointer array) are among those with the given registry indices."""
-    table = np.zeros(max(indices, default=0) + 1, np.uint32)
-    table[list(indices)] = 1
-    index = dr.reinterpret_array(mi.UInt32, shape)
-    return dr.gather(mi.UInt32, upload(mi.UInt32, table), index, index < len(table)) == 1
+    return RegistryTable(indices, 1).at(shape) == 1
 
 
 @dataclass

@@ -10,7 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import download, finite_or_zero, upload
+from ..core.arrays import download, finite_or_zero
+from ..core.registry import RegistryTable
 from ..direct.environment_regions import regions_of
 from .emitter_samples import EmitterSample, MetEmitter
 from .site_choice import SiteChoice
@@ -39,9 +40,7 @@ class LearnedEmitters:
         if weight[of_environment].any():
             self._regions = regions_of(self._environment, _REGIONS, _COLUMNS)
         registry = download(dr.reinterpret_array(mi.UInt32, self._emitters))
-        numbers = np.zeros(registry.max() + 2, np.int64)
-        numbers[registry] = np.arange(self._count)
-        self._number_of = upload(mi.UInt32, numbers)
+        self._number_of = RegistryTable(registry, np.arange(self._count))
         alike = np.zeros(self._count + (self._regions.count if self._regions else 0))
         alike[: self._count] = weight / weight.sum()
         # What regions cannot tell apart, the environment's own sampling may
@@ -126,7 +125,7 @@ class LearnedEmitters:
         emitter = si.emitter(self._scene, active)
         emitted = finite_or_zero(mi.unpolarized_spectrum(emitter.eval(si, active))) & active
         wanted = active & has_density & (emitter != None)  # noqa: E711
-        number = dr.gather(mi.UInt32, self._number_of, dr.reinterpret_array(mi.UInt32, emitter), wanted)
+        number = self._number_of.at(emitter, wanted)
         near = wanted & si.is_valid()
         probability = self.choice.probability(site, number, near)
         density = emitter.pdf_direction(origin, ds, near) * probability
