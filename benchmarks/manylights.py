@@ -12,6 +12,7 @@ Parts, each with both integrators in turn in one run, and with the better of the
   much the mean of the image differs from pass to pass, each with lights of its own.
 - ``denoised``: error of one pass through Open Image Denoise against the reference, its noise taken off; the time of
   `path` for the same error, from passes of growing size.
+- ``lights``: variance × time of `manylights` with fewer and more light paths than it chooses.
 - ``cold``: seconds of the first render, 16 samples a pixel, with an empty kernel cache, and peak memory, whole process.
 """
 
@@ -24,7 +25,10 @@ import re
 import subprocess
 import sys
 import tempfile
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import mitsuba as mi
 import numpy as np
@@ -34,9 +38,13 @@ mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
 from benchmarks import scenes  # noqa: E402
+from vpl.split import balance, decision  # noqa: E402
 
 NAMES = (*scenes.NAMES, "classroom", "hall")
 KINDS, SAMPLERS = ("path", "manylights"), ("independent", "multijitter")
+PARTS = ("product", "denoised", "lights", "cold")
+# Light paths, as multiples of what is chosen
+SWEEP = (1 / 4, 1 / 2, 1, 2, 4)
 DEPTH, TRIMMED, COLD_SPP = 6, 0.001, 16
 # Samples of one pass, at most: it bounds memory
 LARGEST_PASS = 1 << 24
@@ -73,11 +81,24 @@ def load(name: str, width: int):
     return mi.load_string(text, resx=str(width), resy=str(scenes.height(name, width)))
 
 
-class Rival:
-    """One integrator with one sampler on one scene: its passes, of about the same time."""
+@contextmanager
+def light_paths_times(factor: float):
+    """`manylights` with so many times the light paths that it chooses, as long as the block lasts."""
 
-    def __init__(self, name: str, scene, kind: str, sampler: str, width: int, seconds: float):
-        self.kind, self.sampler, self.images, self.seconds = kind, sampler, [], []
+    def scaled(*arguments):
+        chosen = balance.balance(*arguments)
+        return replace(chosen, light_paths=round(factor * chosen.light_paths))
+
+    with mock.patch.object(decision, "balance", scaled):
+        yield
+
+
+class Rival:
+    """One integrator with one sampler on one scene: its passes, of about the same time; ``light_paths``: as a multiple
+    of what it chooses."""
+
+    def __init__(self, name: str, scene, kind: str, sampler: str, width: int, seconds: float, light_paths: float = 1):
+        self.kind, self.sampler, self.images, self.seconds, self.light_paths = kind, sampler, [], [], light_paths
         self.scene, self.sensor = scene, SAMPLERS.index(sampler)
         self.integrator = mi.load_dict({"type": kind, "max_depth": DEPTH})
         # What a pass costs besides its samples is known from two sizes
@@ -97,9 +118,10 @@ class Rival:
 
     def render(self, seed: int):
         """(An image, float64, and its seconds)."""
-        image, seconds = scenes.timed(
-            lambda: mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=self.spp, seed=seed)
-        )
+        with light_paths_times(self.light_paths):
+            image, seconds = scenes.timed(
+                lambda: mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=self.spp, seed=seed)
+            )
         return np.array(image, np.float64)[..., :3], seconds
 
     def measure(self, seed: int) -> None:
@@ -212,6 +234,22 @@ def denoised_of(name: str, width: int, seconds: float, passes: int) -> float:
     return ratio
 
 
+def lights(names, width: int, seconds: float, passes: int) -> None:
+    """Print variance × time with fewer and more light paths than are chosen, next to that with these."""
+    print(f"lights, {width} wide: variance × time with so many times the light paths, over that with those chosen")
+    print(" " * 16 + "".join(f"{factor:8.2g}" for factor in SWEEP))
+    for name in names:
+        scene = load(name, width)
+        rivals = [Rival(name, scene, "manylights", "multijitter", width, seconds, factor) for factor in SWEEP]
+        measure_in_turn(rivals, passes)
+        scale = scale_of(name, [image for rival in rivals for image in rival.images], width)
+        products = np.array([rival.product(scale) for rival in rivals])
+        chosen = SWEEP.index(1)
+        number = rivals[chosen].integrator.statistics.get("light_paths", 0)
+        ratios = "".join(f"{ratio:8.2f}" for ratio in products / products[chosen])
+        print(f"{name:16s}{ratios}   chosen: {number} for {rivals[chosen].spp} samples", flush=True)
+
+
 def cold(names, width: int) -> None:
     """Print first renders with an empty kernel cache, and peak memory, each in a process of its own."""
     print(f"cold, {width} wide, {COLD_SPP} samples: seconds of the first render, peak GiB")
@@ -234,9 +272,7 @@ def cold(names, width: int) -> None:
 def main() -> None:
     """Run the parts that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "--parts", nargs="+", default=["product", "denoised", "cold"], choices=["product", "denoised", "cold"]
-    )
+    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS)
     parser.add_argument("--scenes", nargs="+", default=list(NAMES), metavar="NAME")
     parser.add_argument("--width", type=int, default=256, metavar="PIXELS")
     parser.add_argument("--seconds", type=float, default=2.5, help="of one pass, about (default: 2.5)")
@@ -247,6 +283,8 @@ def main() -> None:
         product(names, options.width, options.seconds, options.passes)
     if "denoised" in options.parts:
         denoised(names, 256, options.seconds, options.passes)
+    if "lights" in options.parts:
+        lights(names, options.width, options.seconds, options.passes)
     if "cold" in options.parts:
         cold(names, options.width)
 
