@@ -145,9 +145,8 @@ def test_kept_lights_and_those_that_stand_for_emitters_give_the_same_image_again
 
 
 def test_a_dim_emitter_next_to_a_bright_one_has_points():
-    lights = emission_of(
-        mi.load_dict(closed_box(panels(64, np.random.default_rng(1)))), np.random.default_rng(0), False
-    ).lights
+    scene = mi.load_dict(closed_box(panels(64, np.random.default_rng(1))))
+    lights = emission_of(scene, np.random.default_rng(0), False).lights
     radiance = np.full_like(lights.emitters.area.radiance, 1e-6)
     radiance[0] = 1
     uneven = dataclasses.replace(
@@ -169,7 +168,7 @@ def test_who_samples_an_emitter_and_who_meets_it_agree_on_what_is_carried(shapes
     emission, si = emission_of(scene, rng, True), interactions(*vertices(rng))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(1, dr.width(si.p))
-    site = emission.choice.site(si, mi.Float(1))
+    site = emission.choice.site(si.p, si.n)
     numbers = sampler.next_1d(), sampler.next_1d(), sampler.next_2d()
     sample = emission.sample(si, site, *numbers, mi.Bool(True))
     ray = si.spawn_ray(sample.direction)

@@ -7,6 +7,7 @@ import pytest
 
 from vpl.core.arrays import upload, upload_vectors
 from vpl.lights.light_set import LightSet
+from vpl.split.irradiance import learn_emitters
 from vpl.split.learned_emitters import LearnedEmitters
 from vpl.split.paths import EVERYWHERE
 from vpl.split.sites import Sites
@@ -30,7 +31,7 @@ def learned(scene, seed=0):
     normal = unit_vectors(rng, count)
     position = rng.uniform(-0.9, 0.9, (count, 3)).astype(np.float32)
     emission = LearnedEmitters(scene)
-    emission.choice.learn(position, normal, 1 << 18, seed)
+    learn_emitters(scene, emission, (position, normal), 1 << 18, seed)
     return emission, position, normal
 
 
@@ -49,7 +50,7 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(emitter):
     si.sh_frame = mi.Frame3f(si.n)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(1, len(position))
-    site = emission.choice.site(si, mi.Float(1))
+    site = emission.choice.site(si.p, si.n)
     sample = emission.sample(si, site, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
     weight = sample.arriving(scene, mi.Bool(True))
     ray = si.spawn_ray(sample.direction)
@@ -83,7 +84,7 @@ def test_no_direction_at_the_edge_of_a_small_sun_weighs_far_too_much(learns):
     si = dr.zeros(mi.SurfaceInteraction3f, len(position))
     si.p, si.n = upload_vectors(mi.Point3f, position), upload_vectors(mi.Normal3f, normal)
     si.sh_frame = mi.Frame3f(si.n)
-    site = emission.choice.site(si, mi.Float(1))
+    site = emission.choice.site(si.p, si.n)
     rng, heaviest, total = np.random.default_rng(0), 0.0, 0.0
     for _ in range(20):
         chosen, member, *place = (upload(mi.Float, rng.random(len(position))) for _ in range(4))

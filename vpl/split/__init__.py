@@ -15,6 +15,7 @@ In the order to read in:
 - ``paths``: where paths begin, what they carry along, what they find
 - ``remainder``: paths as ``path`` follows them, less what virtual lights carry; ``follow``
 - ``next_event``: next-event estimation: how emitters are chosen
+- ``irradiance``: of surfaces, straight from emitters
 - ``site_choice``: a choice among sources of light by what vertices of a pilot see, site by site
 - ``learned_emitters``: emitters, and regions of the environment, chosen so
 - ``tree_emitters``: many emitters, chosen so by clusters

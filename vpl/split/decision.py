@@ -16,6 +16,7 @@ from ..core.arrays import upload
 from ..core.sampling import derived_seed
 from ..lights.light_set import LightSet
 from .balance import Balance, Evidence, Option, balance, importance, judged_by, noise, without_lights
+from .irradiance import learn_emitters
 from .paths import AT_FIRST, EVERYWHERE
 from .pilot import Pilot
 from .site_choice import learning_rays
@@ -80,7 +81,8 @@ class Decision:
 def _learning_pilot(view: View) -> Pilot:
     """The pilot, from which emitters are learned."""
     pilot = _followed(view, ViewLights())
-    if not view.emission.choice.learn(*pilot.vertices, learning_rays(view.count), derived_seed(view.seed, 6)):
+    rays, seed = learning_rays(view.count), derived_seed(view.seed, 6)
+    if not learn_emitters(view.scene, view.emission, pilot.vertices, rays, seed):
         return pilot
     brightness, again = pilot.brightness(view.width), _followed(view, ViewLights())
     if _LEARNED_COST * noise(again.radiance, brightness) < noise(pilot.radiance, brightness):

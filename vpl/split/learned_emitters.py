@@ -54,11 +54,7 @@ class LearnedEmitters:
         if self._both:
             # Its regions stand for the environment
             ignored[self._environment_number] = True
-        self.choice = SiteChoice(scene, alike, _USUAL_SHARE, self._look, np.flatnonzero(ignored))
-
-    def _look(self, si, source, sampler):
-        """What is learned from: a direction to each source."""
-        return self._draw(si, source, sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
+        self.choice = SiteChoice(alike, _USUAL_SHARE, np.flatnonzero(ignored))
 
     def _draw(self, si, source, member, place, active) -> EmitterSample:
         """A direction to each source."""

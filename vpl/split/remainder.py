@@ -54,7 +54,7 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
         # Emission, by next-event estimation
         chosen, place, lobe, turn = numbers.at(path.scattered)
         path.scattered += dr.select(met.smooth, 1, 0)
-        path.site, member = emission.choice.site(met.si, met.side), sampler.next_1d()
+        path.site, member = emission.choice.site(met.si.p, met.si.sh_frame.n * met.side), sampler.next_1d()
         sample = emission.sample(met.si, path.site, chosen, member, place, met.smooth)
         lobe = dr.select(met.smooth, lobe, sampler.next_1d())
         turn = dr.select(met.smooth, turn, sampler.next_2d())

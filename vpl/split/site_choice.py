@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core.arrays import channel_mean, download, upload, upload_vectors
 from ..core.sampling import RowChoice, independent_sampler
+from .irradiance import Places
 from .sites import Sites
 
 # Rays by which sources are learned, as a share of the camera rays
@@ -34,13 +35,14 @@ class SiteChoice:
     """The choice of sources by site; before :meth:`learn`, the usual one everywhere.
 
     ``usual`` (n,) float64: probabilities of sources, which sum to 1; ``share`` of the samples that keep them;
-    ``look(si, source, sampler)``: a direction to each source, :class:`vpl.split.emitter_samples.EmitterSample`;
     ``ignored``: indices of sources that nothing is learned of.
     """
 
-    def __init__(self, scene, usual: np.ndarray, share: float, look: Callable, ignored: np.ndarray):
+    def __init__(self, usual: np.ndarray, share: float, ignored: np.ndarray):
         self.count, self._stride = len(usual), dr.opaque(mi.UInt32, len(usual) + 1)
-        self._scene, self._usual, self._share, self._look, self._ignored = scene, usual, share, look, ignored
+        self._usual, self._share, self._ignored = usual, share, ignored
+        # While it learns, every source has a site of its own, at which no other is drawn
+        self._learns = dr.opaque(mi.Bool, False)
         self.forget()
 
     def _use(self, probability: np.ndarray) -> None:
@@ -60,8 +62,10 @@ class SiteChoice:
         # Twice, because arrays of one entry make other kernels
         self._use(np.stack([self._usual, self._usual]))
 
-    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> bool:
-        """Learn from vertices, (n, 3) each, with about so many rays at most: whether anything was learned."""
+    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int, look: Callable) -> bool:
+        """Learn from vertices, (n, 3) each, with about so many rays at most: whether anything was learned.
+
+        ``look(places, site)``: what :func:`vpl.split.irradiance.irradiance_from_emitters` finds by one sample each."""
         each = _RAYS_EACH * self.count
         most = min(rays, _MOST_RAYS) // each
         if most < 1 or len(position) == 0:
@@ -76,24 +80,20 @@ class SiteChoice:
         sampler = independent_sampler(seed, len(lane))
         number = mi.UInt32(sampler.next_1d() * mi.Float(dr.gather(mi.UInt32, upload(mi.UInt32, size), row)))
         vertex = dr.gather(mi.UInt32, first, row) + number
-        places, normals = (upload_vectors(mi.Point3f, x[order]) for x in (position, normal))
-        unoccluded, seen = (
+        position, normal = (upload_vectors(mi.Point3f, x[order]) for x in (position, normal))
+        facing = mi.Normal3f(dr.gather(mi.Point3f, normal, vertex))
+        # Normals twice, as arrays of their own, so that the kernel is that of lights, which have two
+        places = Places(dr.gather(mi.Point3f, position, vertex), facing + dr.opaque(mi.Float, 0.0), facing)
+        dr.eval(places, source)
+        self._learns = dr.opaque(mi.Bool, True)
+        reached, unoccluded = look(places, source)
+        self._learns = dr.opaque(mi.Bool, False)
+        reached, unoccluded = (
             download(x).astype(np.float64).reshape(sites, self.count, _RAYS_EACH)
-            for x in self._looks(places, normals, vertex, source, sampler)
+            for x in (channel_mean(reached), unoccluded)
         )
-        self._use(self._shares(unoccluded, seen))
+        self._use(self._shares(unoccluded, reached > 0))
         return True
-
-    def _looks(self, positions, normals, vertex, source, sampler):
-        """(Irradiance that a source would give a vertex by one sample if nothing was between, whether nothing is)."""
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(vertex))
-        si.p, si.n = dr.gather(mi.Point3f, positions, vertex), mi.Normal3f(dr.gather(mi.Point3f, normals, vertex))
-        si.sh_frame = mi.Frame3f(si.n)
-        sample = self._look(si, source, sampler)
-        light = channel_mean(sample.weight) * dr.maximum(dr.dot(sample.direction, si.n), 0)
-        seen = dr.select((light > 0) & ~self._scene.ray_test(sample.ray, light > 0), mi.Float(1), 0)
-        dr.eval(light, seen)
-        return light, seen
 
     def _shares(self, unoccluded: np.ndarray, seen: np.ndarray) -> np.ndarray:
         """Probabilities (sites + 1, sources) by root mean squares of what arrived; first where nothing is known."""
@@ -110,18 +110,22 @@ class SiteChoice:
 
     # ---------------------- Sampling ----------------------
 
-    def site(self, si, side):
-        """The site of a vertex; ``side``: see :func:`vpl.split.floors.side_of`."""
-        return self._sites.at(si.p, si.sh_frame.n * side)
+    def site(self, position, facing):
+        """The site of each vertex; ``facing``: shading normal, on the side that is seen."""
+        return self._sites.at(position, facing)
 
     def draw(self, site, number, active):
         """A source for each site by a uniform number: (source, its probability, another uniform number)."""
-        row = self._rows.draw(site, number, active)
-        return row - self._row(site), self._rows.probability(row, active), self._rows.rest(row, number, active)
+        known = active & ~self._learns
+        row = self._rows.draw(site, number, known)
+        source = dr.select(self._learns, site, row - self._row(site))
+        probability = dr.select(self._learns, 1, self._rows.probability(row, known))
+        return source, probability, dr.select(self._learns, number, self._rows.rest(row, number, known))
 
     def probability(self, site, source, active):
         """Probability of a source at each site."""
-        return self._rows.probability(self._row(site) + source, active)
+        known = self._rows.probability(self._row(site) + source, active & ~self._learns)
+        return dr.select(self._learns, dr.select(active & (site == source), mi.Float(1), 0), known)
 
     def _row(self, site):
         """Where the row of a site begins in the table of probabilities."""
@@ -136,10 +140,10 @@ def _share(found: np.ndarray, possible: np.ndarray, axes: tuple) -> np.ndarray:
 class NoChoice:
     """A choice that is everywhere the same, in the place of a :class:`SiteChoice`."""
 
-    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> bool:
+    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int, look: Callable) -> bool:
         """There is nothing to learn."""
         return False
 
-    def site(self, si, side):
+    def site(self, position, facing):
         """The only site."""
         return mi.UInt32(0)

@@ -19,11 +19,11 @@ import numpy as np
 from ..core.arrays import download, ones, spectrum_to_rgb, upload, upload_vectors
 from ..core.loops import recorded_once
 from ..core.sampling import derived_seed, independent_sampler
-from ..direct.emitter_sampling import power_heuristic
 from ..lights.emission import bounding_box
 from ..lights.virtual_lights import VirtualLights
 from .cells import Cells, Lines
 from .floors import floor_of, side_of
+from .irradiance import Places, irradiance_from_emitters
 from .numbers import SpreadNumbers
 from .paths import PAST, FirstEdge, Limits
 from .pilot import Arrivals
@@ -88,8 +88,10 @@ def _lights_along(scene, emission, lines: Lines, limits: Limits, seed: int) -> V
     kept = dr.compress(lit)
     if len(kept) == 0:
         return VirtualLights.of("surface", [], [], [])
-    rays, place, outward, facing, floor = (dr.gather(type(x), x, kept) for x in (rays, place, outward, facing, floor))
-    irradiance, length = _irradiance(scene, emission, rays, limits, seed)
+    place, outward, facing, floor = (dr.gather(type(x), x, kept) for x in (place, outward, facing, floor))
+    places = Places(place, outward, facing)
+    dr.eval(places, floor)
+    irradiance, length = _irradiance(scene, emission, places, limits, seed)
     columns = (place, outward, spectrum_to_rgb(floor * irradiance), length)
     lights = VirtualLights.of("surface", *(download(column) for column in columns))
     lights.facing = download(facing)
@@ -148,19 +150,20 @@ def _floors(scene, perturbed, rays):
     return found
 
 
-def _irradiance(scene, emission, rays, limits: Limits, seed: int):
-    """Irradiance, by one path each, where rays meet surfaces: (unpolarized spectrum, edges of a path that found it)."""
-    count = dr.width(rays.o)
+def _irradiance(scene, emission, places: Places, limits: Limits, seed: int):
+    """Irradiance of each place by one path: (unpolarized spectrum, edges of a path that found it)."""
+    count = places.count
+    site = emission.choice.site(places.position, places.facing) + dr.opaque(mi.UInt32, 0, count)
     sampler = independent_sampler(derived_seed(seed, 0), count)
-    si = scene.ray_intersect(rays)
-    side = side_of(si)
-    facing, site = si.sh_frame.n * side, emission.choice.site(si, side)
-    nearest = _from_emitters(scene, emission, si, facing, site, sampler)
     # A path that begins with a direction drawn by the cosine
     local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
-    ray, density, draw = si.spawn_ray(mi.Frame3f(facing).to_world(local)), local.z * dr.inv_pi, sampler.next_1d()
-    dr.eval(si.p, nearest, ray, density, draw, site)
-    edge = FirstEdge.of(si.p, ray, ones(count) * dr.pi, density, False, PAST, site, 1.0, True)
+    ray = places.interaction().spawn_ray(mi.Frame3f(places.facing).to_world(local))
+    density, draw = local.z * dr.inv_pi, sampler.next_1d()
+    dr.eval(site, ray, density, draw)
+    # A light is seen by many pixels: where there are many emitters, what it has of one of them would show
+    samples = _EMITTER_SAMPLES if emission.lights is not None else 1
+    nearest, _ = irradiance_from_emitters(scene, emission, places, site, samples, derived_seed(seed, 2))
+    edge = FirstEdge.of(places.position, ray, ones(count) * dr.pi, density, False, PAST, site, 1.0, True)
     numbers = SpreadNumbers(dr.arange(mi.UInt32, count), 1, seed)
     found, *_ = follow(scene, emission, edge, numbers, independent_sampler(derived_seed(seed, 1), count), limits)
     # Gather points further from the camera may use shorter paths only: a light stands for paths of one length, and has
@@ -170,19 +173,3 @@ def _irradiance(scene, emission, rays, limits: Limits, seed: int):
     one = dr.select(is_nearest, nearest, found.drawn)
     irradiance = dr.select(level + more > 0, one * (level + more) / dr.sum(one), 0)
     return irradiance, dr.select(is_nearest, mi.UInt32(1), found.length)
-
-
-@recorded_once
-@dr.syntax
-def _from_emitters(scene, emission, si, facing, site, sampler):
-    """Irradiance straight from emitters, by next-event estimation."""
-    # A light is seen by many pixels: where there are many emitters, what it has of one of them would show
-    samples = dr.opaque(mi.UInt32, _EMITTER_SAMPLES if emission.lights is not None else 1)
-    found, number = dr.zeros(mi.UnpolarizedSpectrum, dr.width(si.p)), mi.UInt32(0)
-    while dr.hint(number < samples, exclude=[scene, emission, si, facing, site, samples]):
-        sample = emission.sample(si, site, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), si.is_valid())
-        cosine = dr.maximum(dr.dot(facing, sample.direction), 0)
-        mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, cosine * dr.inv_pi))
-        found += dr.select(sample.density > 0, sample.arriving(scene, si.is_valid()) * cosine * mis, 0)
-        number += 1
-    return found / mi.Float(samples)

@@ -67,7 +67,7 @@ class TreeEmitters:
         usual = np.zeros(self._tree.clusters + self._distant + 1)
         usual[-1] = 1
         self._clusters = dr.opaque(mi.UInt32, self._tree.clusters)
-        self.choice = SiteChoice(scene, usual, _USUAL_SHARE, self._look, np.array([len(usual) - 1]))
+        self.choice = SiteChoice(usual, _USUAL_SHARE, np.array([len(usual) - 1]))
 
     def _located_share(self, intensity: float) -> float:
         """Share of the samples that goes to emitters with a place, of an intensity in all."""
@@ -167,13 +167,6 @@ class TreeEmitters:
         """See :class:`vpl.split.emitter_samples.EmitterSample`, of area emitters."""
         carried = dr.gather(mi.UInt32, self._is_carried, row, active) == 1
         return dr.select(carried, dr.abs(dr.dot(normal, direction)) / dr.square(distance), dr.inf)
-
-    def _look(self, si, source, sampler) -> EmitterSample:
-        """What is learned from: a direction to each source."""
-        active = mi.Bool(True)
-        near, row, index = self._draw(source, si.p, sampler.next_1d(), sampler.next_1d(), active)
-        _, within = self._tree.probability(row, si.p, near)
-        return self._toward(si, near, row, index, sampler.next_2d(), active).chosen_with(dr.select(near, within, 1))
 
     def sample(self, si, site, chosen, member, place, active) -> EmitterSample:
         """As :meth:`vpl.split.next_event.UniformEmitters.sample`."""
