@@ -215,7 +215,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
 
     def _made_lights(self, view: View, arrivals: Arrivals, chosen: Balance, clock: Clock) -> TreedLights:
         """Virtual lights where the pilot's paths arrived, and their tree."""
-        # The path from a light is shorter by the two edges between camera and light
+        # The path from a light is shorter by the two edges between camera and light, and no camera path, whose worth
+        # would be known
         rules = Rules(self.max_depth - 2, rr_depth=1, hide_emitters=False)
         limits = replace(view, rules=rules, worth=Worth.unknown()).limits(ViewLights(), NOWHERE)
         seed = derived_seed(view.seed, 2)

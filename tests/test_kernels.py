@@ -1,5 +1,6 @@
 """Kernels: another size of the image, number of samples or seed compiles none but Mitsuba's own."""
 
+import dataclasses
 import gc
 
 import drjit as dr
@@ -8,6 +9,9 @@ import pytest
 
 import integrators
 from vpl.core.registry import RegistryTable
+from vpl.lights.emitters import read_emitters
+from vpl.points.camera_paths import shape_in
+from vpl.split import irradiance, surface_lights
 
 from .conftest import area_light, closed_box
 
@@ -102,3 +106,36 @@ def test_places_in_the_registry_are_in_no_kernel(compiled):
     assert few.tolist() == [7, 8] + [0] * (len(indices) - 2)
     assert (all_and_more == 3).all()
     assert (RegistryTable(indices, 3).at(shapes, False).numpy() == 0).all()
+    assert (RegistryTable(indices, 3).at(dr.zeros(mi.ShapePtr, 3)).numpy() == 0).all()
+
+
+def test_shapes_that_are_told_apart_are_in_no_kernel(compiled):
+    scene = mi.load_dict(closed_box({"lamp": area_light(), "other": area_light()}))
+    shapes, area = scene.shapes_dr(), read_emitters(scene).area
+    indices = dr.reinterpret_array(mi.UInt32, shapes).numpy()
+    si = dr.zeros(mi.SurfaceInteraction3f, len(indices))
+    si.shape = shapes
+    dr.eval(si)
+    compiled()
+    for indices_of_two, index_of_emitters in ((indices[:2], area.shape_index), ([1, 700], area.shape_index + 900)):
+        shape_in(shapes, tuple(int(index) for index in indices_of_two)).numpy()
+        dataclasses.replace(area, shape_index=index_of_emitters).row(si).numpy()
+        assert (compiled() == 0) == (700 in indices_of_two)
+
+
+def test_sites_and_lights_find_irradiance_by_one_kernel(monkeypatch, lights_cost_nothing):
+    scene = mi.load_dict(closed_box({"lamp": area_light(), "other": area_light()}))
+    find, launched = irradiance.irradiance_from_emitters, []
+
+    def watched(*arguments):
+        dr.kernel_history_clear()
+        found = find(*arguments)
+        launched.append(max(dr.kernel_history(), key=lambda one: one.get("operation_count") or 0)["hash"])
+        return found
+
+    monkeypatch.setattr(irradiance, "irradiance_from_emitters", watched)
+    monkeypatch.setattr(surface_lights, "irradiance_from_emitters", watched)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        mi.render(scene, integrator=mi.load_dict({"type": "manylights", "max_depth": 4}), spp=64).numpy()
+    assert len(launched) == 2
+    assert len(set(launched)) == 1

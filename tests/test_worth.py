@@ -56,7 +56,7 @@ def test_what_a_vertex_sent_back_does_not_tell_of_itself():
 @pytest.mark.parametrize("lights", [True, False])
 def test_the_image_is_that_of_path(monkeypatch, lights_cost_nothing, lights):
     """Most paths end at their second vertices here, as all are thought to be worth little."""
-    monkeypatch.setattr("integrators.manylights.importance", lambda *_: 0.3)
+    monkeypatch.setattr("vpl.split.decision.importance", lambda *_: 0.3)
     scene, pairs = mi.load_dict(closed_box(lamp_behind_the_camera(), size=16)), []
     for seed in range(16):
         found, statistics = render_with_statistics("manylights", scene, 32, seed, virtual_lights=lights)
@@ -66,7 +66,7 @@ def test_the_image_is_that_of_path(monkeypatch, lights_cost_nothing, lights):
 
 
 def test_alpha_is_that_of_path_where_a_pixel_sees_masks_behind_masks(monkeypatch):
-    monkeypatch.setattr("integrators.manylights.importance", lambda *_: 1e-6)
+    monkeypatch.setattr("vpl.split.decision.importance", lambda *_: 1e-6)
     mask = {"type": "mask", "opacity": 0.3, "nested": {"type": "twosided", "nested": {"type": "diffuse"}}}
     veils = {f"veil{k}": wall([0, 0, -0.3 * k], [0, 1, 0], 0, 8, bsdf=mask) for k in range(6)}
     description = {"type": "scene", "sensor": sensor(16), "lamp": {"type": "point", "position": [0, 0, 3]}, **veils}

@@ -16,15 +16,16 @@ class RegistryTable:
     """A number for each of some objects, 0 for all others.
 
     Kernels hold neither indices nor how many there are: shapes are loaded in parallel, and registered in another order
-    in every process, which would have to compile them anew.  The fields of a dataclass, unlike those of other classes,
-    may be given to functions that Dr.Jit freezes.
+    in every process, which would have to compile them anew.  A dataclass, as :class:`vpl.lights.perturbed.Perturbed`,
+    which holds one, is given to functions that Dr.Jit freezes.
     """
 
     _numbers: object
     _size: object
 
     def __init__(self, indices, numbers):
-        """``indices`` (n,) in the registry; ``numbers``: that of each, or one for all."""
+        """``indices`` (n,) of objects of one kind in the registry, which counts each kind by itself, from 1;
+        ``numbers``: that of each, not negative, or one for all."""
         indices = np.asarray(indices, np.int64)
         # An array of one entry would make other kernels
         table = np.zeros(max(int(indices.max(initial=0)) + 1, 2), np.uint32)
@@ -32,6 +33,7 @@ class RegistryTable:
         self._numbers, self._size = upload(mi.UInt32, table), dr.opaque(mi.UInt32, len(table))
 
     def at(self, pointers, active=True):
-        """The number of the object that each pointer leads to, 0 where not active."""
+        """Number (UInt32) of the object that each pointer of that kind leads to; 0 of others and of none, and where not
+        active."""
         index = dr.reinterpret_array(mi.UInt32, pointers)
         return dr.gather(mi.UInt32, self._numbers, index, active & (index < self._size))

@@ -38,6 +38,7 @@ class Perturbed:
     """Shapes whose material shades with a normal of its own.
 
     ``exist``: whether there are any; ``everywhere``: whether they cannot be told from others, as in shape groups.
+    The fields of a dataclass, unlike those of other classes, may be given to functions that Dr.Jit freezes.
     """
 
     exist: bool

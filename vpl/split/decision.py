@@ -1,8 +1,8 @@
-"""Decision: what a view is followed with, from a pilot of some thousand of its paths.
+"""Decision: what a view is followed with, from a pilot of some ten thousand of its paths.
 
-The pilot's paths are followed a second time where emitters were learned from them, once more with lights on surfaces
-where these seem to pay, and so again where lights may stand for emitters.  They are always the same paths, and nothing
-depends on the clock: the same seed decides the same.
+The pilot's paths are followed a second time where emitters were learned from them, and once more with lights on
+surfaces where these seem to pay; where lights may stand for emitters, with these alone, and with both kinds where that
+seems to pay.  They are always the same paths, and nothing depends on the clock: the same seed decides the same.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .view import View
 from .view_lights import ViewLights, spaced_lights
 from .worth import Worth
 
-# Camera rays of the pilot
+# Camera rays of the pilot, at most
 _PILOT = 1 << 15
 # Cost of a path with emitters that were learned, more of whose shadow rays arrive, next to that of others
 _LEARNED_COST = 1.15
@@ -57,8 +57,8 @@ class Decision:
         return np.maximum(self.pilot.nearby(whole - left, view.width, view.pixels), 0)
 
     def judge(self, view: View) -> float | None:
-        """Tell the view what it is worth to follow its paths: the multiple of that by which they go on, see
-        :func:`vpl.split.balance.importance`; None where all do."""
+        """Tell the view what it is worth to follow its paths, which its limits and what is followed from then on go by:
+        the multiple of that by which they go on, see :func:`vpl.split.balance.importance`; None where all do."""
         pilot, onward = self.pilot, self.pilot.onward
         if len(onward.path) == 0:
             return None

@@ -40,7 +40,7 @@ class LearnedEmitters:
         if weight[of_environment].any():
             self._regions = regions_of(self._environment, _REGIONS, _COLUMNS)
         registry = download(dr.reinterpret_array(mi.UInt32, self._emitters))
-        self._number_of = RegistryTable(registry, np.arange(self._count))
+        self._number_of = RegistryTable(registry, np.arange(1, self._count + 1))
         alike = np.zeros(self._count + (self._regions.count if self._regions else 0))
         alike[: self._count] = weight / weight.sum()
         # What regions cannot tell apart, the environment's own sampling may
@@ -121,7 +121,8 @@ class LearnedEmitters:
         emitter = si.emitter(self._scene, active)
         emitted = finite_or_zero(mi.unpolarized_spectrum(emitter.eval(si, active))) & active
         wanted = active & has_density & (emitter != None)  # noqa: E711
-        number = self._number_of.at(emitter, wanted)
+        found = self._number_of.at(emitter, wanted)
+        wanted, number = wanted & (found > 0), found - 1
         near = wanted & si.is_valid()
         probability = self.choice.probability(site, number, near)
         density = emitter.pdf_direction(origin, ds, near) * probability

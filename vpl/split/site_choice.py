@@ -27,7 +27,7 @@ _PRIOR = 1.0
 
 
 def learning_rays(paths: int) -> int:
-    """How many rays there are to learn by for so many camera rays."""
+    """Number of rays to learn by, for so many camera rays."""
     return int(_LEARNING_SHARE * paths)
 
 

@@ -55,7 +55,8 @@ class View:
         return np.minimum(np.arange(pairs)[:, None] * apart + [0, 1], self.count - 1).reshape(-1)
 
     def limits(self, lights: ViewLights, gathering: int) -> Limits:
-        """Limits of camera paths of which ``lights`` carry a part; ``gathering``: see :mod:`vpl.split.paths`."""
+        """Limits, by the view's rules and worth, of paths of which ``lights`` carry a part; ``gathering``: see
+        :mod:`vpl.split.paths`."""
         longest = dr.opaque(mi.UInt32, int(min(self.rules.max_depth, 0xFFFFFFFF)))
         squared_c, of_emitters = (
             dr.opaque(mi.Float, (x.smallest_distance if x else _WHOLE) ** 2) for x in (lights.surfaces, lights.emitters)
