@@ -16,8 +16,9 @@ from .worth import Worth
 # Where a path is: before its first vertex with a floor; on its way from one where lights are gathered to the next
 # vertex; and anywhere else
 SEEKING, CONNECTING, PAST = range(1, 4)
-# Where lights are gathered: the last state in which floors are looked at
-NOWHERE, AT_FIRST, EVERYWHERE = 0, CONNECTING, PAST
+# Where lights are gathered: the last state in which floors are looked at. Where they are placed, as at a first vertex,
+# but even if it is seen from behind its shading normal: the density of lights knows nothing of that
+NOWHERE, AT_FIRST, EVERYWHERE, PLACING = 0, CONNECTING, PAST, PAST + 1
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,8 @@ class Rules:
 @dataclass
 class Limits:
     """``max_depth`` (edges), ``rr_depth``: as in ``path``, UInt32; ``squared_c``: of the split, world units²;
-    ``gathering``: where lights are gathered, NOWHERE, AT_FIRST or EVERYWHERE; ``emitters_carried``: whether virtual
-    lights stand for emitters, too, and ``emitters_squared_c`` of these; all opaque.
+    ``gathering``: where lights are gathered or placed, NOWHERE, AT_FIRST, EVERYWHERE or PLACING; ``emitters_carried``:
+    whether virtual lights stand for emitters, too, and ``emitters_squared_c`` of these; all opaque.
 
     ``worth`` of following paths; ``perturbed``: shapes without a floor; ``hide_emitters``: of Python.
     """
@@ -75,7 +76,7 @@ class FirstEdge(Edge):
 
     @classmethod
     def of_camera(cls, ray, importance, active) -> FirstEdge:
-        """Camera rays."""
+        """Camera rays, and others that begin at no surface."""
         density = dr.opaque(mi.Float, 1.0, dr.width(ray.d))
         return cls.of(ray.o, ray, ones(len(density)), density, True, SEEKING, mi.UInt32(0), importance, active)
 
@@ -87,7 +88,8 @@ class FirstEdge(Edge):
         wide = dr.opaque(mi.Float, 0.0, count)
         ray = mi.Ray3f(ray.o + wide, ray.d + wide, ray.time + wide)
         ray.maxt = dr.largest(mi.Float) + wide
-        active = mi.Bool(active) & (wide == 0)
+        # An array of its own, even where all are active and none was drawn from a density
+        active = mi.Bool(active) & dr.opaque(mi.Bool, True, count)
         edge = cls(
             # An array of its own, even where rays begin at the vertex itself
             vertex + dr.opaque(mi.Float, 0.0, count),
@@ -202,7 +204,8 @@ class Gathered:
         """Add the vertices that are met, where lights are gathered: (whether they are, their weight)."""
         si = met.si
         seeks = met.smooth & (path.state == SEEKING)
-        gathers = (seeks | (met.smooth & (limits.gathering == EVERYWHERE))) & agrees(si, met.side)
+        gathers = seeks | (met.smooth & (limits.gathering == EVERYWHERE))
+        gathers &= agrees(si, met.side) | (limits.gathering == PLACING)
         gathers &= (dr.max(met.floor) > 0) & (limits.emitters_carried | (path.depth + 2 < limits.max_depth))
         weight = path.throughput * met.floor - path.carried
         gathers &= dr.all(dr.abs(weight) <= LARGEST_VALUE)

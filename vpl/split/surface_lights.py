@@ -10,7 +10,7 @@ Cells are chosen by what a pilot's paths brought to the camera from there: light
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -22,10 +22,9 @@ from ..core.sampling import derived_seed, independent_sampler
 from ..lights.emission import bounding_box
 from ..lights.virtual_lights import VirtualLights
 from .cells import Cells, Lines
-from .floors import floor_of, side_of
 from .irradiance import Places, irradiance_from_emitters
 from .numbers import SpreadNumbers
-from .paths import PAST, FirstEdge, Limits
+from .paths import PAST, PLACING, FirstEdge, Limits
 from .pilot import Arrivals
 from .remainder import follow
 
@@ -84,17 +83,13 @@ def _lights_along(scene, emission, lines: Lines, limits: Limits, seed: int) -> V
     rays = _rays_to_surfaces(scene, lines)
     if dr.width(rays.o) == 0:
         return VirtualLights.of("surface", [], [], [])
-    lit, place, outward, facing, floor = _floors(scene, limits.perturbed, rays)
-    kept = dr.compress(lit)
-    if len(kept) == 0:
+    places, floor = _places_with_floors(scene, emission, rays, limits, derived_seed(seed, 3))
+    if places.count == 0:
         return VirtualLights.of("surface", [], [], [])
-    place, outward, facing, floor = (dr.gather(type(x), x, kept) for x in (place, outward, facing, floor))
-    places = Places(place, outward, facing)
-    dr.eval(places, floor)
     irradiance, length = _irradiance(scene, emission, places, limits, seed)
-    columns = (place, outward, spectrum_to_rgb(floor * irradiance), length)
+    columns = (places.position, places.normal, spectrum_to_rgb(floor * irradiance), length)
     lights = VirtualLights.of("surface", *(download(column) for column in columns))
-    lights.facing = download(facing)
+    lights.facing = download(places.facing)
     return lights.without_bad()[0]
 
 
@@ -137,17 +132,22 @@ def _meet(scene, lines, first, find: bool, starts, line):
     return number
 
 
-def _floors(scene, perturbed, rays):
-    """Surfaces that rays meet: (whether they have a floor, place, geometric and shading normals on the side that was
-    met, floor), evaluated."""
-    si = scene.ray_intersect(rays)
-    bsdf, side = si.bsdf(), side_of(si)
-    smooth = si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    floor = floor_of(si, bsdf, side, perturbed, smooth)
-    outward = si.n * dr.mulsign(mi.Float(1), -dr.dot(si.n, rays.d))
-    found = (smooth & (dr.max(floor) > 0), si.p, outward, si.sh_frame.n * side, floor)
-    dr.eval(found)
-    return found
+def _places_with_floors(scene, emission, rays, limits: Limits, seed: int):
+    """Places that rays meet where there is a floor, with normals on the side that was met: (places, floors), evaluated.
+
+    Found by the kernel that follows paths, for another with the code of all materials would take long to compile.
+    """
+    count = dr.width(rays.o)
+    depth, gathering = dr.opaque(mi.UInt32, 2), dr.opaque(mi.UInt32, PLACING)
+    limits = replace(limits, max_depth=depth, gathering=gathering, emitters_carried=dr.opaque(mi.Bool, True))
+    numbers = SpreadNumbers(dr.arange(mi.UInt32, count), 1, derived_seed(seed, 0))
+    sampler = independent_sampler(derived_seed(seed, 1), count)
+    _, met, *_ = follow(scene, emission, FirstEdge.of_camera(rays, 1.0, True), numbers, sampler, limits)
+    met = met.select(dr.compress((met.depth > 0) & (dr.max(met.weight) > 0)))
+    outward = met.flat * dr.mulsign(mi.Float(1), dr.dot(met.flat, met.normal))
+    places = Places(met.position, outward, met.normal)
+    dr.eval(places)
+    return places, met.weight
 
 
 def _irradiance(scene, emission, places: Places, limits: Limits, seed: int):
