@@ -76,10 +76,10 @@ class ManyLightsIntegrator(GatheringIntegrator):
     Light of environments, directional emitters, and meshes whose vertices have other normals than their surface is
     traced.
 
-    **Chooses by itself.** A pilot of some ten thousand paths tells where lights are wanted, how many, and whether they pay:
-    where they would take little of the noise away, or the image has few samples, there are none, and what is left is
-    ``path`` with well spread samples. What was chosen is in ``statistics``, in the log (level Info) and in files
-    that the command writes. The same seed chooses the same.
+    **Chooses by itself.** A pilot of some ten thousand paths tells where lights are wanted, how many, at how many of a
+    pixel's samples, and whether they pay: where they would take little of the noise away, or the image has few samples,
+    there are none, and what is left is ``path`` with well spread samples. What was chosen is in ``statistics``, in the
+    log (level Info) and in files that the command writes. The same seed chooses the same.
 
     **Kept lights.** With ``keep_lights`` the frames of a camera that moves, or several sensors, share their lights and
     the tree over them, each seed its own, as far as these are two million. Every frame still has the mean of ``path``,

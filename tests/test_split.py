@@ -329,6 +329,14 @@ def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
     assert balanced(0.1 * direct, indirect, 10**8, 64, left=0.95 * indirect).light_paths == 0
 
 
+def test_more_vertices_are_lit_the_less_noise_there_is_besides():
+    rng = np.random.default_rng(0)
+    indirect, direct = rng.exponential(size=(2, 10_000))
+    found = [balanced(share * direct, indirect, 10**8, 64).vertices for share in (0.0, 0.3, 1.0)]
+    assert 64 >= found[0] > found[1] > found[2] >= 8
+    assert balanced(0.1 * direct, indirect, 10**8, 1).vertices == 1
+
+
 def test_one_sample_has_no_noise_that_lights_could_take_away():
     chosen = balanced(np.full(2, 0.5), np.full(2, 0.5), 1, 1)
     assert chosen.light_paths == 0 and "nan" not in chosen.reason

@@ -43,8 +43,9 @@ _FIRST_EDGES = 4.0
 _LARGEST_PRODUCT = 0.95
 # Variance × cost with lights, next to that without, below which they are used
 _PAYS_BELOW = 1.0
-# Gather vertices of a pixel: one of so many samples, and at most so many
-_SAMPLES_A_VERTEX, _MOST_VERTICES = 4, 16
+# Relative variance that one gather vertex leaves by standing for all of its pixel, its cost, and how many there are at
+# least, as a share of the samples
+_VERTEX_NOISE, _VERTEX_COST, _LEAST_VERTICES = 0.06, 0.8, 1 / 8
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -156,7 +157,9 @@ def _priced(evidence: Evidence, option: Option) -> tuple[float, float, Balance]:
         light_paths = int(np.clip(wanted, _FEWEST, _MOST))
     fixed = (_FIXED_COST + _LIGHT_PATH_COST * light_paths) / paths
     cost = 1 + cuts * _RAY_COST * rays / samples + fixed
-    vertices = int(np.clip(samples // _SAMPLES_A_VERTEX, 1, _MOST_VERTICES))
+    # The least of (noise of all else + noise of these / their share) × (cost of all else + their share × their cost)
+    share = np.clip((_VERTEX_NOISE * cost / (_VERTEX_COST * max(left, 1e-9))) ** 0.5, _LEAST_VERTICES, 1)
+    vertices = max(round(float(share) * samples), 1)
     return cost * left, cost, Balance(light_paths, option.emitters, error, vertices, left, "")
 
 
