@@ -194,9 +194,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
             return ViewLights(surfaces)
         clock.begin(Stage.TREE)
         lights = view.emission.lights
-        points = lights.points(view.count)
-        groups = lights.groups(points, derived_seed(view.seed, 7))
-        emitters = spaced_lights(groups, lights.spacing(points), self.max_depth)
+        emitters = view.emitter_lights(lights.groups(lights.points(view.count), derived_seed(view.seed, 7)))
         self.statistics["lights"] = self.statistics.get("lights", {}) | {"emitters": emitters.count}
         return ViewLights(surfaces, emitters)
 

@@ -149,11 +149,7 @@ def relative_error(image, expected):
     return np.abs(image - expected).sum() / expected.sum()
 
 
-# Of a hundred t tests none is to fail by chance
-ALPHA = 1e-3
-
-
-def assert_same_mean_over_seeds(pairs, tiles=4, alpha=ALPHA):
+def assert_same_mean_over_seeds(pairs, tiles=4, alpha=0.01):
     """A t test, Šidák-corrected, on the differences of images that are paired, (ours, expected), one pair a seed.
 
     Of the means over tiles and over the image, which are where bias shows.

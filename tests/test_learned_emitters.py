@@ -15,6 +15,7 @@ from vpl.split.view_lights import ViewLights
 
 from .catalogue import EMITTERS, SENSORS, film, image, rgb
 from .conftest import closed_box, render, render_with_statistics, sensor, unit_vectors
+from .test_tree_emitters import interactions
 
 
 def bulbs(**second):
@@ -45,9 +46,7 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(emitter):
     del box["left"], box["ceiling"]
     scene = mi.load_dict(box)
     emission, position, normal = learned(scene)
-    si = dr.zeros(mi.SurfaceInteraction3f, len(position))
-    si.p, si.n = upload_vectors(mi.Point3f, position), upload_vectors(mi.Normal3f, normal)
-    si.sh_frame = mi.Frame3f(si.n)
+    si = interactions(position, normal)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(1, len(position))
     site = emission.choice.site(si.p, si.n)
@@ -81,9 +80,7 @@ def test_no_direction_at_the_edge_of_a_small_sun_weighs_far_too_much(learns):
     emission, position, normal = learned(mi.load_dict({"type": "scene", **EMITTERS["sunsky"]()}))
     if not learns:
         emission.choice.forget()
-    si = dr.zeros(mi.SurfaceInteraction3f, len(position))
-    si.p, si.n = upload_vectors(mi.Point3f, position), upload_vectors(mi.Normal3f, normal)
-    si.sh_frame = mi.Frame3f(si.n)
+    si = interactions(position, normal)
     site = emission.choice.site(si.p, si.n)
     rng, heaviest, total = np.random.default_rng(0), 0.0, 0.0
     for _ in range(20):

@@ -8,7 +8,6 @@ import pytest
 
 from .catalogue import EMITTERS, MATERIALS, ONE_PIXEL, SENSORS, film, image, one_of, rgb, stage
 from .conftest import (
-    ALPHA,
     area_light,
     assert_same_mean_over_seeds,
     closed_box,
@@ -29,7 +28,7 @@ QUICK_MATERIALS = ("roughplastic", "principled", "mask", "blendbsdf", "twosided"
 pytestmark = pytest.mark.usefixtures("lights_cost_nothing")
 
 
-def assert_image_of_path(description, spp=32, seeds=16, reference="path", lights=True, alpha=ALPHA, **more):
+def assert_image_of_path(description, spp=32, seeds=16, reference="path", lights=True, alpha=0.01, **more):
     """Means over seeds, over tiles and over the image, are those of `reference`."""
     scene, pairs = mi.load_dict(description), []
     for seed in range(seeds):

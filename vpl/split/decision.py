@@ -123,8 +123,7 @@ def _considered(view: View, pilot: Pilot) -> tuple[Evidence, list[Option]]:
     evidence = Evidence(pilot.radiance, direct, brightness, view.count, view.samples, carries_emitters)
     options = _with_surfaces(view, evidence, pilot, None)
     if carries_emitters:
-        lights = view.emission.lights
-        emitters = spaced_lights([], lights.spacing(lights.points(view.count)), view.rules.max_depth)
+        emitters = view.emitter_lights([])
         left = _followed(view, ViewLights(emitters=emitters))
         options.append(Option(False, True, left.radiance, left.indirect))
         options += _with_surfaces(view, evidence, left, emitters)

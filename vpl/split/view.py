@@ -9,11 +9,12 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.sampling import derived_seed, independent_sampler
+from ..lights.light_set import LightGroup, LightSet
 from ..lights.perturbed import Perturbed
 from .numbers import SpreadNumbers
 from .paths import FirstEdge, Limits, Rules
 from .remainder import follow
-from .view_lights import ViewLights
+from .view_lights import ViewLights, spaced_lights
 from .worth import Worth
 
 # c of paths that are whole, beyond every distance, world units: nothing is left to virtual lights
@@ -53,6 +54,11 @@ class View:
         pairs = max(min(most, self.count // 4) // 2, 1)
         apart = max(self.count // pairs // 2 * 2, 2)
         return np.minimum(np.arange(pairs)[:, None] * apart + [0, 1], self.count - 1).reshape(-1)
+
+    def emitter_lights(self, groups: list[LightGroup]) -> LightSet:
+        """The lights that stand for emitters, in ``groups``; none where only their c is wanted."""
+        lights = self.emission.lights
+        return spaced_lights(groups, lights.spacing(lights.points(self.count)), self.rules.max_depth)
 
     def limits(self, lights: ViewLights, gathering: int) -> Limits:
         """Limits, by the view's rules and worth, of paths of which ``lights`` carry a part; ``gathering``: see
