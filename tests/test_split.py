@@ -280,6 +280,25 @@ def test_lights_of_a_node_are_drawn_by_their_share_of_its_intensity():
         np.testing.assert_allclose(sent, lights.intensity[inside].sum(0), rtol=1e-3)
 
 
+@pytest.mark.parametrize(("samples", "most"), [(1, 1), (7, 5), (16, 16), (64, 41), (64, 100)])
+def test_so_many_vertices_of_a_pixel_are_lit_evenly_among_its_samples(samples, most):
+    pixels, kept = 3, min(most, samples)
+    # All but one have weight, which is negative somewhere
+    weight = np.ones(pixels * samples)
+    weight[1], weight[-1] = -1, 0
+    count = mi.UnpolarizedSpectrum(upload(mi.Float, weight))
+    place = [dr.zeros(kind, len(weight)) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f)]
+    first = GatherVertices(*place, count, dr.full(mi.UInt32, 1, len(weight)))
+    later = GatherVertices(*place, dr.zeros(mi.UnpolarizedSpectrum, len(weight)), dr.zeros(mi.UInt32, len(weight)))
+    lit = LitVertices.of(first, later, samples, most, 1)
+    assert lit.kept == kept and lit.alone == 0
+    sample = np.sort(np.array(lit.rays))
+    number = [np.count_nonzero(sample // samples == pixel) for pixel in range(pixels)]
+    assert number == [kept, kept, kept - 1]
+    apart = np.diff(sample[sample < samples])
+    assert set(apart) <= {samples // kept, -(-samples // kept)}
+
+
 def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
     rng, count, samples = np.random.default_rng(1), 400, 8
     weight = rng.uniform(0.01, 1, (count, 3))
@@ -335,6 +354,13 @@ def test_more_vertices_are_lit_the_less_noise_there_is_besides():
     found = [balanced(share * direct, indirect, 10**8, 64).vertices for share in (0.0, 0.3, 1.0)]
     assert 64 >= found[0] > found[1] > found[2] >= 8
     assert balanced(0.1 * direct, indirect, 10**8, 1).vertices == 1
+
+
+def test_more_light_paths_are_followed_the_noisier_indirect_light_is():
+    rng = np.random.default_rng(0)
+    direct = rng.exponential(size=10_000)
+    found = [balanced(direct, rng.gamma(1 / noise, noise, 10_000), 10**7, 64).light_paths for noise in (1, 4, 16)]
+    assert 0 < 1.2 * found[0] < found[1] < found[2] / 1.2
 
 
 def test_one_sample_has_no_noise_that_lights_could_take_away():

@@ -22,8 +22,10 @@ _SPREAD, _MANY_EMITTERS_SPREAD = 0.5, 1.0
 _GAIN, _DOUBTFUL = 0.9, 1.5
 # Relative standard error that one set of lights leaves in the mean of the image
 _SET_ERROR = 0.03
-# Relative variance that a set of lights leaves in a pixel, times the paths that it was made by
-_LIGHT_NOISE = 200.0
+# Relative variance that a set of lights leaves in a pixel, times the paths that it was made by, next to that of the
+# indirect light that one camera path finds; and how many times as much as other noise it weighs: neighbouring pixels
+# share it, so that it shows as blotches, which no denoiser takes away
+_LIGHT_NOISE, _SHARED = 50.0, 4.0
 # Light paths as a share of the paths from the camera, and how few and how many there may be
 _SHARES, _FEWEST, _MOST = (1 / 64, 1 / 8), 20_000, 500_000
 # Relative variance that cuts leave, times shadow rays a pixel; and the cost of one of these rays
@@ -152,7 +154,8 @@ def _priced(evidence: Evidence, option: Option) -> tuple[float, float, Balance]:
     left, light_paths = rest + cuts * _CUT_NOISE * samples / rays, 0
     if option.surfaces:
         # The least of (noise of these / samples + noise of lights / their paths) × cost
-        balanced = (_LIGHT_NOISE * samples * paths / (_LIGHT_PATH_COST * left)) ** 0.5
+        of_lights = _SHARED * _LIGHT_NOISE * noise(option.indirect, evidence.brightness)
+        balanced = (of_lights * samples * paths / (_LIGHT_PATH_COST * max(left, _TINY))) ** 0.5
         wanted = np.clip(max(balanced, option.clumps / _SET_ERROR**2), _SHARES[0] * paths, _SHARES[1] * paths)
         light_paths = int(np.clip(wanted, _FEWEST, _MOST))
     fixed = (_FIXED_COST + _LIGHT_PATH_COST * light_paths) / paths

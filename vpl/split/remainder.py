@@ -23,7 +23,7 @@ from ..direct.emitter_sampling import power_heuristic
 from .emitter_samples import EmitterSample, MetEmitter
 from .floors import agrees, carried_share, carried_share_of_emitter
 from .gather_vertices import Arrival
-from .paths import CONNECTING, PAST, SEEKING, FirstEdge, Found, Gains, Gathered, Limits, Met, Path
+from .paths import CONNECTING, PAST, PLACING, SEEKING, FirstEdge, Found, Gains, Gathered, Limits, Met, Path
 
 # Paths and shadow rays go on with this probability at least, however little is left: that is known only roughly
 _LEAST_SURVIVAL = 0.02
@@ -51,6 +51,9 @@ def follow(scene, emission, first: FirstEdge, numbers, sampler, limits: Limits):
         connects = _carry(path, met, limits, gains.radiance, gathered)
         _end_by_worth(path, met, connects, limits, sampler)
         gathers, weight = gathered.add(path, met, limits, sampler)
+        # Where lights are placed, that is all
+        met.goes_on &= limits.gathering != PLACING
+        met.smooth &= met.goes_on
         # Emission, by next-event estimation
         chosen, place, lobe, turn = numbers.at(path.scattered)
         path.scattered += dr.select(met.smooth, 1, 0)
@@ -95,11 +98,9 @@ def _carry(path: Path, met: Met, limits: Limits, radiance, gathered: Gathered):
 
 def _end_by_worth(path: Path, met: Met, connects, limits: Limits, sampler) -> None:
     """Russian roulette by what is left to trace, and by what that may bring."""
-    # With lobes other than a diffuse reflection, the floor does not tell how much is left
-    other_lobes = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.DiffuseReflection)
     reflected = path.throughput * met.floor
     left = dr.max(dr.abs(reflected - path.carried)) / dr.max(dr.abs(reflected))
-    left = dr.select(connects & ((met.flags & other_lobes) == 0), dr.clip(left, _LEAST_SURVIVAL, 1), 1)
+    left = dr.select(connects & _is_diffuse(met), dr.clip(left, _LEAST_SURVIVAL, 1), 1)
     left = dr.select(dr.isfinite(left), left, 1)
     # Not before a surface was met that alpha shows: paths that have only passed masks are still to find one
     judged = met.smooth & (path.scattered > 0) & path.valid
@@ -109,6 +110,12 @@ def _end_by_worth(path: Path, met: Met, connects, limits: Limits, sampler) -> No
     met.smooth &= met.goes_on
     path.throughput /= survival
     path.carried /= survival
+
+
+def _is_diffuse(met: Met):
+    """Whether the floor is all that surfaces reflect, so that it tells how much is left whatever the direction."""
+    other_lobes = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.DiffuseReflection)
+    return (met.flags & other_lobes) == 0
 
 
 def _left_of_emitter(path: Path, emitter: MetEmitter, limits: Limits):
@@ -152,7 +159,9 @@ def _turn(path: Path, met: Met, bs, share, gathers, weight):
     lambertian = dr.select(lambertian, path.cosine / path.density, 0)
     path.throughput = full - path.carried * lambertian
     kept = dr.max(dr.abs(path.throughput)) / dr.max(dr.abs(full))
-    kept = dr.select((dr.max(path.carried) > 0) & dr.isfinite(kept), dr.clip(kept, _LEAST_SURVIVAL, 1), 1)
+    # Where that was known beforehand, paths have ended by it already
+    judged = (dr.max(dr.abs(path.carried)) > 0) & ~_is_diffuse(met) & dr.isfinite(kept)
+    kept = dr.select(judged, dr.clip(kept, _LEAST_SURVIVAL, 1), 1)
     path.carried = weight * lambertian
     onward = dr.select(gathers & ~path.delta, mi.UInt32(CONNECTING), mi.UInt32(PAST))
     path.state = dr.select((path.state == SEEKING) & ~gathers, mi.UInt32(SEEKING), onward)
