@@ -11,7 +11,7 @@ from vpl.core.stages import Stage
 from . import analysis
 
 # What is made before a method begins: VPLs and their trees
-LIGHT_STAGES = (Stage.TRACE, Stage.TREE)
+LIGHT_STAGES = (Stage.TRACE, Stage.LIGHTS, Stage.TREE)
 CHOOSING_STAGES = {
     "matrixrecovery": (Stage.SLICES, Stage.INITIAL_CUT, Stage.COLUMNS, Stage.PREDICTION),
     "lightslice": (Stage.SLICES, Stage.SHARED_COLUMNS, Stage.ROWS, Stage.COLUMNS),

@@ -20,7 +20,7 @@ from vpl.split.decision import Decision
 from vpl.split.gather_vertices import LitVertices
 from vpl.split.kept_lights import KeptLights, TreedLights
 from vpl.split.next_event import emitters_of
-from vpl.split.paths import EVERYWHERE, NOWHERE, Rules
+from vpl.split.paths import Rules
 from vpl.split.pilot import Arrivals
 from vpl.split.pixel_clusters import PixelClusters, light_clusters
 from vpl.split.site_choice import learning_rays
@@ -131,7 +131,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
         self._kept = KeptLights()
 
     def _sample(self, scene, sampler, ray, active):
-        radiance, valid = self._trace(self._view(scene, sampler, ray, active))
+        clock = Clock(Stage.SCENE)
+        radiance, valid = self._trace(self._view(scene, sampler, ray, active), clock)
         return mi.Spectrum(radiance), valid, []
 
     def _view(self, scene, sampler, ray, active) -> View:
@@ -149,16 +150,17 @@ class ManyLightsIntegrator(GatheringIntegrator):
         rules = Rules(self.max_depth, self.rr_depth, self.hide_emitters)
         return View(scene, emission, Perturbed(scene), rules, ray, active, *size, seed, alike, Worth.unknown())
 
-    def _trace(self, view: View):
+    def _trace(self, view: View, clock: Clock):
         """(Radiance of each camera ray, whether it is opaque in the film's alpha)."""
-        clock, self.statistics = Clock(Stage.PILOT), {}
+        clock.begin(Stage.PILOT)
+        self.statistics = {}
         decision = Decision.of(view, self.virtual_lights)
         chosen, worth = decision.balance, decision.judge(view)
         if worth is not None:
             self.statistics["worth"] = worth
         mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
         lights = self._lights(view, decision.pilot.arrivals, chosen, clock)
-        limits = view.limits(lights, EVERYWHERE if lights.all else NOWHERE)
+        limits = view.limits(lights)
         expected = decision.expected_light(view, lights)
         radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
         # Whole pixels at a time
@@ -208,15 +210,14 @@ class ManyLightsIntegrator(GatheringIntegrator):
         self.statistics["lights"] = {"surface": made.surface.lights.count}
         if made.group is None:
             return None
-        spacing, paths = made.surface.spacing(arrivals), self.statistics["light_paths"]
-        return spaced_lights([made.group], spacing, self.max_depth, paths)
+        return spaced_lights([made.group], made.surface.spacing(arrivals), self.max_depth)
 
     def _made_lights(self, view: View, arrivals: Arrivals, chosen: Balance, clock: Clock) -> TreedLights:
         """Virtual lights where the pilot's paths arrived, and their tree."""
         # The path from a light is shorter by the two edges between camera and light, and no camera path, whose worth
         # would be known
-        rules = Rules(self.max_depth - 2, rr_depth=1, hide_emitters=False)
-        limits = replace(view, rules=rules, worth=Worth.unknown()).limits(ViewLights(), NOWHERE)
+        rules = Rules(self.max_depth - 2, rr_depth=1, hide_emitters=self.hide_emitters)
+        limits = replace(view, rules=rules, worth=Worth.unknown()).limits(ViewLights())
         seed = derived_seed(view.seed, 2)
         made = surface_lights(view.scene, view.emission, arrivals, chosen.light_paths, limits, seed)
         self.statistics["light_paths"] = chosen.light_paths

@@ -91,6 +91,7 @@ def test_the_mean_over_seeds_is_that_of_path(floor, max_depth, always):
 def test_emitters_that_are_hidden_and_paths_that_end_soon_change_no_mean(integrator, always):
     rng = np.random.default_rng(6)
     scene = mi.load_dict(closed_box(panels(40, rng) | balls(40, rng), 16))
+    assert_lights_stand_for_emitters(mi.load_dict({"type": "manylights"} | integrator), scene, 64)
     pairs = [[render(scene, name, 64, seed, **integrator) for name in ("manylights", "path")] for seed in range(12)]
     assert_same_mean_over_seeds(pairs)
 
@@ -102,8 +103,23 @@ def test_no_lights_stand_for_emitters_with_normals_of_vertices(tmp_path, always)
     emission = emission_of(scene, rng, False)
     assert emission.lights.carried.tolist() == [False]
     assert [group.kind for group in emission.lights.groups(1000, 0)] == ["spot"]
+    assert_lights_stand_for_emitters(mi.load_dict({"type": "manylights", "max_depth": 3}), scene, 64)
     pairs = [[render(scene, name, 64, seed, max_depth=3) for name in ("manylights", "path")] for seed in range(12)]
     assert_same_mean_over_seeds(pairs)
+
+
+@pytest.mark.parametrize("lit", [False, True])
+def test_black_and_flat_emitters_among_many_are_no_trouble(lit, always):
+    rng = np.random.default_rng(9)
+    black = panels(70, rng)
+    for panel in black.values():
+        panel["emitter"]["radiance"] = rgb(0.0)
+    flat = {"type": "sphere", "center": [0.1, 0.2, 0], "radius": 0.0, "emitter": {"type": "area", "radiance": rgb(1.0)}}
+    scene = mi.load_dict(closed_box(black | {"flat": flat} | (balls(3, rng) if lit else {}), 16))
+    pairs = [[render(scene, name, 64, seed, max_depth=3) for name in ("manylights", "path")] for seed in range(12)]
+    if lit:
+        assert_same_mean_over_seeds(pairs)
+    assert np.isfinite(pairs).all() and (np.mean(pairs) > 0) == lit
 
 
 def test_turned_covered_hollow_and_uneven_emitters_change_no_mean(always):

@@ -38,7 +38,7 @@ def compiled():
 
 
 @pytest.mark.parametrize("name", integrators.PLUGINS)
-def test_sizes_and_samples_are_in_no_kernel(name, compiled):
+def test_sizes_and_samples_are_in_no_kernel(name, compiled, lights_cost_nothing):
     views = {f"view_{size}": closed_box({}, size)["sensor"] for size in (32, 40, 48)}
     scene = mi.load_dict(closed_box({"lamp": area_light()}) | views)
     settings = SETTINGS.get(name, {"vpl_count": 3000})
@@ -46,6 +46,7 @@ def test_sizes_and_samples_are_in_no_kernel(name, compiled):
 
     def new(camera=1, spp=4, seed=0):
         mi.render(scene, sensor=camera, integrator=plugin, spp=spp, seed=seed).numpy()
+        assert name != "manylights" or plugin.statistics["light_paths"] > 0
         return compiled()
 
     # What is a single number in one image may be several in the next, which makes a few other kernels
@@ -81,9 +82,10 @@ def turned(angle):
     ).scale(0.05)  # fmt: skip
 
 
-def test_paths_from_the_camera_and_from_lights_are_followed_by_one_kernel(lights_cost_nothing):
+@pytest.mark.parametrize("hide_emitters", [False, True])
+def test_paths_from_the_camera_and_from_lights_are_followed_by_one_kernel(hide_emitters, lights_cost_nothing):
     scene = mi.load_dict(closed_box({"lamp": area_light()}))
-    plugin = mi.load_dict({"type": "manylights", "max_depth": 4})
+    plugin = mi.load_dict({"type": "manylights", "max_depth": 4, "hide_emitters": hide_emitters})
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         mi.render(scene, integrator=plugin, spp=16).numpy()

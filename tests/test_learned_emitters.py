@@ -9,7 +9,6 @@ from vpl.core.arrays import upload, upload_vectors
 from vpl.lights.light_set import LightSet
 from vpl.split.irradiance import learn_emitters
 from vpl.split.learned_emitters import LearnedEmitters
-from vpl.split.paths import EVERYWHERE
 from vpl.split.sites import Sites
 from vpl.split.view_lights import ViewLights
 
@@ -157,11 +156,11 @@ def test_the_weights_of_gather_vertices_are_finite():
     plugin, seen = mi.load_dict({"type": "manylights", "max_depth": 4}), []
     original = plugin._trace
 
-    def look(view):
+    def look(view, *more):
         lane, lights = dr.arange(mi.UInt32, view.count), ViewLights(LightSet([], 0.1, plugin.max_depth, 0, 0, {}))
-        _, first, later, _ = view.follow(lane, view.limits(lights, EVERYWHERE), 9)
+        _, first, later, _ = view.follow(lane, view.limits(lights), 9)
         seen.extend(np.isfinite(np.array(x.weight)).all() for x in (first, later))
-        return original(view)
+        return original(view, *more)
 
     plugin._trace = look
     plugin.virtual_lights = False
@@ -206,12 +205,16 @@ def test_no_kernel_is_compiled_anew_for_another_seed(lights_cost_nothing):
     assert [kernel["size"] for kernel in kernels if not kernel["cache_hit"]] == []
 
 
+@pytest.mark.parametrize("many", [False, True])
 @pytest.mark.parametrize("texel", [0.0, np.nan, np.inf])
-def test_an_environment_of_no_density_spoils_no_path(texel):
+def test_an_environment_of_no_density_spoils_no_path(texel, many):
     """Mitsuba's own density of an image that is black, or has a texel that is no number, is none in any direction."""
     pixels = np.zeros((4, 8, 3), np.float32)
     pixels[1, 2] = texel
-    lit = closed_box(bulbs(), 12)
+    dim = {
+        f"dim{i}": {"type": "point", "position": [0.02 * i - 0.7, 0.5, 0.4], "intensity": rgb(0.01)} for i in range(70)
+    }
+    lit = closed_box(bulbs() | (dim if many else {}), 12)
     del lit["left"]
     images = []
     for sky in ({}, {"sky": {"type": "envmap", "bitmap": mi.Bitmap(pixels)}}):

@@ -84,7 +84,8 @@ class VirtualLights:
         finite = usable(self.intensity).all(1) & np.isfinite(self.direction).all(1)
         if self.position is not None:
             finite &= np.isfinite(self.position).all(1)
-        keep = finite & (self.intensity > 0).any(1)
+        # As single precision knows it: light trees are built by that
+        keep = finite & (self.intensity.mean(1, dtype=np.float64).astype(np.float32) > 0)
         return (self if keep.all() else self.select(keep)), int((~finite).sum())
 
 

@@ -110,9 +110,9 @@ class Option:
 class Evidence:
     """Evidence of a pilot on an image of ``paths`` camera paths, ``samples`` a pixel.
 
-    ``radiance`` (n,): what the pilot's paths found, two next to each other from one pixel; ``direct`` (n,): without
-    what came by way of surfaces that lights may stand for; ``brightness`` (n,): of the image around; ``emitters``:
-    whether lights may stand for these, which are many.
+    ``radiance`` (n,): what the pilot's paths found, two next to each other, of one pixel if it has so many; ``direct``
+    (n,): without what came by way of surfaces that lights may stand for; ``brightness`` (n,): of the image around;
+    ``emitters``: whether lights may stand for these, which are many.
     """
 
     radiance: np.ndarray

@@ -17,7 +17,7 @@ from ..core.sampling import derived_seed
 from ..lights.light_set import LightSet
 from .balance import Balance, Evidence, Option, balance, importance, judged_by, noise, without_lights
 from .irradiance import learn_emitters
-from .paths import AT_FIRST, EVERYWHERE
+from .paths import AT_FIRST
 from .pilot import Pilot
 from .site_choice import learning_rays
 from .view import View
@@ -95,9 +95,7 @@ def _learning_pilot(view: View) -> Pilot:
 def _followed(view: View, lights: ViewLights) -> Pilot:
     """What is found by pairs of paths all over the image, always the same ones, besides light of ``lights``."""
     lane = view.pairs(_PILOT)
-    # At later vertices, few of which are lit, lights that stand for emitters alone bring noise of their own
-    limits = view.limits(lights, EVERYWHERE if lights.surfaces else AT_FIRST)
-    found, vertices, _, arrival = view.follow(upload(mi.UInt32, lane), limits, 1)
+    found, vertices, _, arrival = view.follow(upload(mi.UInt32, lane), view.limits(lights, AT_FIRST), 1)
     return Pilot.of(found, vertices, arrival, lane // view.samples)
 
 

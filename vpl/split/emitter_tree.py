@@ -22,6 +22,8 @@ _RECORD = 8
 # Lower than their spread: a vertex that is near the middle of them is likely to be near some, which would else be drawn
 # too seldom
 _LEAST_DISTANCE = 0.6
+# Intensity of an emitter next to that of the brightest, as it is taken at least
+_LEAST_INTENSITY = 1e-12
 
 
 class EmitterTree:
@@ -32,6 +34,9 @@ class EmitterTree:
 
     def __init__(self, position: np.ndarray, radius: np.ndarray, intensity: np.ndarray, most_clusters: int):
         self.count = len(position)
+        # Black emitters, too, have a place in a tree
+        least = _LEAST_INTENSITY * float(intensity.max()) or 1.0
+        intensity = np.maximum(intensity, least)
         colours = np.repeat(intensity[:, None], 3, axis=1).astype(np.float32)
         tree = build_light_tree(position.astype(np.float32), None, colours, np.random.default_rng(0))
         low, high = tree.records[:, BOX_MIN].astype(np.float64), tree.records[:, BOX_MAX].astype(np.float64)

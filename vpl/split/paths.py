@@ -152,7 +152,9 @@ class Met:
         si = scene.ray_intersect(path.ray, mi.RayFlags.All, coherent=path.depth == 0, active=path.active)
         bsdf, hidden = si.bsdf(path.ray), mi.Bool(False)
         if limits.hide_emitters:
-            hidden = path.active & (path.depth == 0) & (~si.is_valid() | si.shape.is_emitter())
+            # By rays from the camera alone
+            seen = path.active & (path.depth == 0) & (path.state == SEEKING) & (limits.gathering != PLACING)
+            hidden = seen & (~si.is_valid() | si.shape.is_emitter())
         goes_on = path.active & si.is_valid() & (path.depth + 1 < limits.max_depth) & ~hidden
         flags, side = bsdf.flags(), side_of(si)
         smooth = goes_on & mi.has_flag(flags, mi.BSDFFlags.Smooth)

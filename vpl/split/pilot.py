@@ -40,7 +40,8 @@ class Onward:
 
 @dataclass
 class Pilot:
-    """Paths, two next to each other from one pixel.  What they found may be negative where virtual lights carry a part.
+    """Paths, two next to each other from one pixel, or from two where each has a single sample.  What they found may be
+    negative where virtual lights carry a part.
 
     ``arrivals``: their second vertices, where they have a floor, as their first ones have; ``pixel``, ``radiance``,
     ``indirect`` (n,): the pixel of each path, what it found, and the part that came by way of its second vertex.
@@ -76,11 +77,13 @@ class Pilot:
         return self.nearby(self.radiance, width, self.pixel)
 
     def nearby(self, values: np.ndarray, width: int, pixels: np.ndarray) -> np.ndarray:
-        """Mean of the paths' ``values`` in the tile that each of some pixels is in, in an image so many pixels wide."""
+        """Mean of the paths' ``values`` in the tile that each of some pixels is in, in an image so many pixels wide; of
+        all paths where a tile has none."""
         tiles, of_path = _tile(pixels, width), _tile(self.pixel, width)
         size = max(tiles.max(), of_path.max()) + 1
         count = np.bincount(of_path, minlength=size)
-        return (np.bincount(of_path, values, size) / np.maximum(count, 1))[tiles]
+        means = np.bincount(of_path, values, size) / np.maximum(count, 1)
+        return np.where(count > 0, means, np.mean(values))[tiles]
 
 
 def _tile(pixel: np.ndarray, width: int) -> np.ndarray:

@@ -63,8 +63,10 @@ def surface_lights(scene, emission, arrivals: Arrivals, count: int, limits: Limi
     cells.choose_by(_importance(cells, arrivals))
     lights = _lights_along(scene, emission, cells.lines(count, generator), limits, derived_seed(seed, 1))
     density = count * cells.density(lights.position, lights.direction)
-    lights.intensity = (lights.intensity / density[:, None]).astype(np.float32)
-    return SurfaceLights(lights, cells, count)
+    with np.errstate(over="ignore"):
+        lights.intensity = (lights.intensity / density[:, None]).astype(np.float32)
+    # What single precision cannot hold after that is no light either
+    return SurfaceLights(lights.without_bad()[0], cells, count)
 
 
 def _importance(cells: Cells, arrivals: Arrivals) -> np.ndarray:

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import rgb_to_spectrum, upload
+from ..core.arrays import finite_or_zero, rgb_to_spectrum, upload
 from ..lights.emission import bounding_sphere, solid_angle_radiance
 from ..lights.emitters import Emitters, registered_shapes
 from ..lights.virtual_lights import DeviceLights, VirtualLights, spot_falloff
@@ -192,7 +192,8 @@ class TreeEmitters:
             nearness = dr.select(here, self._nearness(row, si.n, ray.d, si.t, here), nearness)
         if self._environment is not None:
             here = active & has_density & ~si.is_valid()
-            pdf = self._environment.pdf_direction(origin, ds, here)
+            # Of a black one, Mitsuba's is no number
+            pdf = finite_or_zero(self._environment.pdf_direction(origin, ds, here))
             probability = self._distant_probability(mi.UInt32(self._distant - 1), site, here)
             density = dr.select(here, pdf * probability, density)
         return MetEmitter(emitted_towards(self._emitters, si, active), density, nearness)

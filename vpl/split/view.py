@@ -12,7 +12,7 @@ from ..core.sampling import derived_seed, independent_sampler
 from ..lights.light_set import LightGroup, LightSet
 from ..lights.perturbed import Perturbed
 from .numbers import SpreadNumbers
-from .paths import FirstEdge, Limits, Rules
+from .paths import AT_FIRST, EVERYWHERE, NOWHERE, FirstEdge, Limits, Rules
 from .remainder import follow
 from .view_lights import ViewLights, spaced_lights
 from .worth import Worth
@@ -52,17 +52,19 @@ class View:
     def pairs(self, most: int) -> np.ndarray:
         """Some of the rays, two next to each other at a time, evenly over the image: so many at most."""
         pairs = max(min(most, self.count // 4) // 2, 1)
-        apart = max(self.count // pairs // 2 * 2, 2)
-        return np.minimum(np.arange(pairs)[:, None] * apart + [0, 1], self.count - 1).reshape(-1)
+        first = np.arange(pairs) * self.count // pairs // 2 * 2
+        return np.minimum(first[:, None] + [0, 1], self.count - 1).reshape(-1)
 
     def emitter_lights(self, groups: list[LightGroup]) -> LightSet:
         """The lights that stand for emitters, in ``groups``; none where only their c is wanted."""
         lights = self.emission.lights
         return spaced_lights(groups, lights.spacing(lights.points(self.count)), self.rules.max_depth)
 
-    def limits(self, lights: ViewLights, gathering: int) -> Limits:
-        """Limits, by the view's rules and worth, of paths of which ``lights`` carry a part; ``gathering``: see
-        :mod:`vpl.split.paths`."""
+    def limits(self, lights: ViewLights, least: int = NOWHERE) -> Limits:
+        """Limits, by the view's rules and worth, of paths of which ``lights`` carry a part; ``least``: where lights are
+        gathered (:mod:`vpl.split.paths`) even if there are none, to learn of these vertices."""
+        # At later vertices, few of which are lit, lights that stand for emitters alone bring noise of their own
+        gathering = EVERYWHERE if lights.surfaces else AT_FIRST if lights.emitters else least
         longest = dr.opaque(mi.UInt32, int(min(self.rules.max_depth, 0xFFFFFFFF)))
         squared_c, of_emitters = (
             dr.opaque(mi.Float, (x.smallest_distance if x else _WHOLE) ** 2) for x in (lights.surfaces, lights.emitters)

@@ -10,10 +10,10 @@ from ..lights.light_set import LightGroup, LightSet
 _TAPER = 6.0
 
 
-def spaced_lights(groups: list[LightGroup], spacing: float, max_depth: float, paths: int = 0) -> LightSet:
+def spaced_lights(groups: list[LightGroup], spacing: float, max_depth: float) -> LightSet:
     """The light set of groups with a typical distance between lights, world units, and with it their c; ``max_depth``
-    (edges) of the image; ``paths``: how many light paths found them."""
-    return LightSet(groups, _TAPER * spacing, max_depth, paths, 0, {})
+    (edges) of the image."""
+    return LightSet(groups, _TAPER * spacing, max_depth, 0, 0, {})
 
 
 @dataclass(frozen=True)
