@@ -27,7 +27,7 @@ _SET_ERROR = 0.03
 # share it, so that it shows as blotches, which no denoiser takes away
 _LIGHT_NOISE, _SHARED = 50.0, 4.0
 # Light paths as a share of the paths from the camera, and how few and how many there may be
-_SHARES, _FEWEST, _MOST = (1 / 64, 1 / 8), 20_000, 500_000
+_SHARES, _FEWEST, _MOST = (1 / 64, 1 / 8), 20_000, 2_000_000
 # Relative variance that cuts leave, times shadow rays a pixel; and the cost of one of these rays
 _CUT_NOISE, _RAY_COST = 0.3, 0.2
 # Noise and rays of cuts of lights that stand for emitters, next to those of lights on surfaces
