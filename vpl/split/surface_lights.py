@@ -165,15 +165,15 @@ def _irradiance(scene, emission, places: Places, limits: Limits, seed: int):
     # A light is seen by many pixels: where there are many emitters, what it has of one of them would show
     samples = _EMITTER_SAMPLES if emission.lights is not None else 1
     nearest, _ = irradiance_from_emitters(scene, emission, places, site, samples, derived_seed(seed, 2))
-    # By the cosine, a direction has a weight of pi; roulette is by what surfaces leave of it
-    edge = FirstEdge.of(places.position, ray, ones(count), density, False, PAST, site, 1.0, True)
+    # A direction has a weight of pi, by which roulette lets paths go on: ended by what surfaces leave of it, they would
+    # cost lights 7% less and leave 12% more of their noise (kitchen)
+    edge = FirstEdge.of(places.position, ray, ones(count) * dr.pi, density, False, PAST, site, 1.0, True)
     numbers = SpreadNumbers(dr.arange(mi.UInt32, count), 1, seed)
     found, *_ = follow(scene, emission, edge, numbers, independent_sampler(derived_seed(seed, 1), count), limits)
     # Gather points further from the camera may use shorter paths only: a light stands for paths of one length, and has
     # the colour of none but these
-    beyond = found.drawn * dr.pi
-    level, more = dr.sum(nearest), dr.sum(beyond)
+    level, more = dr.sum(nearest), dr.sum(found.drawn)
     is_nearest = draw * (level + more) < level
-    one = dr.select(is_nearest, nearest, beyond)
+    one = dr.select(is_nearest, nearest, found.drawn)
     irradiance = dr.select(level + more > 0, one * (level + more) / dr.sum(one), 0)
     return irradiance, dr.select(is_nearest, mi.UInt32(1), found.length)
