@@ -85,7 +85,8 @@ class VirtualLights:
         if self.position is not None:
             finite &= np.isfinite(self.position).all(1)
         # As single precision knows it: light trees are built by that
-        keep = finite & (self.intensity.mean(1, dtype=np.float64).astype(np.float32) > 0)
+        with np.errstate(invalid="ignore", over="ignore"):
+            keep = finite & (self.intensity.mean(1, dtype=np.float64).astype(np.float32) > 0)
         return (self if keep.all() else self.select(keep)), int((~finite).sum())
 
 
