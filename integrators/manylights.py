@@ -216,7 +216,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         """Virtual lights where the pilot's paths arrived, and their tree."""
         # The path from a light is shorter by the two edges between camera and light, and no camera path, whose worth
         # would be known
-        rules = Rules(self.max_depth - 2, rr_depth=1, hide_emitters=self.hide_emitters)
+        rules = replace(view.rules, max_depth=self.max_depth - 2, rr_depth=1)
         limits = replace(view, rules=rules, worth=Worth.unknown()).limits(ViewLights())
         seed = derived_seed(view.seed, 2)
         made = surface_lights(view.scene, view.emission, arrivals, chosen.light_paths, limits, seed)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vpl.core.arrays import download, upload
-from vpl.cuts.light_cuts import collect_cuts, cut_sizes, evaluate_cuts, limited_cuts
+from vpl.cuts.light_cuts import CutChunk, collect_cuts, cut_sizes, evaluate_cuts, limited_cuts
 from vpl.lights.light_set import LightGroup, LightSet, light_tree
 from vpl.lights.virtual_lights import VirtualLights
 from vpl.points.surfaces import LambertianSurface, ScatteringSurface
@@ -90,6 +90,14 @@ def test_cuts_hold_every_light_that_can_arrive_once_and_keep_their_bounds(batch)
             light = chunk.group.lights.gather(tree.representative(mi.UInt32(int(leaf))))
             value = contribution(chunk.group.kind, part.surfaces, light, job.lights.smallest_distance)
             assert download(value).max() == 0, "a light that was skipped contributes nothing"
+
+
+def test_what_a_cut_came_out_shorter_than_counted_is_part_of_none():
+    """Of the second and third cut, a node each was counted that was not written; the fourth has none at all."""
+    rows, offset, length = ([0, 0, 1, 0, 2, 2, 0, 0], [0, 2, 4, 7], [2, 1, 2, 0])
+    columns = (upload(mi.UInt32, np.array(x)) for x in (offset, length, rows))
+    chunk = CutChunk(None, None, None, *columns, nodes=None, visits=None)
+    assert download(chunk.written).tolist() == [True, True, True, False, True, True, False, False]
 
 
 def test_largest_cut_is_respected():

@@ -304,9 +304,9 @@ def test_so_many_vertices_of_a_pixel_are_lit_evenly_among_its_samples(samples, m
     # All but one have weight, which is negative somewhere
     weight = np.ones(pixels * samples)
     weight[1], weight[-1] = -1, 0
-    count = mi.UnpolarizedSpectrum(upload(mi.Float, weight))
+    light = mi.UnpolarizedSpectrum(upload(mi.Float, weight))
     place = [dr.zeros(kind, len(weight)) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f)]
-    first = GatherVertices(*place, count, dr.full(mi.UInt32, 1, len(weight)))
+    first = GatherVertices(*place, light, dr.full(mi.UInt32, 1, len(weight)))
     later = GatherVertices(*place, dr.zeros(mi.UnpolarizedSpectrum, len(weight)), dr.zeros(mi.UInt32, len(weight)))
     lit = LitVertices.of(first, later, samples, most, 1)
     assert lit.kept == kept and lit.alone == 0

@@ -121,6 +121,12 @@ def usable(value):
     return (value >= 0) & (value <= LARGEST_VALUE)
 
 
+def carries_light(colours: np.ndarray) -> np.ndarray:
+    """Mask (n,) of colours (n, 3) whose mean is positive in single precision, by which light trees are built."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return colours.mean(1, dtype=np.float64).astype(np.float32) > 0
+
+
 def finite_or_zero(spectrum):
     """Replace values that are infinite (see :func:`usable`), negative or not a number by 0, so that one bad texel
     cannot spoil an image."""

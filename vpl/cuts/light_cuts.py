@@ -184,6 +184,14 @@ class CutChunk:
     nodes: object
     visits: object
 
+    @property
+    def written(self):
+        """Mask of the ``rows`` and ``nodes`` that are part of a cut: rounding may leave one shorter than was counted,
+        and the rest of its part 0."""
+        row = dr.arange(mi.UInt32, dr.width(self.rows))
+        place = row - dr.gather(mi.UInt32, self.offset, self.rows)
+        return place < dr.gather(mi.UInt32, self.length, self.rows)
+
 
 def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
     """Yield the cuts of a batch as :class:`CutChunk`, evaluated, each of bounded size."""

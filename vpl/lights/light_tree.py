@@ -29,7 +29,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import download, upload
+from ..core.arrays import carries_light, download, upload
 from ..core.cones import COSINE_ROUNDING
 from ..core.morton import morton_order
 from .clustering import (
@@ -132,7 +132,7 @@ def _validate(position, direction, flux):
             raise ValueError(f"{name} has {len(array)} rows, but flux has {len(arrays['flux'])}")
     flux, position, direction = arrays.values()
     require_rows((flux >= 0).all(axis=1), "flux", flux, "not negative")
-    require_rows(flux.mean(axis=1, dtype=np.float64).astype(np.float32) > 0, "flux", flux, "positive in some channel")
+    require_rows(carries_light(flux), "flux", flux, "positive in some channel")
     if flux.sum(axis=0, dtype=np.float64).max() > np.finfo(np.float32).max:
         raise ValueError("flux is too large: its sum over the lights exceeds float32")
     if direction is not None:

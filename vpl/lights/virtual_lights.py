@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import upload, usable
+from ..core.arrays import carries_light, upload, usable
 
 # Kinds of virtual light. "point" and "spot" radiate from a point that the scene really has and are never clamped;
 # "oriented" lights stand for a piece of surface, and so do "surface" lights, which taper off near them: what they lack
@@ -84,9 +84,7 @@ class VirtualLights:
         finite = usable(self.intensity).all(1) & np.isfinite(self.direction).all(1)
         if self.position is not None:
             finite &= np.isfinite(self.position).all(1)
-        # As single precision knows it: light trees are built by that
-        with np.errstate(invalid="ignore", over="ignore"):
-            keep = finite & (self.intensity.mean(1, dtype=np.float64).astype(np.float32) > 0)
+        keep = finite & carries_light(self.intensity)
         return (self if keep.all() else self.select(keep)), int((~finite).sum())
 
 

@@ -63,7 +63,10 @@ def initial_columns(entries: MatrixEntries, mean: float, most: int) -> tuple[Col
     bounds, parts = int(dr.sum(mi.UInt64(visits))[0]), []
     numbers = {id(group): number for number, group in enumerate(entries.lights.groups)}
     for chunk in collect_cuts(entries.lights, slices, threshold, sizes):
-        piece, node = download(dr.gather(mi.UInt32, chunk.points, chunk.rows)), download(chunk.nodes)
+        piece, node, written = (
+            download(x) for x in (dr.gather(mi.UInt32, chunk.points, chunk.rows), chunk.nodes, chunk.written)
+        )
+        piece, node = piece[written], node[written]
         parts.append(entries.columns_of(piece.astype(np.int64), numbers[id(chunk.group)], node.astype(np.int64)))
     return reduce(Columns.joined, parts, Columns.none()).sorted()[0], bounds
 

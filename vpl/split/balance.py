@@ -151,17 +151,18 @@ def _priced(evidence: Evidence, option: Option) -> tuple[float, float, Balance]:
     error = float(np.clip(_ERROR * (rays / _RAYS_AT_ERROR) ** -_SLOPE, _FINEST, _COARSEST))
     # A cut has some nodes, however few rays are wanted
     rays = _RAYS_AT_ERROR * (error / _ERROR) ** (-1 / _SLOPE)
+    # Never 0, for cuts leave some
     left, light_paths = rest + cuts * _CUT_NOISE * samples / rays, 0
     if option.surfaces:
         # The least of (noise of these / samples + noise of lights / their paths) × cost
         of_lights = _SHARED * _LIGHT_NOISE * noise(option.indirect, evidence.brightness)
-        balanced = (of_lights * samples * paths / (_LIGHT_PATH_COST * max(left, _TINY))) ** 0.5
+        balanced = (of_lights * samples * paths / (_LIGHT_PATH_COST * left)) ** 0.5
         wanted = np.clip(max(balanced, option.clumps / _SET_ERROR**2), _SHARES[0] * paths, _SHARES[1] * paths)
         light_paths = int(np.clip(wanted, _FEWEST, _MOST))
     fixed = (_FIXED_COST + _LIGHT_PATH_COST * light_paths) / paths
     cost = 1 + cuts * _RAY_COST * rays / samples + fixed
     # The least of (noise of all else + noise of these / their share) × (cost of all else + their share × their cost)
-    share = np.clip((_VERTEX_NOISE * cost / (_VERTEX_COST * max(left, 1e-9))) ** 0.5, _LEAST_VERTICES, 1)
+    share = np.clip((_VERTEX_NOISE * cost / (_VERTEX_COST * left)) ** 0.5, _LEAST_VERTICES, 1)
     vertices = max(round(float(share) * samples), 1)
     return cost * left, cost, Balance(light_paths, option.emitters, error, vertices, left, "")
 

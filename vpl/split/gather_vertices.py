@@ -99,7 +99,7 @@ class LitVertices:
         kept, number = min(most, samples), dr.opaque(mi.UInt32, samples)
         sample = dr.arange(mi.UInt32, dr.width(first.weight)) % number
         # Evenly among the samples of a pixel, which are spread well in their order
-        lit = _share_before(sample + 1, kept, number) > _share_before(sample, kept, number)
+        lit = mi.UInt64(sample) * dr.opaque(mi.UInt64, kept) % mi.UInt64(number) >= dr.opaque(mi.UInt64, samples - kept)
         rays = dr.compress(lit & (dr.max(dr.abs(first.weight)) > 0))
         later_rays, factor = drawn_later(first, later, samples, kept, seed)
         # As many as there would be among the first vertices that are lit
@@ -110,12 +110,6 @@ class LitVertices:
     @property
     def count(self) -> int:
         return len(self.rays)
-
-
-def _share_before(sample, kept: int, samples):
-    """How many of the ``kept`` ones are among the first ``sample`` of ``samples`` (UInt32)."""
-    # Products of two 32-bit numbers
-    return mi.UInt32(dr.uint64_array_t(mi.UInt32)(sample) * dr.opaque(mi.UInt64, kept) // mi.UInt64(samples))
 
 
 def drawn_later(first: GatherVertices, later: GatherVertices, samples: int, most: int, seed: int):

@@ -131,14 +131,11 @@ def light_clusters(transport: Transport, clusters: PixelClusters, allowed: np.nd
     for number, chunk in enumerate(collect_cuts(transport.lights, clusters.receivers, threshold, sizes)):
         sampler = independent_sampler(derived_seed(seed, number), dr.width(chunk.rows))
         cluster = dr.gather(mi.UInt32, chunk.points, chunk.rows)
-        # Of a cut that comes out shorter than it was counted, the rest is nothing
-        place = dr.arange(mi.UInt32, dr.width(chunk.rows)) - dr.gather(mi.UInt32, chunk.offset, chunk.rows)
-        written = place < dr.gather(mi.UInt32, chunk.length, chunk.rows)
         ray, surface, weight = clusters.draw(cluster, precise_sample(sampler))
         light, scale = chunk.group.draw(chunk.nodes, precise_sample(sampler))
         value, traced = evaluate_pairs(transport, chunk.group, surface, light, scale)
         value = mi.UnpolarizedSpectrum(value) * weight
-        add_at(result, dr.select(written & dr.all(dr.isfinite(value)), value, 0), ray)
+        add_at(result, dr.select(chunk.written & dr.all(dr.isfinite(value)), value, 0), ray)
         dr.eval(result, traced)
         rays += int(dr.count(traced)[0])
     return rays
