@@ -1,5 +1,6 @@
 """The parts of the split: floors, numbers, cells, clusters, bounds; each against what it has to be."""
 
+import itertools
 from types import SimpleNamespace
 
 import drjit as dr
@@ -19,7 +20,7 @@ from vpl.split.balance import Evidence, Option, balance
 from vpl.split.cells import Cells
 from vpl.split.floors import agrees, carried_share, floor_of, side_of
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
-from vpl.split.numbers import SpreadNumbers
+from vpl.split.numbers import SpreadNumbers, lattice_multiplier
 from vpl.split.pilot import Pilot
 from vpl.split.pixel_clusters import PixelClusters, Receivers
 from vpl.split.remainder import power_heuristic
@@ -99,24 +100,48 @@ def test_rough_metal_has_next_to_no_floor_and_diffuse_walls_all_of_it():
 # ---------------------- Numbers ----------------------
 
 
-@pytest.mark.parametrize("samples", [1, 4, 16, 64, 6])
+@pytest.mark.parametrize("samples", [1, 4, 16, 64, 6, 100, 4096])
 def test_numbers_are_uniform_and_stratified_in_every_pixel(samples):
-    pixels = 4096
+    pixels = max(2**18 // samples, 1024)
     numbers = SpreadNumbers(dr.arange(mi.UInt32, pixels * samples), samples, 7).at(mi.UInt32(3))
     columns = [np.array(x).reshape(-1, pixels, samples) for x in numbers]
-    for column in columns:
-        for dimension in column:
-            assert dimension.min() >= 0 and dimension.max() < 1
-            assert stats.kstest(dimension[:, 0], "uniform").pvalue > 1e-4
-            assert stats.kstest(dimension[:, -1], "uniform").pvalue > 1e-4
-            if samples & (samples - 1) == 0:
-                strata = np.sort((dimension * samples).astype(int), axis=1)
-                assert (strata == np.arange(samples)).all()
-    if samples in (4, 16, 64):
-        side = int(samples**0.5)
-        for x, y in columns[1::2]:
-            cell = np.sort((x * side).astype(int) * side + (y * side).astype(int), axis=1)
-            assert (cell == np.arange(samples)).all()
+    # Numbers have 24 bits
+    far = max(samples // 1024, 1)
+    for dimension in (x for column in columns for x in column):
+        assert dimension.min() >= 0 and dimension.max() < 1
+        for sample in (0, -1):
+            assert stats.kstest(dimension[:, sample], "uniform").pvalue > 1e-4
+        gaps = np.diff(np.sort(dimension, axis=1), axis=1, append=1 + dimension.min(1, keepdims=True))
+        assert np.allclose(gaps * samples, 1, atol=1e-3 * far)
+    if samples >= 16:
+        for pair in columns[1::2]:
+            # No two are closer than points of a square grid by more than a third
+            away = np.abs(pair[:, :64, 1:] - pair[:, :64, :1])
+            assert (np.minimum(away, 1 - away) ** 2).sum(0).min() * samples > 0.4
+
+
+def test_lattices_beat_every_other_that_has_as_many_points():
+    """Worst error over smooth periodic functions, against all multipliers."""
+
+    def worst_error(multiplier, count):
+        x = np.stack([np.arange(count), np.arange(count) * multiplier % count]) / count
+        return np.prod(1 + 2 * np.pi**2 * (x * x - x + 1 / 6), axis=0).mean() - 1
+
+    for count in (2, 3, 7, 36, 64):
+        others = [worst_error(g, count) for g in range(1, count) if np.gcd(g, count) == 1]
+        assert worst_error(lattice_multiplier(count), count) == pytest.approx(min(others))
+    assert worst_error(lattice_multiplier(1009), 1009) < 1.1 * min(worst_error(g, 1009) for g in range(1, 1009))
+
+
+def test_products_of_numbers_are_no_noisier_than_those_of_random_ones():
+    """Orders in which halves of the points stay together would double it."""
+    samples, pixels = 64, 8192
+    numbers = SpreadNumbers(dr.arange(mi.UInt32, pixels * samples), samples, 5)
+    first, second = (numbers.at(mi.UInt32(vertex)) for vertex in (0, 1))
+    chosen = first[0], first[1].x, first[2], first[3].y, second[0]
+    halves = [np.where(np.array(x).reshape(pixels, samples) < 0.5, 1, -1) for x in chosen]
+    for one, other in itertools.combinations(halves, 2):
+        assert (one * other).mean(1).var() * samples < 1.15
 
 
 def test_numbers_of_other_dimensions_vertices_pixels_and_seeds_are_independent():

@@ -52,13 +52,11 @@ def regions_of(environment, count: int, most_columns: int = _LARGEST_WIDTH) -> E
 
 class EnvironmentRegions:
     """``count`` regions: ``axis`` (count, 3), ``cone_cos`` (count,) contain their directions; ``irradiance`` (count,):
-    radiance (mean over channels) integrated over solid angle; all float64.  ``constant``: whether all of the
-    environment is alike, so that the table tells all of it.  ``most_columns``: of the table."""
+    radiance (mean over channels) integrated over solid angle; all float64.  ``most_columns``: of the table."""
 
     def __init__(self, environment, count: int, most_columns: int = _LARGEST_WIDTH):
         self._environment = environment
         width = min(_table_width(environment), most_columns)
-        self.constant = environment.class_name() == _CONSTANT
         radiance = _read(environment, width)
         height = len(radiance)
         edges = np.cos(np.linspace(0, np.pi, height + 1))

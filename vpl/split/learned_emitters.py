@@ -43,16 +43,9 @@ class LearnedEmitters:
         self._number_of = RegistryTable(registry, np.arange(1, self._count + 1))
         alike = np.zeros(self._count + (self._regions.count if self._regions else 0))
         alike[: self._count] = weight / weight.sum()
-        # What regions cannot tell apart, the environment's own sampling may
-        self._both = self._regions is not None and not self._regions.constant
-        if self._regions and not self._both:
-            light = np.maximum(self._regions.irradiance, 0)
-            light = light / light.sum() if light.sum() > 0 else np.full(len(light), 1 / len(light))
-            alike[self._count :] = alike[self._environment_number] * light
-            alike[self._environment_number] = 0
         ignored = alike[: self._count] == 0
-        if self._both:
-            # Its regions stand for the environment
+        if self._regions:
+            # They stand for the environment, whose own samples are spread better where nothing is known
             ignored[self._environment_number] = True
         self.choice = SiteChoice(alike, _USUAL_SHARE, np.flatnonzero(ignored))
 
@@ -81,9 +74,9 @@ class LearnedEmitters:
         """As :meth:`vpl.split.next_event.UniformEmitters.sample`."""
         source, probability, _ = self.choice.draw(site, chosen, active)
         sample = self._draw(si, source, member, place, active)
-        if not self._both:
+        if not self._regions:
             return sample.chosen_with(probability)
-        # What both the emitter and its regions may draw has the sum of their densities
+        # What both the environment and its regions may draw has the sum of their densities
         of_region = active & (source >= self._count)
         of_environment = of_region | (active & (source == self._environment_number))
         # The emitter's own density where it has drawn: asked for its direction alone, Mitsuba 3.9.1 takes directions at
@@ -100,18 +93,14 @@ class LearnedEmitters:
         return finite_or_zero(self._environment.pdf_direction(origin, ds, active))
 
     def _environment_density(self, site, direction, own, active):
-        """Density with which a direction to the environment is drawn; ``own``: by the environment itself, None where
-        only its regions are."""
+        """Density with which a direction to the environment is drawn; ``own``: by the environment itself."""
         region, density = self._regions.find(direction, active)
         density *= self.choice.probability(site, self._count + region, active)
-        if own is not None:
-            density += own * self.choice.probability(site, mi.UInt32(self._environment_number), active)
-        return density
+        return density + own * self.choice.probability(site, mi.UInt32(self._environment_number), active)
 
     def _density_met(self, origin, site, direction):
         """Density of a direction in which the environment was met."""
-        own = self._own_density(origin, direction, True) if self._both else None
-        return self._environment_density(site, direction, own, True)
+        return self._environment_density(site, direction, self._own_density(origin, direction, True), True)
 
     def met(self, vertex, site, ray, si, has_density, active) -> MetEmitter:
         """As :meth:`vpl.split.next_event.UniformEmitters.met`."""

@@ -1,23 +1,28 @@
 """Well spread random numbers for vertices that scatter: a point set for all samples of a pixel at each.
 
-Sobol' points, shuffled and scrambled by hashes that keep their strata [Burley 2020, "Practical hash-based Owen
-scrambling"]: any power of two of a pixel's samples falls into as many strata of every shape, other dimensions take the
-points in another order, and every number alone is uniform.
+Rank-1 lattices with a random shift of the unit square, by which every number alone is uniform [Cranley and Patterson
+1976; Sloan and Joe 1994, "Lattice Methods for Multiple Integration"].  Other dimensions, vertices and pixels take the
+points in orders that have nothing to do with each other: samples that were far apart in one dimension and for that in
+another would double the noise of what depends on both.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from ..core.arrays import upload
 from ..core.sampling import HASH_ROUNDS, derived_seed
 
 # Multipliers of a hash in which every bit of the result depends on all [Wellons 2018, "Prospecting for hash functions"]
 _MIXING = (0x7FEB352D, 0x846CA68B)
 # Odd, far from any simple fraction of 2^32: the golden ratio's
 _STEP = 0x9E3779B9
-# Multipliers of the hash whose every bit depends on lower ones alone [Laine and Karras 2011; Burley 2020, section 3]
-_MULTIPLIERS = (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6)
+# Orders in the table, and its entries, at most; multipliers that are tried for a lattice
+_ORDERS, _ENTRIES, _TRIED = 256, 1 << 18, 64
 
 
 def _mixed(bits, stream: int):
@@ -28,26 +33,28 @@ def _mixed(bits, stream: int):
     return bits ^ (bits >> 16)
 
 
-def _hash_upwards(bits, seed):
-    bits = bits + seed
-    for multiplier in _MULTIPLIERS:
-        bits = bits ^ (bits * multiplier)
-    return bits
+@lru_cache(maxsize=64)
+def lattice_multiplier(count: int) -> int:
+    """g of the lattice (i, g i) / ``count`` modulo 1: of some near the golden ratio that with the least P_2, its worst
+    error over smooth periodic functions [Sloan and Joe 1994, section 4.2]."""
+    candidates = np.arange(1, max(count, 2))
+    candidates = candidates[np.gcd(candidates, count) == 1]
+    nearest = np.argsort(np.abs(candidates * (1 + 5**0.5) / 2 - count), kind="stable")[:_TRIED]
+    number = np.arange(count)
+
+    def kernel(numerator):
+        x = numerator / count
+        return 1 + 2 * np.pi**2 * (x * x - x + 1 / 6)
+
+    errors = [np.mean(kernel(number) * kernel(number * g % count)) for g in candidates[nearest]]
+    return int(candidates[nearest][np.argmin(errors)])
 
 
-def _nested_scramble(bits, seed):
-    """A permutation of 32-bit numbers that keeps those together that share their leading bits [Owen 1995]."""
-    return dr.brev(_hash_upwards(dr.brev(bits), seed))
-
-
-def _second_sobol(index):
-    """The second Sobol' dimension as a 32-bit fraction: Pascal's triangle modulo 2 times the index, back to front."""
-    # Bit i is the parity of the bits whose number has all bits of i [Lucas 1878]. Not ``mi.sobol_2``, which only knows
-    # the types of the variant that was set first.
-    for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF)):
-        index = index ^ ((index >> shift) & mask)
-    # To the 24 bits of a float, which are more than there are samples of a pixel
-    return mi.UInt32(mi.Float(dr.brev(index)) * 2**-8) << 8
+@lru_cache(maxsize=8)
+def _orders(count: int) -> np.ndarray:
+    """Random orders of so many points, one after the other; what they are matters as little as what a hash is."""
+    rows = np.tile(np.arange(count, dtype=np.uint32), (max(min(_ORDERS, _ENTRIES // count), 1), 1))
+    return np.random.default_rng(0).permuted(rows, axis=1).reshape(-1)
 
 
 def _fraction(bits):
@@ -55,28 +62,41 @@ def _fraction(bits):
 
 
 class SpreadNumbers:
-    """Numbers for paths, of which ``samples`` (UInt32, opaque) consecutive ones are those of a pixel; ``lane``: of each
-    path."""
+    """Numbers for paths, of which ``samples`` consecutive ones are those of a pixel; ``lane``: of each path."""
 
     def __init__(self, lane, samples: int, seed: int):
-        count = dr.opaque(mi.UInt32, samples)
         # One kernel follows paths, whether their lanes are counted or chosen
         dr.eval(lane)
-        self._pixel, self._number = lane // count, lane % count
+        self._samples = dr.opaque(mi.UInt32, samples)
+        self._pixel, self._number = lane // self._samples, lane % self._samples
         # Derived, as vertices count on from it
         self._seed = dr.opaque(mi.UInt32, derived_seed(seed, 0))
+        orders = _orders(samples)
+        self._orders, self._entries = upload(mi.UInt32, orders), dr.opaque(mi.UInt64, len(orders))
+        # From one point of the lattice to the next, 2^32 being one
+        steps = (2**32 // samples, lattice_multiplier(samples) * 2**32 // samples)
+        self._steps = [dr.opaque(mi.UInt32, step % 2**32) for step in steps]
 
     def at(self, vertex):
         """Numbers that a path uses at its vertex of a number (UInt32): (number, pair, number, pair), from [0, 1)."""
         found = []
         # A good hash for all, of which cheap ones make the rest
-        orders, scrambles = mi.sample_tea_32(self._pixel, self._seed + vertex, HASH_ROUNDS)
+        orders, shifts = mi.sample_tea_32(self._pixel, self._seed + vertex, HASH_ROUNDS)
         for stream in range(4):
-            # The low bits count the samples of a pixel: what has to stay together are those with equal higher bits
-            index = _nested_scramble(self._number, _mixed(orders, stream))
-            numbers = [_fraction(_nested_scramble(dr.brev(index), _mixed(scrambles, 2 * stream)))]
+            point = self._point(_mixed(orders, stream))
+            shift = _mixed(shifts, 2 * stream)
+            numbers = [_fraction(point * self._steps[0] + shift)]
             if stream % 2:
-                second = _mixed(scrambles, 2 * stream + 1)
-                numbers.append(_fraction(_nested_scramble(_second_sobol(index), second)))
+                # In a mirror as often as not, because every lattice has directions in which it is coarse
+                mirrored = dr.select((shift & 1) == 0, point, self._samples - point)
+                numbers.append(_fraction(mirrored * self._steps[1] + _mixed(shifts, 2 * stream + 1)))
             found.append(mi.Point2f(*numbers) if stream % 2 else numbers[0])
         return tuple(found)
+
+    def _point(self, bits):
+        """Which point of its pixel a sample takes: random ``bits`` choose an order, and where in it it begins."""
+        begin = mi.UInt32(mi.UInt64(bits) * self._entries >> 32)
+        order = begin // self._samples * self._samples
+        place = begin - order + self._number
+        place = dr.select(place < self._samples, place, place - self._samples)
+        return dr.gather(mi.UInt32, self._orders, order + place)
