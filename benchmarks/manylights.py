@@ -112,8 +112,7 @@ class Rival:
             # Squares, as it has them
             self.spp = min(max(round(max(wanted, 16) ** 0.5), 4), most) ** 2
         else:
-            # Powers of two, of which Sobol' numbers fill strata
-            self.spp = 2 ** min(max(round(np.log2(max(wanted, 16))), 4), int(np.log2(most**2)))
+            self.spp = min(max(round(wanted), 16), most**2)
         self.render(0)
 
     def render(self, seed: int):

@@ -92,6 +92,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
     filtered, takes a scene that is loaded anew: give it an integrator of its own.
 
     - Values of single pixels may be negative while samples are few: what is traced is a difference.
+    - Samplers: where a sample lies in its pixel, on the lens and in time is left to the sensor's sampler; what emitters
+      and directions it chooses at surfaces that scatter is spread by the plugin. With ``multijitter`` instead of
+      ``independent``, Mitsuba's default, there is 2% (bistro_interior), 8% (kitchen) or 23% (cornell) less variance.
     - Masks: the image is that of ``prb``. ``path`` (Mitsuba 3.9.1) shows black for samples that have passed nothing but
       masks when their paths end, and so is too dark where nothing is behind a mask; with ``hide_emitters`` it hides an
       environment behind a mask by that, which is seen through it here. Alpha is that of ``path``.

@@ -100,9 +100,9 @@ def test_rough_metal_has_next_to_no_floor_and_diffuse_walls_all_of_it():
 # ---------------------- Numbers ----------------------
 
 
-@pytest.mark.parametrize("samples", [1, 4, 16, 64, 6, 100, 4096])
+@pytest.mark.parametrize("samples", [1, 4, 16, 64, 6, 100, 3000])
 def test_numbers_are_uniform_and_stratified_in_every_pixel(samples):
-    pixels = max(2**18 // samples, 1024)
+    pixels = max(2**18 // samples, 512)
     numbers = SpreadNumbers(dr.arange(mi.UInt32, pixels * samples), samples, 7).at(mi.UInt32(3))
     columns = [np.array(x).reshape(-1, pixels, samples) for x in numbers]
     # Numbers have 24 bits
@@ -115,13 +115,13 @@ def test_numbers_are_uniform_and_stratified_in_every_pixel(samples):
         assert np.allclose(gaps * samples, 1, atol=1e-3 * far)
     if samples >= 16:
         for pair in columns[1::2]:
-            # No two are closer than points of a square grid by more than a third
+            # None is much closer to the first than points of a square grid; in a lattice, that holds for any two
             away = np.abs(pair[:, :64, 1:] - pair[:, :64, :1])
             assert (np.minimum(away, 1 - away) ** 2).sum(0).min() * samples > 0.4
 
 
-def test_lattices_beat_every_other_that_has_as_many_points():
-    """Worst error over smooth periodic functions, against all multipliers."""
+def test_no_lattice_of_as_many_points_is_much_better():
+    """By the worst error over smooth periodic functions, against all multipliers."""
 
     def worst_error(multiplier, count):
         x = np.stack([np.arange(count), np.arange(count) * multiplier % count]) / count

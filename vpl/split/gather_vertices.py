@@ -98,7 +98,7 @@ class LitVertices:
         """At most ``most`` first vertices of every pixel, and as many later ones as their light is worth."""
         kept, number = min(most, samples), dr.opaque(mi.UInt32, samples)
         sample = dr.arange(mi.UInt32, dr.width(first.weight)) % number
-        # Evenly among the samples of a pixel, which are spread well in their order
+        # Evenly among the samples of a pixel
         lit = mi.UInt64(sample) * dr.opaque(mi.UInt64, kept) % mi.UInt64(number) >= dr.opaque(mi.UInt64, samples - kept)
         rays = dr.compress(lit & (dr.max(dr.abs(first.weight)) > 0))
         later_rays, factor = drawn_later(first, later, samples, kept, seed)

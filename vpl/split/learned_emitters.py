@@ -45,7 +45,8 @@ class LearnedEmitters:
         alike[: self._count] = weight / weight.sum()
         ignored = alike[: self._count] == 0
         if self._regions:
-            # They stand for the environment, whose own samples are spread better where nothing is known
+            # Nothing is learned of the environment as a whole: its regions are. Where nothing is known it is drawn by
+            # itself, which spreads its samples better
             ignored[self._environment_number] = True
         self.choice = SiteChoice(alike, _USUAL_SHARE, np.flatnonzero(ignored))
 

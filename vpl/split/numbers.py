@@ -2,8 +2,8 @@
 
 Rank-1 lattices with a random shift of the unit square, by which every number alone is uniform [Cranley and Patterson
 1976; Sloan and Joe 1994, "Lattice Methods for Multiple Integration"].  Other dimensions, vertices and pixels take the
-points in orders that have nothing to do with each other: samples that were far apart in one dimension and for that in
-another would double the noise of what depends on both.
+points in other random orders: if samples that are far apart in one dimension were so in all, the noise of what depends
+on two of them would be up to twice that of random numbers.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from ..core.sampling import HASH_ROUNDS, derived_seed
 _MIXING = (0x7FEB352D, 0x846CA68B)
 # Odd, far from any simple fraction of 2^32: the golden ratio's
 _STEP = 0x9E3779B9
-# Orders in the table, and its entries, at most; multipliers that are tried for a lattice
+# Orders in the table at most, and its entries, but for one order at least; multipliers that are tried for a lattice.
+# Two dimensions whose order is the same from the same point on, one time in as many as there are entries, are alike
 _ORDERS, _ENTRIES, _TRIED = 256, 1 << 18, 64
 
 
@@ -46,7 +47,8 @@ def lattice_multiplier(count: int) -> int:
         x = numerator / count
         return 1 + 2 * np.pi**2 * (x * x - x + 1 / 6)
 
-    errors = [np.mean(kernel(number) * kernel(number * g % count)) for g in candidates[nearest]]
+    along = kernel(number)
+    errors = [np.mean(along * kernel(number * g % count)) for g in candidates[nearest]]
     return int(candidates[nearest][np.argmin(errors)])
 
 
@@ -72,9 +74,9 @@ class SpreadNumbers:
         # Derived, as vertices count on from it
         self._seed = dr.opaque(mi.UInt32, derived_seed(seed, 0))
         orders = _orders(samples)
-        self._orders, self._entries = upload(mi.UInt32, orders), dr.opaque(mi.UInt64, len(orders))
+        self._orders, self._rows = upload(mi.UInt32, orders), dr.opaque(mi.UInt32, len(orders) // samples)
         # From one point of the lattice to the next, 2^32 being one
-        steps = (2**32 // samples, lattice_multiplier(samples) * 2**32 // samples)
+        steps = (round(times * 2**32 / samples) for times in (1, lattice_multiplier(samples)))
         self._steps = [dr.opaque(mi.UInt32, step % 2**32) for step in steps]
 
     def at(self, vertex):
@@ -88,15 +90,14 @@ class SpreadNumbers:
             numbers = [_fraction(point * self._steps[0] + shift)]
             if stream % 2:
                 # In a mirror as often as not, because every lattice has directions in which it is coarse
-                mirrored = dr.select((shift & 1) == 0, point, self._samples - point)
+                mirrored = dr.select((shift & 1) == 0, point, 0 - point)
                 numbers.append(_fraction(mirrored * self._steps[1] + _mixed(shifts, 2 * stream + 1)))
             found.append(mi.Point2f(*numbers) if stream % 2 else numbers[0])
         return tuple(found)
 
     def _point(self, bits):
         """Which point of its pixel a sample takes: random ``bits`` choose an order, and where in it it begins."""
-        begin = mi.UInt32(mi.UInt64(bits) * self._entries >> 32)
-        order = begin // self._samples * self._samples
-        place = begin - order + self._number
+        order, begin = dr.mul_hi(bits, self._rows), dr.mul_hi(bits * self._rows, self._samples)
+        place = begin + self._number
         place = dr.select(place < self._samples, place, place - self._samples)
-        return dr.gather(mi.UInt32, self._orders, order + place)
+        return dr.gather(mi.UInt32, self._orders, order * self._samples + place)
