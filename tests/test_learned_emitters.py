@@ -5,10 +5,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.core.arrays import upload, upload_vectors
+from vpl.core.arrays import download, upload, upload_vectors
 from vpl.lights.light_set import LightSet
 from vpl.split.irradiance import learn_emitters
 from vpl.split.learned_emitters import LearnedEmitters
+from vpl.split.site_choice import SiteChoice
 from vpl.split.sites import Sites
 from vpl.split.view_lights import ViewLights
 
@@ -103,6 +104,47 @@ def test_a_place_that_is_no_number_leads_to_no_entry_beyond_the_table():
     bad = np.array([[np.nan, 0.5, 0.5], [0.5, np.inf, 0.5], [-np.inf, np.nan, 1e30]], np.float32)
     found = sites.at(upload_vectors(mi.Point3f, bad), upload_vectors(mi.Normal3f, normal[:3]))
     assert np.array(found).max() <= number.max()
+
+
+def test_neighbours_are_the_sites_that_face_the_same_way_in_the_cubes_around():
+    rng = np.random.default_rng(0)
+    position, normal = rng.random((3000, 3)).astype(np.float32), unit_vectors(rng, 3000)
+    sites, number = Sites.around(position, normal, 200)
+    found = sites.neighbours()
+    assert found.shape == (number.max(), 26)
+    size, low = np.array(sites.size).item(), np.array(sites.low).ravel()
+    place = np.zeros((number.max(), 4), int)
+    way = np.abs(normal).argmax(1) * 2 + (normal[np.arange(3000), np.abs(normal).argmax(1)] > 0)
+    # Outliers belong to the cubes at the ends
+    cell = np.clip((position - low) // size, 0, np.array(sites.resolution).ravel() - 1)
+    place[number - 1] = np.concatenate([cell, way[:, None]], 1)
+    apart = np.abs(place[:, None, :3] - place[None, :, :3]).max(2)
+    expected = (apart == 1) & (place[:, None, 3] == place[None, :, 3])
+    assert expected.any(1).mean() > 0.9
+    for site, near in enumerate(expected):
+        assert set(found[site]) - {0} == set(np.flatnonzero(near) + 1)
+
+
+def test_what_neighbours_have_seen_is_drawn_more_often_than_what_nobody_has():
+    rng = np.random.default_rng(1)
+    position = rng.random((20_000, 3)).astype(np.float32)
+    choice = SiteChoice(np.full(3, 1 / 3), 0.2, np.zeros(0, int))
+
+    def look(places, source):
+        """The first source is seen everywhere, the second from one half, the third from nowhere."""
+        x, number = download(places.position.x), download(source)
+        seen = (number == 0) | ((number == 1) & (x < 0.5))
+        return upload_vectors(mi.Color3f, np.repeat(seen[:, None], 3, 1)), upload(mi.Float, np.ones(len(x)))
+
+    assert choice.learn(position, np.tile(np.float32([[0, 0, 1]]), (len(position), 1)), 6000, 0, look)
+    low, size = np.array(choice._sites.low)[0].item(), np.array(choice._sites.size).item()
+    where = np.arange(low + size / 2, 0.98, size)
+    middle = np.array(choice.site(mi.Point3f(upload(mi.Float, where), 0.5, 0.5), mi.Normal3f(0, 0, 1)))
+    second, third = choice.pmf[middle, 1], choice.pmf[middle, 2]
+    sees, neighbour = where < 0.5 - size / 2, np.flatnonzero(where > 0.5 + size / 2)[0]
+    assert (second[sees] > 0.3).all()
+    # What somebody sees, though nobody near, is drawn a little more often than what nobody sees
+    assert second[neighbour] > 2 * second[-1] > 2 * third[-1] > 0
 
 
 # ---------------------- Changes between renders ----------------------

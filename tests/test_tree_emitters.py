@@ -74,7 +74,7 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(sky, learns):
     box = closed_box(panels(100, rng) | bulbs(50, rng) | (EMITTERS["envmap"]() if sky else {}))
     del box["left"]
     scene = mi.load_dict(box)
-    emission, si = emission_of(scene, rng, learns), interactions(*vertices(rng, 8000))
+    emission, si = emission_of(scene, rng, learns), interactions(*vertices(rng, 16_000))
     site, sample, weight = drawn(emission, si, 1)
     ray, density = si.spawn_ray(sample.direction), sample.density
     met = emission.met(si.p, site, ray, scene.ray_intersect(ray), mi.Bool(True), mi.Bool(True))

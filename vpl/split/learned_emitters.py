@@ -19,7 +19,7 @@ from .site_choice import SiteChoice
 # Regions of the environment, and columns of the table that they are made from
 _REGIONS, _COLUMNS = 256, 512
 # Share of the samples for which emitters have the probability that they have in Mitsuba
-_USUAL_SHARE = 0.3
+_USUAL_SHARE = 0.2
 
 
 class LearnedEmitters:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import upload
+from ..core.arrays import download, upload
 from .facing import WAYS, facing, facing_of
 
 # Cubes along the longest side of where vertices are, at most; a share of them at its ends that may lie outside
 _FINEST_GRID, _OUTLIERS = 32, 0.005
+# Cubes around a cube, in a padded grid
+_AROUND = [cube for cube in itertools.product(range(3), repeat=3) if cube != (1, 1, 1)]
 
 
 @dataclass
@@ -57,6 +60,15 @@ class Sites:
                 break
         table = np.where(known, np.cumsum(known), 0)
         return cls._of(low, size, resolution, table), table[key]
+
+    def neighbours(self) -> np.ndarray:
+        """The sites (n, 26) that face the same way in the cubes around those of sites 1 to n; 0 where there is none."""
+        *cubes, table = (download(x) for x in (*self.resolution, self.table))
+        grid = table.reshape(*(int(x.item()) for x in reversed(cubes)), WAYS)
+        padded = np.pad(grid, ((1, 1), (1, 1), (1, 1), (0, 0)))
+        z, y, x, way = np.nonzero(grid)
+        around = [padded[z + dz, y + dy, x + dx, way] for dz, dy, dx in _AROUND]
+        return np.stack(around, 1)[np.argsort(grid[z, y, x, way])]
 
     def at(self, position, normal):
         """The site of each position, for vertices that face ``normal``."""

@@ -21,7 +21,7 @@ from .site_choice import SiteChoice
 # the rays that there are to learn by, of which sites take as large a part
 _MOST_CLUSTERS, _CLUSTERS_BY_RAYS = 256, 0.25
 # Share of the samples for which the tree is walked from its root
-_USUAL_SHARE = 0.4
+_USUAL_SHARE = 0.2
 # Share of the emitters in the tree that are drawn alike where that is not known: near ones may be hidden, or shine
 # elsewhere
 _UNIFORM_SHARE = 0.1
