@@ -49,7 +49,9 @@ def floor_of(si, bsdf, side, perturbed: Perturbed, active):
     it off in fireflies.
     """
     active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & ~perturbed.at(si, active)
-    context, turned, pair = mi.BSDFContext(), mi.SurfaceInteraction3f(si), mi.UInt32(0)
+    context, turned = mi.BSDFContext(), mi.SurfaceInteraction3f(si)
+    # Where no floor is asked for, none is looked at
+    pair = dr.select(active, mi.UInt32(0), _PAIRS)
     least = dr.full(mi.UnpolarizedSpectrum, dr.inf, dr.width(active))
     # A loop of kernels, so that the code of every material is in them once
     while dr.hint(pair < _PAIRS, exclude=[si, context, perturbed, turned]):

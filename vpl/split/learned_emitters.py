@@ -63,11 +63,13 @@ class LearnedEmitters:
         direction, density, delta = ds.d, ds.pdf, ds.delta & of_emitter
         if self._regions:
             of_region = active & ~of_emitter
-            region = dr.select(of_region, source - self._count, 0)
-            away, arriving, region_density = self._regions.sample(region, member, place, of_region)
-            direction = dr.select(of_region, away, direction)
-            weight = dr.select(of_region, arriving, weight)
-            density = dr.select(of_region, region_density, density)
+            # A branch: where nothing is known of any place, no region is drawn
+            direction, weight, density = dr.if_stmt(
+                (source, member, place, direction, weight, density),
+                of_region,
+                lambda source, member, place, *_: self._regions.sample(source - self._count, member, place, True),
+                lambda source, member, place, *drawn: drawn,
+            )
             ray = dr.select(of_region, si.spawn_ray(direction), ray)
         return EmitterSample(direction, weight, density, delta, ray)
 
@@ -95,9 +97,19 @@ class LearnedEmitters:
 
     def _environment_density(self, site, direction, own, active):
         """Density with which a direction to the environment is drawn; ``own``: by the environment itself."""
-        region, density = self._regions.find(direction, active)
-        density *= self.choice.probability(site, self._count + region, active)
-        return density + own * self.choice.probability(site, mi.UInt32(self._environment_number), active)
+        # A branch, as there: no region is drawn at the first site
+        by_region = dr.if_stmt(
+            (site, direction, mi.Float(0)),
+            active & (site > 0),
+            lambda site, direction, _: self._region_density(site, direction),
+            lambda site, direction, none: none,
+        )
+        return by_region + own * self.choice.probability(site, mi.UInt32(self._environment_number), active)
+
+    def _region_density(self, site, direction):
+        """Density with which a direction is drawn by way of its region."""
+        region, density = self._regions.find(direction, True)
+        return density * self.choice.probability(site, self._count + region, True)
 
     def _density_met(self, origin, site, direction):
         """Density of a direction in which the environment was met."""
