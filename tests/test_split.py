@@ -97,6 +97,14 @@ def test_rough_metal_has_next_to_no_floor_and_diffuse_walls_all_of_it():
         assert (floor >= 0.999 * least).all() and (floor <= 1.001 * most).all()
 
 
+def test_floors_are_0_where_none_is_asked_for_and_the_same_elsewhere():
+    bsdf, si = mi.load_dict(MATERIALS["diffuse"]()), dr.zeros(mi.SurfaceInteraction3f, 64)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
+    asked, nowhere = dr.arange(mi.UInt32, 64) % 3 == 0, Perturbed(mi.load_dict({"type": "scene"}))
+    some, whole = (np.array(floor_of(si, bsdf, mi.Float(1), nowhere, mask)) for mask in (asked, mi.Bool(True)))
+    assert (whole > 0).all() and (some == np.where(np.array(asked), whole, 0)).all()
+
+
 # ---------------------- Numbers ----------------------
 
 

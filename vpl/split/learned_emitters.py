@@ -67,7 +67,9 @@ class LearnedEmitters:
             direction, weight, density = dr.if_stmt(
                 (source, member, place, direction, weight, density),
                 of_region,
-                lambda source, member, place, *_: self._regions.sample(source - self._count, member, place, True),
+                lambda source, member, place, *_: self._regions.sample(
+                    source - self._count, member, place, mi.Bool(True)
+                ),
                 lambda source, member, place, *drawn: drawn,
             )
             ray = dr.select(of_region, si.spawn_ray(direction), ray)
@@ -97,7 +99,7 @@ class LearnedEmitters:
 
     def _environment_density(self, site, direction, own, active):
         """Density with which a direction to the environment is drawn; ``own``: by the environment itself."""
-        # A branch, as there: no region is drawn at the first site
+        # A branch, as in `_draw`: no region is drawn at site 0; while emitters are learned, that is the first one's
         by_region = dr.if_stmt(
             (site, direction, mi.Float(0)),
             active & (site > 0),

@@ -23,7 +23,8 @@ from .sites import Sites
 _LEARNING_SHARE = 0.25
 # Rays from a site to each source; how many of them all sites may have together
 _RAYS_EACH, _MOST_RAYS = 2, 1 << 20
-# Rays from a site that those of its neighbours count for; rays from these that the visibility on average counts for
+# Rays from a site that those of its neighbours count for, at most; rays from these that the visibility on average
+# counts for
 _NEIGHBOURS, _PRIOR = 4.0, 1.0
 
 
@@ -101,26 +102,29 @@ class SiteChoice:
         possible = np.nan_to_num(unoccluded, posinf=0) ** 2
         possible[:, self._ignored] = 0
         found = possible * seen
-        # Where nobody near has looked, a source is expected to be seen as often as the site sees others, and as others
-        # see that source
+        # The less neighbours have looked, the more a source is expected to be seen as often as the site sees others and
+        # others see that source
         of_site, of_source, of_all = (_share(found, possible, axes) for axes in ((1, 2), (0, 2), (0, 1, 2)))
         visible = np.minimum(of_site * of_source / max(float(of_all.squeeze()), 1e-9), 1)[..., 0]
         found, possible = found.mean(2), possible.mean(2)
         # Roots of what the neighbours found: some of them are next to an emitter that is far from here
-        expected = self._of_neighbours(found**0.5, (visible * possible) ** 0.5)
-        power = ((_RAYS_EACH * found + _NEIGHBOURS * expected**2) / (_RAYS_EACH + _NEIGHBOURS)) ** 0.5
+        expected, rays = self._of_neighbours(found**0.5, (visible * possible) ** 0.5)
+        rays = np.minimum(rays, _NEIGHBOURS)
+        power = ((_RAYS_EACH * found + rays * expected**2) / (_RAYS_EACH + rays)) ** 0.5
         total = power.sum(1, keepdims=True)
         learned = np.where(total > 0, power / np.maximum(total, np.finfo(np.float64).tiny), self._usual)
         return np.concatenate([self._usual[None], (1 - self._share) * learned + self._share * self._usual])
 
-    def _of_neighbours(self, power: np.ndarray, guess: np.ndarray) -> np.ndarray:
-        """Mean ``power`` (sites, sources) at the neighbours of each site, with a ``guess`` as if it was some rays'."""
+    def _of_neighbours(self, power: np.ndarray, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(Mean ``power`` (sites, sources) at the neighbours of each site, with a ``guess`` as if it was some rays'; by
+        how many rays that is known, (sites, 1))."""
         neighbours, total = self._sites.neighbours(), _PRIOR * guess
         # Nothing comes from where no neighbour is
         padded = np.concatenate([np.zeros((1, self.count)), _RAYS_EACH * power])
         for neighbour in neighbours.T:
             total += padded[neighbour]
-        return total / (_RAYS_EACH * np.count_nonzero(neighbours, 1)[:, None] + _PRIOR)
+        rays = _RAYS_EACH * np.count_nonzero(neighbours, 1)[:, None] + _PRIOR
+        return total / rays, rays
 
     # ---------------------- Sampling ----------------------
 
