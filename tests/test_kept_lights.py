@@ -73,7 +73,7 @@ def two_rooms():
 @pytest.mark.parametrize("views", [two_views, two_rooms])
 def test_a_second_camera_sees_the_image_of_path_by_the_lights_of_the_first(made, views):
     scene, pairs = mi.load_dict(views()), []
-    for seed in range(24):
+    for seed in range(64):
         integrator = keeping()
         lit(scene, integrator, 0, seed)
         found = lit(scene, integrator, 1, seed, 32)
