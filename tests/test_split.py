@@ -21,7 +21,6 @@ from vpl.split.cells import Cells
 from vpl.split.floors import agrees, carried_share, floor_of, side_of
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
 from vpl.split.numbers import SpreadNumbers, lattice_multiplier
-from vpl.split.pilot import Pilot
 from vpl.split.pixel_clusters import PixelClusters, Receivers
 from vpl.split.remainder import power_heuristic
 from vpl.split.view import View
@@ -323,12 +322,6 @@ def test_the_pilot_has_pairs_all_over_the_image(count):
     assert len(rays) <= max(1 << 15, 2) and (first % 2 == 0).all() and (second - first <= 1).all()
     assert (np.diff(first) > 0).all() and second[-1] < count
     assert np.diff(first, append=count).max() <= count / len(first) + 2
-
-
-def test_places_without_a_path_of_the_pilot_are_as_bright_as_all():
-    nothing = dict.fromkeys(("arrivals", "onward", "vertices", "indirect"))
-    pilot = Pilot(pixel=np.array([0, 1, 40]), radiance=np.array([1.0, 3.0, 5.0]), **nothing)
-    np.testing.assert_allclose(pilot.nearby(pilot.radiance, 64, np.array([5, 20, 40, 63])), [2, 3, 5, 3])
 
 
 @pytest.mark.parametrize(("samples", "most"), [(1, 1), (7, 5), (16, 16), (64, 41), (64, 100)])

@@ -32,9 +32,10 @@ _LEARNED_COST = 1.15
 
 @dataclass(frozen=True)
 class Decision:
-    """The ``balance`` that a ``pilot`` led to, and the ``options`` that were considered."""
+    """The ``balance`` that a ``pilot`` led to, by its ``evidence``, and the ``options`` that were considered."""
 
     pilot: Pilot
+    evidence: Evidence
     balance: Balance
     options: list[Option]
 
@@ -43,18 +44,19 @@ class Decision:
         """The decision for a view, whose emitters are learned from the pilot; ``virtual_lights``: whether there may be
         any."""
         pilot = _learning_pilot(view)
+        evidence = _evidence(view, pilot)
         refusal = _refusal(view, virtual_lights)
         if refusal:
-            return cls(pilot, without_lights(refusal), [])
-        evidence, options = _considered(view, pilot)
-        return cls(pilot, balance(evidence, options), options)
+            return cls(pilot, evidence, without_lights(refusal), [])
+        options = _options(view, pilot, evidence)
+        return cls(pilot, evidence, balance(evidence, options), options)
 
     def expected_light(self, view: View, lights: ViewLights) -> np.ndarray:
         """Light that ``lights`` are expected to bring to each pixel of the view, (pixels,)."""
         kinds = bool(lights.surfaces), bool(lights.emitters)
         whole = self.pilot.radiance
         left = next((x.expected for x in self.options if (x.surfaces, x.emitters) == kinds), whole)
-        return np.maximum(self.pilot.nearby(whole - left, view.width, view.pixels), 0)
+        return np.maximum(self.pilot.nearby(whole - left, view), 0)
 
     def judge(self, view: View) -> float | None:
         """Tell the view what it is worth to follow its paths, which its limits and what is followed from then on go by:
@@ -63,9 +65,8 @@ class Decision:
         if len(onward.path) == 0:
             return None
         worth, expected = Worth.of(onward.position, onward.normal, onward.sent)
-        brightness = pilot.brightness(view.width)
-        relative = onward.throughput / judged_by(brightness)[onward.path]
-        whole = noise(pilot.radiance, brightness)
+        relative = onward.throughput / judged_by(self.evidence.brightness)[onward.path]
+        whole = self.evidence.noise(pilot.radiance)
         multiple = importance(relative * expected, relative * onward.sent, onward.edges, len(pilot.radiance), whole)
         if not np.isfinite(multiple):
             return None
@@ -73,7 +74,7 @@ class Decision:
             # The less noise there is besides, the more they are worth
             multiple *= (whole / max(self.balance.noise, 1e-9)) ** 0.5
         view.worth = worth
-        nearby = pilot.nearby(pilot.radiance, view.width, view.pixels)
+        nearby = pilot.nearby(pilot.radiance, view)
         view.importance = upload(mi.Float, multiple / judged_by(nearby))
         return multiple
 
@@ -84,7 +85,7 @@ def _learning_pilot(view: View) -> Pilot:
     rays, seed = learning_rays(view.count), derived_seed(view.seed, 6)
     if not learn_emitters(view.scene, view.emission, pilot.vertices, rays, seed):
         return pilot
-    brightness, again = pilot.brightness(view.width), _followed(view, ViewLights())
+    brightness, again = pilot.brightness(view), _followed(view, ViewLights())
     if _LEARNED_COST * noise(again.radiance, brightness) < noise(pilot.radiance, brightness):
         return again
     # Where shadows are small, or gloss is what is noisy, sites may mislead
@@ -114,18 +115,21 @@ def _may_carry_emitters(view: View) -> bool:
     return view.emission.lights is not None and view.rules.max_depth > 1
 
 
-def _considered(view: View, pilot: Pilot) -> tuple[Evidence, list[Option]]:
+def _evidence(view: View, pilot: Pilot) -> Evidence:
+    """What is known of the view's noise by the pilot's paths."""
+    direct, brightness = pilot.radiance - pilot.indirect, pilot.brightness(view)
+    return Evidence(pilot.radiance, direct, brightness, view.count, view.samples, _may_carry_emitters(view))
+
+
+def _options(view: View, pilot: Pilot, evidence: Evidence) -> list[Option]:
     """Lights that may pay, with what the pilot's paths find besides."""
-    direct, brightness = pilot.radiance - pilot.indirect, pilot.brightness(view.width)
-    carries_emitters = _may_carry_emitters(view)
-    evidence = Evidence(pilot.radiance, direct, brightness, view.count, view.samples, carries_emitters)
     options = _with_surfaces(view, evidence, pilot, None)
-    if carries_emitters:
+    if evidence.emitters:
         emitters = view.emitter_lights([])
         left = _followed(view, ViewLights(emitters=emitters))
         options.append(Option(False, True, left.radiance, left.indirect))
         options += _with_surfaces(view, evidence, left, emitters)
-    return evidence, options
+    return options
 
 
 def _with_surfaces(view: View, evidence: Evidence, traced: Pilot, emitters: LightSet | None) -> list[Option]:

@@ -9,9 +9,7 @@ import numpy as np
 from ..core.arrays import channel_mean, download
 from .gather_vertices import Arrival, GatherVertices
 from .paths import Found
-
-# Tiles of the pilot's image, in pixels
-_TILE = 16
+from .pixel_means import pixel_means
 
 
 @dataclass
@@ -72,19 +70,10 @@ class Pilot:
         vertices = tuple(np.concatenate(x) for x in ((first[seen], position[arrived]), (facing[seen], normal[arrived])))
         return cls(arrivals, onward, vertices, pixel, radiance, indirect)
 
-    def brightness(self, width: int) -> np.ndarray:
-        """Mean radiance of the tile of each path, (n,)."""
-        return self.nearby(self.radiance, width, self.pixel)
+    def brightness(self, view) -> np.ndarray:
+        """Mean radiance around each path, (n,), as the others tell."""
+        return pixel_means(self.radiance, self.pixel, view.width, len(view.pixels))[1]
 
-    def nearby(self, values: np.ndarray, width: int, pixels: np.ndarray) -> np.ndarray:
-        """Mean of the paths' ``values`` in the tile that each of some pixels is in, in an image so many pixels wide; of
-        all paths where a tile has none."""
-        tiles, of_path = _tile(pixels, width), _tile(self.pixel, width)
-        size = max(tiles.max(), of_path.max()) + 1
-        count = np.bincount(of_path, minlength=size)
-        means = np.bincount(of_path, values, size) / np.maximum(count, 1)
-        return np.where(count > 0, means, np.mean(values))[tiles]
-
-
-def _tile(pixel: np.ndarray, width: int) -> np.ndarray:
-    return pixel // width // _TILE * (width // _TILE + 1) + pixel % width // _TILE
+    def nearby(self, values: np.ndarray, view) -> np.ndarray:
+        """Mean of the paths' ``values`` around each pixel of the view, (pixels,)."""
+        return pixel_means(values, self.pixel, view.width, len(view.pixels))[0]
