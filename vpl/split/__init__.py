@@ -25,8 +25,9 @@ In the order to read in:
 - ``view_lights``: the lights of a view
 - ``view``: camera rays, and paths that begin with them
 - ``gather_vertices``: vertices where virtual lights are gathered, and which of the later ones are
-- ``pilot``: a few paths that tell where light is wanted
 - ``balance``: whether lights pay, how many, how finely they are clustered
+- ``pixel_means``: how bright the image is around its pixels, from values at some of them
+- ``pilot``: a few paths that tell where light is wanted
 - ``decision``: what a view is followed with: pilots, the balance that they lead to, what paths are worth
 - ``emitter_lights``: many emitters as virtual lights, which cuts stand for instead of a sample of one
 - ``cells``: boxes where camera paths arrive, and random lines that meet surfaces in them with a known density

@@ -192,7 +192,8 @@ def importance(worth: np.ndarray, brought: np.ndarray, edges: np.ndarray, paths:
     cost is least, as far as it depends on the second; infinite where none should end, as that would hardly pay.
 
     ``worth`` (m,) and ``brought`` (m,): what goes on is expected to bring, and what it brought, relative to the image;
-    ``edges`` (m,) that it cost; ``paths``: number of all paths, with a relative variance of ``whole`` each.
+    ``edges`` (m,) that it cost; ``paths``: number of all paths; ``whole``: relative variance of each, when samples of a
+    pixel are spread well.
     """
     best, least = np.inf, _LARGEST_PRODUCT * whole * (_FIRST_EDGES + edges.sum() / paths)
     for multiple in 2.0 ** np.arange(-3, 5.5, 0.5):

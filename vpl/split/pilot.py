@@ -9,7 +9,7 @@ import numpy as np
 from ..core.arrays import channel_mean, download
 from .gather_vertices import Arrival, GatherVertices
 from .paths import Found
-from .pixel_means import pixel_means
+from .pixel_means import means_of_others, pixel_means
 
 
 @dataclass
@@ -72,8 +72,11 @@ class Pilot:
 
     def brightness(self, view) -> np.ndarray:
         """Mean radiance around each path, (n,), as the others tell."""
-        return pixel_means(self.radiance, self.pixel, view.width, len(view.pixels))[1]
+        return self._of_others(view)[0]
 
     def nearby(self, values: np.ndarray, view) -> np.ndarray:
         """Mean of the paths' ``values`` around each pixel of the view, (pixels,)."""
-        return pixel_means(values, self.pixel, view.width, len(view.pixels))[0]
+        return pixel_means(values, self.pixel, view.width, view.pixels, self._of_others(view)[1])
+
+    def _of_others(self, view) -> tuple[np.ndarray, list[float]]:
+        return means_of_others(self.radiance, self.pixel, view.width, view.pixels)

@@ -17,21 +17,36 @@ from .balance import noise
 _SPREAD = 0.15
 
 
-def pixel_means(values: np.ndarray, at: np.ndarray, width: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Means of ``values`` (n,) in the pixels ``at`` (n,), pairs of two next to each other, float64: (around each of
-    ``count`` pixels of an image so many wide; around each value, as all others tell but that beside it, (n,))."""
-    beside = np.arange(len(values)) ^ 1
-    grid, others = np.full((1, 1), np.mean(values)), np.full(len(values), np.mean(values))
+def means_of_others(values: np.ndarray, at: np.ndarray, width: int, count: int) -> tuple[np.ndarray, list[float]]:
+    """(Mean around each of ``values`` (n,), pairs of two next to each other, as all others tell but that beside it,
+    (n,); how many values of the larger cell's mean cells of each size were taken to have had).
+
+    ``at``: the pixel of each, of ``count`` pixels of an image so many wide.  How noisy values are is judged by all.
+    """
+    number = len(values)
+    beside = np.arange(number) ^ 1
+    rest = max(number - 2, 1)
+    others = (np.sum(values) - values - values[beside]) / rest if number > 2 else np.full(number, np.mean(values))
+    priors = []
     for (down, across), cell in _divisions(at, width, count):
-        # Values of the larger cell's mean that each is taken to have had; of n values the relative variance is below n
-        prior = min(noise(values, others), len(values)) / _SPREAD
-        number, total = (np.bincount(cell, x, down * across) for x in (np.ones(len(values)), values))
-        around = grid.repeat(2, 0).repeat(2, 1)[:down, :across].reshape(-1)
-        grid = _mean(total, number, prior, around).reshape(down, across)
+        # Of n values the relative variance is below n
+        priors.append(min(noise(values, others), number) / _SPREAD)
+        inside, total = _sums(cell, values, down * across)
         both = cell == cell[beside]
-        own = values + both * values[beside]
-        others = _mean(total[cell] - own, number[cell] - 1 - both, prior, others)
-    return grid.reshape(-1)[:count], others
+        total, inside = total[cell] - values - both * values[beside], inside[cell] - 1 - both
+        others = _mean(total, inside, priors[-1], others)
+    return others, priors
+
+
+def pixel_means(values: np.ndarray, at: np.ndarray, width: int, count: int, priors: list[float]) -> np.ndarray:
+    """Mean of ``values`` (n,) in the pixels ``at`` (n,) around each of ``count`` pixels of an image so many wide,
+    (count,); ``priors``: see :func:`means_of_others`."""
+    grid = np.full((1, 1), np.mean(values))
+    for ((down, across), cell), prior in zip(_divisions(at, width, count), priors, strict=True):
+        inside, total = _sums(cell, values, down * across)
+        around = grid.repeat(2, 0).repeat(2, 1)[:down, :across].reshape(-1)
+        grid = _mean(total, inside, prior, around).reshape(down, across)
+    return grid.reshape(-1)[:count]
 
 
 def _divisions(at: np.ndarray, width: int, count: int) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
@@ -42,6 +57,11 @@ def _divisions(at: np.ndarray, width: int, count: int) -> Iterator[tuple[tuple[i
         side //= 2
         down, across = -(-height // side), -(-width // side)
         yield (down, across), at // width // side * across + at % width // side
+
+
+def _sums(cell: np.ndarray, values: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """How many values each cell has, and their sums."""
+    return np.bincount(cell, minlength=cells), np.bincount(cell, values, cells)
 
 
 def _mean(total, number, prior: float, around):

@@ -45,9 +45,9 @@ class View:
         return dr.width(self.ray.o)
 
     @property
-    def pixels(self) -> np.ndarray:
-        """Numbers of the pixels."""
-        return np.arange(-(-self.count // self.samples))
+    def pixels(self) -> int:
+        """How many pixels there are."""
+        return -(-self.count // self.samples)
 
     def pairs(self, most: int) -> np.ndarray:
         """Some of the rays, two next to each other at a time, evenly over the image: so many at most."""
