@@ -164,7 +164,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
         lights = self._lights(view, decision.pilot.arrivals, chosen, clock)
         limits = view.limits(lights)
-        expected = decision.expected_light(view, lights) if lights.all else None
+        expected = decision.expected_light(lights) if lights.all else None
         radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
         # Whole pixels at a time
         most = max(_WAVEFRONT // view.samples, 1) * view.samples

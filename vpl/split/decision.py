@@ -51,12 +51,12 @@ class Decision:
         options = _options(view, pilot, evidence)
         return cls(pilot, evidence, balance(evidence, options), options)
 
-    def expected_light(self, view: View, lights: ViewLights) -> np.ndarray:
+    def expected_light(self, lights: ViewLights) -> np.ndarray:
         """Light that ``lights`` are expected to bring to each pixel of the view, (pixels,)."""
         kinds = bool(lights.surfaces), bool(lights.emitters)
         whole = self.pilot.radiance
-        left = next((x.expected for x in self.options if (x.surfaces, x.emitters) == kinds), whole)
-        return np.maximum(self.pilot.nearby(whole - left, view), 0)
+        left = next(x.expected for x in self.options if (x.surfaces, x.emitters) == kinds)
+        return np.maximum(self.pilot.nearby(whole - left), 0)
 
     def judge(self, view: View) -> float | None:
         """Tell the view what it is worth to follow its paths, which its limits and what is followed from then on go by:
@@ -74,7 +74,7 @@ class Decision:
             # The less noise there is besides, the more they are worth
             multiple *= (whole / max(self.balance.noise, 1e-9)) ** 0.5
         view.worth = worth
-        nearby = pilot.nearby(pilot.radiance, view)
+        nearby = pilot.nearby(pilot.radiance)
         view.importance = upload(mi.Float, multiple / judged_by(nearby))
         return multiple
 
@@ -85,7 +85,7 @@ def _learning_pilot(view: View) -> Pilot:
     rays, seed = learning_rays(view.count), derived_seed(view.seed, 6)
     if not learn_emitters(view.scene, view.emission, pilot.vertices, rays, seed):
         return pilot
-    brightness, again = pilot.brightness(view), _followed(view, ViewLights())
+    brightness, again = pilot.brightness, _followed(view, ViewLights())
     if _LEARNED_COST * noise(again.radiance, brightness) < noise(pilot.radiance, brightness):
         return again
     # Where shadows are small, or gloss is what is noisy, sites may mislead
@@ -97,7 +97,7 @@ def _followed(view: View, lights: ViewLights) -> Pilot:
     """What is found by pairs of paths all over the image, always the same ones, besides light of ``lights``."""
     lane = view.pairs(_PILOT)
     found, vertices, _, arrival = view.follow(upload(mi.UInt32, lane), view.limits(lights, AT_FIRST), 1)
-    return Pilot.of(found, vertices, arrival, lane // view.samples)
+    return Pilot.of(found, vertices, arrival, lane // view.samples, (view.width, view.pixels))
 
 
 def _refusal(view: View, virtual_lights: bool) -> str:
@@ -117,7 +117,7 @@ def _may_carry_emitters(view: View) -> bool:
 
 def _evidence(view: View, pilot: Pilot) -> Evidence:
     """What is known of the view's noise by the pilot's paths."""
-    direct, brightness = pilot.radiance - pilot.indirect, pilot.brightness(view)
+    direct, brightness = pilot.radiance - pilot.indirect, pilot.brightness
     return Evidence(pilot.radiance, direct, brightness, view.count, view.samples, _may_carry_emitters(view))
 
 

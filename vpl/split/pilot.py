@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -43,7 +44,8 @@ class Pilot:
 
     ``arrivals``: their second vertices, where they have a floor, as their first ones have; ``pixel``, ``radiance``,
     ``indirect`` (n,): the pixel of each path, what it found, and the part that came by way of its second vertex.
-    ``vertices``: positions and normals, (m, 3) each, of both; ``onward``: what came by way of all second vertices.
+    ``vertices``: positions and normals, (m, 3) each, of both; ``onward``: what came by way of all second vertices;
+    ``size``: width of the image, and how many pixels it has.
     """
 
     arrivals: Arrivals
@@ -52,10 +54,13 @@ class Pilot:
     pixel: np.ndarray
     radiance: np.ndarray
     indirect: np.ndarray
+    size: tuple[int, int]
 
     @classmethod
-    def of(cls, found: Found, vertices: GatherVertices, arrival: Arrival, pixel: np.ndarray) -> Pilot:
-        """The pilot of some paths of the pixels ``pixel``."""
+    def of(
+        cls, found: Found, vertices: GatherVertices, arrival: Arrival, pixel: np.ndarray, size: tuple[int, int]
+    ) -> Pilot:
+        """The pilot of some paths of the pixels ``pixel`` in an image of a ``size``."""
         radiance = np.nan_to_num(download(channel_mean(found.radiance)).astype(np.float64), posinf=0, neginf=0)
         position, normal, weight, throughput, before = (download(x) for x in vars(arrival).values())
         beyond, edges = np.maximum(radiance - np.nan_to_num(before), 0), download(found.edges).astype(np.int64)
@@ -68,15 +73,17 @@ class Pilot:
         first, facing, depth = (download(x) for x in (vertices.position, vertices.normal, vertices.depth))
         seen = (depth > 0) & np.isfinite(first).all(1)
         vertices = tuple(np.concatenate(x) for x in ((first[seen], position[arrived]), (facing[seen], normal[arrived])))
-        return cls(arrivals, onward, vertices, pixel, radiance, indirect)
+        return cls(arrivals, onward, vertices, pixel, radiance, indirect, size)
 
-    def brightness(self, view) -> np.ndarray:
+    @property
+    def brightness(self) -> np.ndarray:
         """Mean radiance around each path, (n,), as the others tell."""
-        return self._of_others(view)[0]
+        return self._of_others[0]
 
-    def nearby(self, values: np.ndarray, view) -> np.ndarray:
-        """Mean of the paths' ``values`` around each pixel of the view, (pixels,)."""
-        return pixel_means(values, self.pixel, view.width, view.pixels, self._of_others(view)[1])
+    def nearby(self, values: np.ndarray) -> np.ndarray:
+        """Mean of the paths' ``values`` around each pixel of the image, (pixels,)."""
+        return pixel_means(values, self.pixel, *self.size, self._of_others[1])
 
-    def _of_others(self, view) -> tuple[np.ndarray, list[float]]:
-        return means_of_others(self.radiance, self.pixel, view.width, view.pixels)
+    @cached_property
+    def _of_others(self) -> tuple[np.ndarray, list[float]]:
+        return means_of_others(self.radiance, self.pixel, *self.size)
