@@ -2,6 +2,7 @@
 
     python benchmarks/manylights.py                                      all parts, all scenes
     python benchmarks/manylights.py --parts product --scenes kitchen     some
+    python benchmarks/manylights.py --parts product --views 2            from other cameras, at random
 
 Parts, each with both integrators in turn in one run, and with the better of the samplers `independent` and
 `multijitter` for each:
@@ -38,6 +39,7 @@ mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
 from benchmarks import scenes  # noqa: E402
+from benchmarks.views import move_cameras  # noqa: E402
 from vpl.split import balance, decision  # noqa: E402
 
 NAMES = (*scenes.NAMES, "classroom", "hall")
@@ -156,27 +158,30 @@ def reference_of(name: str) -> tuple[np.ndarray, np.ndarray]:
     return values[..., truth], values[..., noise]
 
 
-def scale_of(name: str, images: list, width: int) -> np.ndarray:
+def scale_of(name: str, images: list, width: int, view: int = 0) -> np.ndarray:
     """What squared errors are relative to."""
-    known = scenes.reference_file(name) and width == 256
+    known = scenes.reference_file(name) and width == 256 and not view
     truth = reference_of(name)[0] if known else np.mean(images, axis=0)
     return truth**2 + 0.01 * truth.mean() ** 2
 
 
-def product(names, width: int, seconds: float, passes: int) -> None:
-    """Print variance × time of all, and the ratio."""
+def product(names, width: int, seconds: float, passes: int, views: int) -> None:
+    """Print variance × time of all, and the ratio; from the cameras of the scenes, or from so many other ``views``."""
     print(f"product, {width} wide, {passes} passes of about {seconds:g} s; variance × time, with samples of a pass")
-    print(f"{'scene':16s} {'path':>22s} {'manylights':>22s}   ratio   bias                sets")
-    ratios = [product_of(name, width, seconds, passes) for name in names]
+    print(f"{'scene':18s} {'path':>22s} {'manylights':>22s}   ratio   bias                sets")
+    numbers = range(1, views + 1) if views else (0,)
+    ratios = [product_of(name, width, seconds, passes, view) for name in names for view in numbers]
     print(f"geometric mean {scenes.geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
 
 
-def product_of(name: str, width: int, seconds: float, passes: int) -> float:
-    """Print variance × time of a scene: the ratio."""
+def product_of(name: str, width: int, seconds: float, passes: int, view: int) -> float:
+    """Print variance × time of a scene, from another camera where ``view`` is not 0: the ratio."""
     scene = load(name, width)
+    if view:
+        move_cameras(scene, view)
     rivals = [Rival(name, scene, kind, sampler, width, seconds) for kind in KINDS for sampler in SAMPLERS]
     measure_in_turn(rivals, passes)
-    scale = scale_of(name, [image for rival in rivals for image in rival.images], width)
+    scale = scale_of(name, [image for rival in rivals for image in rival.images], width, view)
     best = {kind: min((r for r in rivals if r.kind == kind), key=lambda r: r.product(scale)) for kind in KINDS}
     values = [best[kind].product(scale) for kind in KINDS]
     ratio = values[0] / values[1]
@@ -185,9 +190,10 @@ def product_of(name: str, width: int, seconds: float, passes: int) -> float:
     columns = [
         f"{value:.4g} ({best[kind].spp}, {best[kind].sampler[:5]})" for value, kind in zip(values, KINDS, strict=True)
     ]
+    label = f"{name} {view}" if view else name
     excess, uncertain = ours / theirs - 1, np.hypot(error / ours, their_error / theirs)
     print(
-        f"{name:16s} {columns[0]:>22s} {columns[1]:>22s} {ratio:7.2f}   {excess:+.2%} ± {uncertain:.2%}"
+        f"{label:18s} {columns[0]:>22s} {columns[1]:>22s} {ratio:7.2f}   {excess:+.2%} ± {uncertain:.2%}"
         f"{sets:12.2%}   {best['manylights'].integrator.statistics.get('balance')}",
         flush=True,
     )
@@ -276,10 +282,13 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=256, metavar="PIXELS")
     parser.add_argument("--seconds", type=float, default=2.5, help="of one pass, about (default: 2.5)")
     parser.add_argument("--passes", type=int, default=6, help="of each (default: 6)")
+    parser.add_argument("--views", type=int, default=0, help="how many other cameras the product is of (default: none)")
     options = parser.parse_args()
+    if options.views < 0:
+        parser.error(f"--views is {options.views}: allowed are 0 and above")
     names = scenes.available(options.scenes)
     if "product" in options.parts:
-        product(names, options.width, options.seconds, options.passes)
+        product(names, options.width, options.seconds, options.passes, options.views)
     if "denoised" in options.parts:
         denoised(names, 256, options.seconds, options.passes)
     if "lights" in options.parts:

@@ -34,9 +34,9 @@ from .gathering import Clock, GatheringIntegrator, add_statistics
 from .knobs import Boolean
 from .manual import manual_page
 
-# Camera rays that are followed at a time, about: memory that no process had before is slow to fill, and recording
-# kernels anew for fewer rays is slow, too
-_WAVEFRONT = 1 << 19
+# Camera rays that are followed at a time, about: half of them, but so many at least and at most. Memory that is new to a
+# process takes long to fill, which is felt in small images, and kernels are recorded anew each time
+_WAVEFRONT = 1 << 19, 1 << 20
 # Pixels darker than this share of the image's mean are lit as precisely as if they had it
 _DARK_FLOOR = 0.1
 # Nodes of the cut of a cluster, at most
@@ -167,8 +167,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
         limits = view.limits(lights)
         expected = decision.expected_light(lights) if lights.all else None
         radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
-        # Whole pixels at a time, as many each time
-        most = -(-view.pixels // max(round(view.count / _WAVEFRONT), 1)) * view.samples
+        # Whole pixels, in parts of about the same size
+        parts = max(round(view.count / np.clip(view.count / 2, *_WAVEFRONT)), 1)
+        most = -(-view.pixels // parts) * view.samples
         for first in range(0, view.count, most):
             if self.should_stop():
                 break

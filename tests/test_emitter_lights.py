@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from vpl.split import balance as balances
+from vpl.split import decision
 
 from .catalogue import EMITTERS, image, rgb
 from .conftest import assert_same_mean_over_seeds, closed_box, render, wall
+from .test_loops import calls_of
 from .test_tree_emitters import bulbs, emission_of, interactions, panels, vertices
 
 
@@ -66,6 +68,23 @@ def always(monkeypatch):
 def assert_lights_stand_for_emitters(integrator, scene, spp):
     mi.render(scene, integrator=integrator, spp=spp)
     assert integrator.statistics["lights"]["emitters"] > 0
+
+
+@pytest.mark.usefixtures("lights_cost_nothing")
+def test_lights_that_promise_less_are_not_followed(monkeypatch):
+    """Nothing else is decided than with all of them followed."""
+    rng = np.random.default_rng(5)
+    scene = mi.load_dict(closed_box(panels(40, rng) | balls(40, rng), 64))
+    found = []
+    for may_pay in (decision.may_pay, lambda *_: True):
+        with monkeypatch.context() as patch:
+            followed = calls_of(patch, decision, "_followed")
+            patch.setattr(decision, "may_pay", may_pay)
+            integrator = mi.load_dict({"type": "manylights", "max_depth": 5})
+            mi.render(scene, integrator=integrator, spp=64)
+        found.append((integrator.statistics["balance"], integrator.statistics["lights"], len(followed)))
+    (*chosen, number), (*expected, of_all) = found
+    assert chosen == expected and number < of_all
 
 
 # ---------------------- Expectation ----------------------

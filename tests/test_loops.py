@@ -1,10 +1,13 @@
 """Loops of kernels are recorded once: where there are many shapes and materials, that takes longer than rendering."""
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from vpl.direct import cluster_sampling, emitter_sampling
 from vpl.lights.emitters import read_emitters
+from vpl.split.cells import Lines
+from vpl.split.surface_lights import _rays_to_surfaces
 
 from .catalogue import rgb
 from .conftest import area_light, closed_box, render
@@ -34,6 +37,21 @@ def test_bodies_of_loops_are_recorded_once_in_a_kernel(plugin, more, module, nam
     calls = calls_of(monkeypatch, module, name)
     render(mi.load_dict(closed_box({"lamp": area_light()}, 8)), plugin, 1, max_depth=3, **more)
     assert len(calls) == kernels
+
+
+def test_surfaces_along_lines_are_looked_for_once_in_a_kernel():
+    """In one that counts them and one that finds them."""
+    scene = mi.load_dict(closed_box({"lamp": area_light()}, 8))
+    calls = []
+
+    class Counted:
+        def ray_intersect(self, *arguments, **more):
+            calls.append(1)
+            return scene.ray_intersect(*arguments, **more)
+
+    origin, direction = np.full((10, 3), [0.1, 0.2, -9], np.float32), np.full((10, 3), [0, 0, 1], np.float32)
+    rays = _rays_to_surfaces(Counted(), Lines(origin, direction, np.full(10, 20, np.float32)))
+    assert len(calls) == 2 and len(rays.o.x) == 20
 
 
 def test_a_few_emitters_among_many_shapes_are_called_alone():

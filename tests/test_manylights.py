@@ -351,6 +351,12 @@ def test_few_pixels_and_samples(size, spp, max_depth):
         np.testing.assert_allclose(found, render(scene, "path", spp, max_depth=max_depth), atol=1e-6)
 
 
+def test_images_of_several_parts_have_the_mean_of_path(monkeypatch):
+    """Of 34, 34 and 32 pixels."""
+    monkeypatch.setattr("integrators.manylights._WAVEFRONT", (1000, 1000))
+    assert_image_of_path(closed_box({"light": area_light()}, 10), max_depth=4)
+
+
 def test_the_same_seed_gives_the_same_image():
     scene = mi.load_dict(closed_box({"light": area_light()}, 16))
     first, second, other = (render(scene, "manylights", 16, seed, max_depth=4) for seed in (1, 1, 2))

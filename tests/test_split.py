@@ -16,7 +16,6 @@ from vpl.lights.light_set import ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.lights.virtual_lights import DeviceLights, VirtualLights
 from vpl.points.surfaces import LambertianSurface
-from vpl.split.balance import Evidence, Option, balance
 from vpl.split.cells import Cells
 from vpl.split.floors import agrees, carried_share, floor_of, side_of
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
@@ -363,53 +362,6 @@ def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
         )  # fmt: skip
         assert set(np.unique(np.array(ray))) == set(members)
         np.testing.assert_allclose(np.array(value).mean(1), weight[members].sum(0), rtol=2e-3)
-
-
-# ---------------------- Balance ----------------------
-
-
-def balanced(direct, indirect, paths, samples, left=None):
-    """The balance of an image of an even brightness; ``left``: of it besides lights on surfaces, if followed."""
-    option = Option(True, False, direct + indirect, indirect, left)
-    return balance(Evidence(direct + indirect, direct, np.ones(len(direct)), paths, samples, False), [option])
-
-
-def test_lights_pay_where_indirect_light_is_the_noise_and_only_there():
-    rng = np.random.default_rng(0)
-    indirect, direct = rng.exponential(size=(2, 10_000))
-    none = np.zeros(10_000)
-    assert balanced(none, indirect, 10**8, 64).light_paths > 0
-    assert balanced(none, indirect, 10**4, 64).light_paths == 0
-    assert balanced(direct, 1e-3 * indirect, 10**7, 64).light_paths == 0
-    assert balance(Evidence(direct, direct, none + 1, 10**8, 64, False), []).light_paths == 0
-
-
-def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
-    """As behind veils, which stop what lights shine, and let paths pass."""
-    rng = np.random.default_rng(0)
-    indirect, direct = rng.exponential(size=(2, 10_000))
-    assert balanced(0.1 * direct, indirect, 10**8, 64).light_paths > 0
-    assert balanced(0.1 * direct, indirect, 10**8, 64, left=0.95 * indirect).light_paths == 0
-
-
-def test_more_vertices_are_lit_the_less_noise_there_is_besides():
-    rng = np.random.default_rng(0)
-    indirect, direct = rng.exponential(size=(2, 10_000))
-    found = [balanced(share * direct, indirect, 10**8, 64).vertices for share in (0.0, 0.3, 1.0)]
-    assert 64 >= found[0] > found[1] > found[2] >= 8
-    assert balanced(0.1 * direct, indirect, 10**8, 1).vertices == 1
-
-
-def test_more_light_paths_are_followed_the_noisier_indirect_light_is():
-    rng = np.random.default_rng(0)
-    direct = rng.exponential(size=10_000)
-    found = [balanced(direct, rng.gamma(1 / noise, noise, 10_000), 10**7, 64).light_paths for noise in (1, 4, 16)]
-    assert 0 < 1.2 * found[0] < found[1] < found[2] / 1.2
-
-
-def test_one_sample_has_no_noise_that_lights_could_take_away():
-    chosen = balanced(np.full(2, 0.5), np.full(2, 0.5), 1, 1)
-    assert chosen.light_paths == 0 and "nan" not in chosen.reason
 
 
 def test_later_vertices_are_drawn_by_weight_and_stand_for_all_of_them():

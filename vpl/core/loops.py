@@ -12,7 +12,8 @@ def recorded_once(function: Callable) -> Callable:
     """A function whose loops are recorded once.
 
     Dr.Jit looks for what a loop does not change, and records the body again without it: where paths are followed, all
-    shapes and materials of the scene once more.  What these loops do not change they have to ``exclude`` themselves.
+    shapes and materials of the scene once more.  What these loops do not change they have to ``exclude`` themselves,
+    and arrays that they scatter to, which Dr.Jit takes out of the loop's state by recording it again.
     """
 
     @wraps(function)

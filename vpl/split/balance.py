@@ -137,9 +137,20 @@ def balance(evidence: Evidence, options: list[Option]) -> Balance:
     product, cost, best = min((_priced(evidence, option) for option in options), key=lambda option: option[0])
     left_over = best.noise / max(whole, _TINY)
     if product > _PAYS_BELOW * whole:
-        price = f"virtual lights would cost {cost - 1:.2g} times as much as the paths"
-        return without_lights(f"{price} and leave {left_over:.0%} of the noise")
+        costs = f"virtual lights would cost {cost - 1:.2g} times as much as the paths"
+        return without_lights(f"{costs} and leave {left_over:.0%} of the noise")
     return replace(best, reason=f"virtual lights take {1 - left_over:.0%} of the noise away")
+
+
+def price(evidence: Evidence, option: Option) -> float:
+    """Variance × cost with the lights of an option."""
+    return _priced(evidence, option)[0]
+
+
+def may_pay(evidence: Evidence, option: Option, others: list[Option]) -> bool:
+    """Whether lights of an option seem to pay, and more than those of all ``others``."""
+    least = _PAYS_BELOW * evidence.noise(evidence.radiance)
+    return price(evidence, option) <= min([least, *(price(evidence, other) for other in others)])
 
 
 def _priced(evidence: Evidence, option: Option) -> tuple[float, float, Balance]:

@@ -43,9 +43,8 @@ class Lines:
 
 @dataclass
 class Boxes:
-    """``number`` of the cell of each, sorted; ``level`` of it; ``low``, ``size``: (n, 3), world units; ``turn``: (n,
-    3),
-    M; ``chance``: (n,) of being chosen."""
+    """``number`` of the cell of each, sorted; ``level`` of it; ``low``, ``size``: (n, 3), world units; ``turn``:
+    (n, 3), M; ``chance``: (n,) of being chosen."""
 
     number: np.ndarray
     level: np.ndarray

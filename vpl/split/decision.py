@@ -1,21 +1,32 @@
 """Decision: what a view is followed with, from a pilot of some ten thousand of its paths.
 
-The pilot's paths are followed a second time where emitters were learned from them, and once more with lights on
-surfaces where these seem to pay; where lights may stand for emitters, with these alone, and with both kinds where that
-seems to pay.  They are always the same paths, and nothing depends on the clock: the same seed decides the same.
+The pilot's paths are followed a second time where emitters were learned from them; where lights may stand for emitters,
+with these alone; and with lights on surfaces, by themselves or beside those, where either seems to be best.  They are
+always the same paths, and nothing depends on the clock: the same seed decides the same.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import upload
 from ..core.sampling import derived_seed
-from ..lights.light_set import LightSet
-from .balance import Balance, Evidence, Option, balance, importance, judged_by, noise, without_lights
+from .balance import (
+    Balance,
+    Evidence,
+    Option,
+    balance,
+    importance,
+    judged_by,
+    may_pay,
+    noise,
+    price,
+    without_lights,
+)
 from .irradiance import learn_emitters
 from .paths import AT_FIRST
 from .pilot import Pilot
@@ -122,24 +133,28 @@ def _evidence(view: View, pilot: Pilot) -> Evidence:
 
 
 def _options(view: View, pilot: Pilot, evidence: Evidence) -> list[Option]:
-    """Lights that may pay, with what the pilot's paths find besides."""
-    options = _with_surfaces(view, evidence, pilot, None)
+    """Lights that may pay, with what the pilot's paths find besides where that may matter."""
+    options, assumed, emitters = [], _with_surfaces(view, pilot, False), None
     if evidence.emitters:
         emitters = view.emitter_lights([])
         left = _followed(view, ViewLights(emitters=emitters))
         options.append(Option(False, True, left.radiance, left.indirect))
-        options += _with_surfaces(view, evidence, left, emitters)
+        assumed += _with_surfaces(view, left, True)
+    # Following can only make an option worse: so the most promising goes first, and another is followed only if it
+    # still promises more
+    for option in sorted(assumed, key=partial(price, evidence)):
+        if may_pay(evidence, option, options):
+            # Their distance from each other is not known yet, and with it c: with 0, they carry all that they can
+            surfaces = spaced_lights([], 0.0, view.rules.max_depth)
+            left = _followed(view, ViewLights(surfaces, emitters if option.emitters else None))
+            option = replace(option, left=left.radiance)
+        options.append(option)
     return options
 
 
-def _with_surfaces(view: View, evidence: Evidence, traced: Pilot, emitters: LightSet | None) -> list[Option]:
-    """Options, one at most, of lights on surfaces beside those that stand for ``emitters``; ``traced``: the pilot
-    without those on surfaces."""
+def _with_surfaces(view: View, traced: Pilot, emitters: bool) -> list[Option]:
+    """Options, one at most, of lights on surfaces beside those that stand for ``emitters``, or without these;
+    ``traced``: the pilot without those on surfaces."""
     if view.rules.max_depth <= 2 or not traced.indirect.any():
         return []
-    option = Option(True, emitters is not None, traced.radiance, traced.indirect)
-    if not balance(evidence, [option]).gathers:
-        return [option]
-    # Their distance from each other is not known yet, and with it c: with 0, they carry all that they can
-    lights = ViewLights(spaced_lights([], 0.0, view.rules.max_depth), emitters)
-    return [replace(option, left=_followed(view, lights).radiance)]
+    return [Option(True, emitters, traced.radiance, traced.indirect)]

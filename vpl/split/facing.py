@@ -11,8 +11,10 @@ WAYS = 6
 
 def facing(normal: np.ndarray) -> np.ndarray:
     """The way that normals (n, 3) face: 0 to 5."""
-    axis = np.abs(normal).argmax(1)
-    return 2 * axis + (normal[np.arange(len(normal)), axis] < 0)
+    x, y, z = np.abs(normal).T
+    is_x, is_y = (x >= y) & (x >= z), y >= z
+    below = np.where(is_x, normal[:, 0], np.where(is_y, normal[:, 1], normal[:, 2])) < 0
+    return np.where(is_x, 0, np.where(is_y, 2, 4)) + below
 
 
 def facing_of(normal):

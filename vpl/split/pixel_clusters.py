@@ -66,22 +66,24 @@ class PixelClusters:
 
     def __init__(self, lit: LitVertices, samples: int):
         vertices, rays, alone = lit.vertices, lit.rays, lit.alone
-        position, normal = download(vertices.position), download(vertices.normal)
+        # Components apart, (3, n), in which NumPy is several times faster
+        position, normal = (np.stack([download(x) for x in vector]) for vector in (vertices.position, vertices.normal))
         pixel = download(rays).astype(np.int64) // samples
-        key = pixel * WAYS + facing(normal)
+        key = pixel * WAYS + facing(normal.T)
         key[len(key) - alone :] = (pixel.max() + 1) * WAYS + np.arange(alone)
         order = np.argsort(key, kind="stable")
-        position, normal, key = position[order], normal[order], key[order]
+        position, normal, key = position.take(order, 1), normal.take(order, 1), key[order]
         first = np.flatnonzero(np.diff(key, prepend=-1))
-        low, high = np.minimum.reduceat(position, first), np.maximum.reduceat(position, first)
-        axis = np.add.reduceat(normal, first)
-        axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-20)[:, None]
+        low, high = np.minimum.reduceat(position, first, 1), np.maximum.reduceat(position, first, 1)
+        axis = np.add.reduceat(normal, first, 1)
+        axis /= np.maximum(np.linalg.norm(axis, axis=0), 1e-20)
         size = np.diff(first, append=len(key))
         self.cluster = np.repeat(np.arange(len(first)), size)
-        cosine = np.minimum.reduceat((normal * axis[self.cluster]).sum(1), first)
+        cosine = np.minimum.reduceat((normal * axis.take(self.cluster, 1)).sum(0), first)
         self.pixel = pixel[order[first]]
         # Rounded down, so that every normal is inside
-        self.receivers = Receivers.of(0.5 * (low + high), 0.5 * (high - low), axis, np.maximum(cosine - 2e-6, -1))
+        box = 0.5 * (low + high), 0.5 * (high - low), axis
+        self.receivers = Receivers.of(*(x.T for x in box), np.maximum(cosine - 2e-6, -1))
         self.first, self.size = upload(mi.UInt32, first), upload(mi.UInt32, size)
         along = upload(mi.UInt32, order)
         self.ray, self._weight = (

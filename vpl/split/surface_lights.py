@@ -120,7 +120,7 @@ def _meet(scene, lines, first, find: bool, starts, line):
     dr.make_opaque(first, starts, line)
     place, remaining, number = mi.Point3f(origin), mi.Float(length), dr.zeros(mi.UInt32, dr.width(length))
     this, active = dr.arange(mi.UInt32, dr.width(length)), length > 0
-    while dr.hint(active, exclude=[scene, origin, direction, length, first, find, this]):
+    while dr.hint(active, exclude=[scene, origin, direction, length, first, find, this, starts, line]):
         ray = mi.Ray3f(place, direction, remaining, 0.0, [])
         si = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=active)
         active &= si.is_valid()
