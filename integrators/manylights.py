@@ -34,8 +34,8 @@ from .gathering import Clock, GatheringIntegrator, add_statistics
 from .knobs import Boolean
 from .manual import manual_page
 
-# Camera rays that are followed at a time, about: half of them, but so many at least and at most. Memory that is new to a
-# process takes long to fill, which is felt in small images, and kernels are recorded anew each time
+# Camera rays that are followed at a time, about: half of them, but so many at least and at most. Memory that is new to
+# a process takes long to fill, which is felt in small images, and kernels are recorded anew each time
 _WAVEFRONT = 1 << 19, 1 << 20
 # Pixels darker than this share of the image's mean are lit as precisely as if they had it
 _DARK_FLOOR = 0.1
