@@ -13,6 +13,7 @@ import numpy as np
 
 from vpl.core.arrays import add_at, download, usable
 from vpl.core.exclusive import exclusive
+from vpl.core.shared_code import share_code
 from vpl.core.stages import Stage, tell
 from vpl.lights.emitters import Emitters, read_emitters
 from vpl.points.camera_paths import CameraPaths, PixelGrid, SceneTraits, follow_camera_rays, refuse_media, scene_traits
@@ -160,6 +161,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
                         "the camera is inside a participating medium; many-light integrators support surfaces only"
                     )
                 refuse_media(scene)
+                share_code(scene)
                 return self._sample(scene, sampler, mi.Ray3f(ray), active)
             except Exception as error:
                 # Out of `mi.render` comes another one, which only says that something went wrong

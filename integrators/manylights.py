@@ -20,7 +20,7 @@ from vpl.split.decision import Decision
 from vpl.split.gather_vertices import LitVertices
 from vpl.split.kept_lights import KeptLights, TreedLights
 from vpl.split.next_event import emitters_of
-from vpl.split.paths import Rules
+from vpl.split.paths import Limits, Rules
 from vpl.split.pilot import Arrivals
 from vpl.split.pixel_clusters import PixelClusters, light_clusters
 from vpl.split.site_choice import learning_rays
@@ -36,7 +36,7 @@ from .manual import manual_page
 
 # Camera rays that are followed at a time, about: half of them, but so many at least and at most. Memory that is new to
 # a process takes long to fill, which is felt in small images, and kernels are recorded anew each time
-_WAVEFRONT = 1 << 19, 1 << 20
+_WAVEFRONT = 1 << 18, 1 << 20
 # Pixels darker than this share of the image's mean are lit as precisely as if they had it
 _DARK_FLOOR = 0.1
 # Nodes of the cut of a cluster, at most
@@ -175,14 +175,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
                 break
             lane = dr.arange(mi.UInt32, min(most, view.count - first)) + dr.opaque(mi.UInt32, first)
             dr.eval(lane)
-            clock.begin(Stage.TRACED)
-            found, vertices, later, _ = view.follow(lane, limits, 4, first)
-            if lights.all:
-                nearby = expected[first // view.samples :][: -(-len(lane) // view.samples)]
-                seed = derived_seed(view.seed, 5, first)
-                found.radiance += self._gather(view, lights, chosen, (vertices, later), found, nearby, seed, clock)
-            dr.scatter(radiance, found.radiance, lane)
-            dr.scatter(valid, found.valid, lane)
+            part, opaque = self._part(view, lane, first, limits, lights, chosen, expected, clock)
+            dr.scatter(radiance, part, lane)
+            dr.scatter(valid, opaque, lane)
             dr.eval(radiance, valid)
         clock.stop()
         if view.scene.environment() is not None and not self.hide_emitters:
@@ -193,6 +188,22 @@ class ManyLightsIntegrator(GatheringIntegrator):
             mi.Log(mi.LogLevel.Warn, f"{dropped} sample(s) with values that are not finite were dropped.")
         self.statistics |= {"balance": chosen.reason, "dropped": dropped, "seconds": clock.seconds}
         return dr.select(finite & (self.max_depth > 0), radiance, 0), valid & (self.max_depth > 0)
+
+    def _part(self, view: View, lane, first: int, limits: Limits, lights: ViewLights, chosen: Balance, expected, clock):
+        """(Radiance of the camera rays ``lane``, of whole pixels and from ``first`` on, whether each is opaque in the
+        film's alpha)."""
+        clock.begin(Stage.TRACED)
+        found, *vertices, _ = view.follow(lane, limits, 4, first)
+        radiance, valid = found.radiance, found.valid
+        if not lights.all:
+            return radiance, valid
+        clock.begin(Stage.CLUSTERS)
+        seed = derived_seed(view.seed, 5, first)
+        points = LitVertices.of(*vertices, view.samples, chosen.vertices, derived_seed(seed, 0))
+        # Memory for the cuts
+        del found, vertices, _
+        nearby = expected[first // view.samples :][: -(-len(lane) // view.samples)]
+        return radiance + self._gather(view, lights, chosen, points, radiance, nearby, seed, clock), valid
 
     def _lights(self, view: View, arrivals: Arrivals, chosen: Balance, clock: Clock) -> ViewLights:
         """Virtual lights and their trees."""
@@ -231,22 +242,20 @@ class ManyLightsIntegrator(GatheringIntegrator):
         clock.begin(Stage.TREE)
         return TreedLights(made, ScatteredGroup.of(made.lights, derived_seed(view.seed, 3)))
 
-    def _gather(self, view, lights, chosen, vertices, found, expected, seed, clock):
-        """Light of virtual lights at the vertices of some pixels, per camera ray.
+    def _gather(self, view, lights, chosen, points: LitVertices, found, expected, seed, clock):
+        """Light of virtual lights at the ``points`` of some pixels, per camera ray.
 
         ``expected``: light that lights should bring to each pixel, by which errors are judged together with what its
-        paths found.
+        paths ``found``.
         """
-        clock.begin(Stage.CLUSTERS)
-        samples, count = view.samples, dr.width(found.radiance)
+        samples, count = view.samples, dr.width(found)
         lit = dr.zeros(mi.UnpolarizedSpectrum, count)
         dr.eval(lit)
-        points = LitVertices.of(*vertices, samples, chosen.vertices, derived_seed(seed, 0))
         if points.count == 0:
             return lit
         clusters = PixelClusters(points, samples)
         clock.begin(Stage.CUTS)
-        traced = np.nan_to_num(download(channel_mean(found.radiance)), posinf=0, neginf=0)
+        traced = np.nan_to_num(download(channel_mean(found)), posinf=0, neginf=0)
         level = np.maximum(traced, 0).reshape(-1, samples).mean(1) + expected
         level = np.maximum(level, _DARK_FLOOR * level.mean())
         # What a pair may add to what the vertices of a pixel bring together

@@ -5,6 +5,7 @@
 - ``sampling``: seeds derived from seeds, samplers of any width, rows chosen by weight (``Choice``, ``RowChoice``,
   ``find_interval``), evenly spread samples (``SpreadSamples``)
 - ``loops``: long loops of kernels, recorded once
+- ``shared_code``: shapes that differ in numbers alone are compiled once
 - ``garbage``: blocks that Python's cyclic collector does not disturb
 - ``morton``: codes and orders along a Morton curve
 - ``cones``: axes of cones around directions, and how their cosines are rounded

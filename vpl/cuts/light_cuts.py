@@ -135,17 +135,16 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
         return threshold, sizes, visits
     index = upload(mi.UInt32, rows)
     part = batch.select(index)
-    spent, fitting = dr.zeros(mi.UInt32, len(rows)), [dr.zeros(mi.UInt32, len(rows)) for _ in sizes.count]
+    # In NumPy: they are few, and as kernels they would take longer to compile than to compute
+    spent, fitting = np.zeros(len(rows), np.uint32), [np.zeros(len(rows), np.uint32) for _ in sizes.count]
 
     def too_large(values):
         """Mask of the cuts that are too large at these thresholds; keeps the sizes of those that are not."""
         nonlocal spent, fitting
         found = cut_sizes(lights, part, upload_thresholds(values), max_cut)
         over = found.total() > max_cut
-        kept = upload(mi.UInt32, ~over) == 1
-        fitting = [dr.select(kept, new, old) for new, old in zip(found.count, fitting, strict=True)]
-        spent += sum(found.visits)
-        dr.eval(spent, fitting)
+        fitting = [np.where(over, old, download(new)) for new, old in zip(found.count, fitting, strict=True)]
+        spent = spent + sum(map(download, found.visits))
         return over
 
     low = np.maximum(download(dr.gather(mi.Float, threshold, index)).astype(np.float64), np.finfo(np.float32).tiny)
@@ -161,8 +160,8 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
     threshold = mi.Float(threshold)
     dr.scatter(threshold, upload_thresholds(high), index)
     for target, count in zip(sizes.count, fitting, strict=True):
-        dr.scatter(target, count, index)
-    add_at(visits, spent, index)
+        dr.scatter(target, upload(mi.UInt32, count), index)
+    add_at(visits, upload(mi.UInt32, spent), index)
     dr.eval(threshold, sizes.count, visits)
     return threshold, sizes, visits
 

@@ -269,6 +269,8 @@ def area_lights(emitters: Emitters, count: int, seed: int, weight: np.ndarray | 
     intensity = spectrum_to_rgb(area.emitted_in_front(row, ps)) / (ps.pdf * choice.probability(row))
     # Divided on the device, where the number of lights is part of no kernel
     intensity /= dr.opaque(mi.Float, float(count))
+    # By one kernel, which holds the code of all shapes
+    dr.eval(ps.p, ps.n, intensity)
     return VirtualLights.of("oriented", download(ps.p), download(ps.n), download(intensity))
 
 

@@ -118,9 +118,9 @@ def drawn_later(first: GatherVertices, later: GatherVertices, samples: int, most
 
     Systematic sampling along each pixel, from a random start.  ``samples``: camera rays of a pixel, side by side.
     """
-    of_first, of_later = (
-        np.nan_to_num(download(channel_mean(dr.abs(x.weight))).astype(np.float64), posinf=0) for x in (first, later)
-    )
+    levels = [channel_mean(dr.abs(x.weight)) for x in (first, later)]
+    dr.eval(levels)
+    of_first, of_later = (np.nan_to_num(download(x).astype(np.float64), posinf=0) for x in levels)
     pixels = np.arange(0, len(of_first), samples)
     sums = np.add.reduceat(of_later, pixels)
     step = (sums + np.add.reduceat(of_first, pixels)) / most

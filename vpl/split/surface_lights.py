@@ -90,6 +90,7 @@ def _lights_along(scene, emission, lines: Lines, limits: Limits, seed: int) -> V
         return VirtualLights.of("surface", [], [], [])
     irradiance, length = _irradiance(scene, emission, places, limits, seed)
     columns = (places.position, places.normal, spectrum_to_rgb(floor * irradiance), length)
+    dr.eval(columns)
     lights = VirtualLights.of("surface", *(download(column) for column in columns))
     lights.facing = download(places.facing)
     return lights.without_bad()[0]
