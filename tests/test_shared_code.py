@@ -28,7 +28,8 @@ def scene_of():
 def placed(k):
     """Where lamp ``k`` hangs below the ceiling of the box."""
     transform = mi.ScalarTransform4f()
-    return transform.translate([0.2 * k - 1, 0, 0.9]) @ transform.rotate([1, 0.1 * k, 0], 180) @ transform.scale(0.1 + k)
+    place, turn = transform.translate([0.2 * k - 1, 0, 0.9]), transform.rotate([1, 0.1 * k, 0], 180)
+    return place @ turn @ transform.scale(0.1 + k)
 
 
 def lamp(scene, k=0):
