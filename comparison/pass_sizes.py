@@ -1,5 +1,8 @@
 """How many samples per pixel the next pass of a render has: passes of about two seconds, whatever they cost.
 
+Passes that are rendered in parts, and so can be stopped in between, are longer where they cost much to start: so long
+that starting one is a quarter of it, but ten seconds at most.
+
 Sizes are powers of two, from 4 on if a pixel allows it: Mitsuba compiles one kernel for all of these, and others for
 numbers between and, with some filters of the film, for fewer. The first pass is small, since nothing is known; each
 later one is as large as the one before, or larger by a factor that the time of that one allows. As the first pass of a
@@ -12,23 +15,28 @@ import math
 from .rendering import largest_pass
 
 PASS_SECONDS = 2.0
-LONGEST = 2.0  # times that: only longer passes are made smaller
+START_SHARE, MOST_SECONDS = 0.25, 10.0  # of a pass in parts: share of its time that starts it; all of it, at most
+LONGEST = 2.0  # times as much: only longer passes are made smaller
+MOST_GROWTH = 4  # from one size to the next, where it is not safe
 USUAL = 4  # samples per pixel from which on all powers of two have the same kernels
 FIRST_SAMPLES = 2**19  # pixel samples that a first pass may have, unless one per pixel is more
 LEAST_SHARE = 0.1  # of a pass's time that is taken to depend on its samples, at least
 PARTS = 8  # where an error is asked for: no pass has more than this part of the samples that there are
+MORE_IN_PARTS = 4  # times as many pixel samples may a pass have that is rendered in parts
 
 
 class PassSizes:
     """Sizes of the passes of an image of `pixels` pixels, until `spp` samples per pixel or `time` seconds are used up;
     either may be None. `fixed`, if given, is the size of all passes but the last. `many` asks for at least eight passes
-    of similar sizes, so that an error can be estimated from them."""
+    of similar sizes, so that an error can be estimated from them. `in_parts`: whether passes are rendered in
+    parts."""
 
-    def __init__(self, pixels, spp=None, time=None, fixed=None, many=False):
-        self._spp, self._time, self._fixed, self._many = spp, time, fixed, many
-        self._largest = _power_of_two(largest_pass(pixels))
+    def __init__(self, pixels, spp=None, time=None, fixed=None, many=False, in_parts=False):
+        self._spp, self._time, self._fixed, self._many, self._in_parts = spp, time, fixed, many, in_parts
+        self._largest = _power_of_two(largest_pass(pixels, MORE_IN_PARTS if in_parts else 1))
         self._least = USUAL if USUAL * pixels <= FIRST_SAMPLES else 1
         self._current, self._seconds, self._asked = fixed or self._least, {}, None
+        self._known = {}  # of these, by size, those in which nothing is compiled any more
 
     def next(self, passes, elapsed):
         """Return the samples per pixel of the pass that follows `passes` (list of `Pass`) after `elapsed` seconds, or
@@ -42,8 +50,7 @@ class PassSizes:
         if self._spp is not None:
             if done >= self._spp:
                 return "spp"
-            left = self._spp - done
-            size = min(size, left if self._fixed or left < USUAL else _power_of_two(left))
+            size = self._of_the_rest(size, self._spp - done)
         if self._time is not None and passes:
             size = self._in_time(size, self._time - elapsed)
             if size == 0:
@@ -51,23 +58,41 @@ class PassSizes:
         self._asked = size
         return size
 
+    def _of_the_rest(self, size, left):
+        """Return the size of the next pass, of about `size` samples, where `left` are missing."""
+        if self._in_parts and not self._fixed and size < left < min(2 * size, self._largest + 1):
+            return left  # to start another pass takes longer than to compile kernels for another size
+        return min(size, left if self._fixed or self._in_parts or left < USUAL else _power_of_two(left))
+
     def _learn(self, seconds, done):
         """Take note of what the last pass took, and choose the usual size of those to come."""
         repeated = self._asked in self._seconds
-        # The first of a size may have compiled its kernels.
+        # The first of a size may have compiled its kernels
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
+        if repeated or len(self._seconds) > 1:
+            self._known[self._asked] = self._seconds[self._asked]
         if self._fixed or self._asked != self._current:
             return
-        if repeated and seconds > LONGEST * PASS_SECONDS:
-            self._current = max(1, _power_of_two(self._current * PASS_SECONDS / seconds))
+        wanted, line = self._wanted(), self._in_parts and self._line()
+        if repeated and seconds > LONGEST * wanted:
+            self._current = max(1, _power_of_two(self._current * wanted / seconds))
             return
-        grown = _power_of_two(max(1, self._current * PASS_SECONDS / max(seconds, 1e-6)))
-        if repeated and seconds < PASS_SECONDS:
-            # Where starting a pass is most of it, its time would never let it grow
-            grown = max(grown, (4 if seconds < PASS_SECONDS / 2 else 2) * self._current)
+        grown = self._grown(seconds, wanted, repeated, line)
         grown = min(grown, self._largest, _power_of_two(max(1, done / PARTS)) if self._many else self._largest)
-        if grown > self._current and grown >= min(USUAL, self._largest):
+        if grown > self._current and (self._in_parts or grown >= min(USUAL, self._largest)):
             self._current = grown
+
+    def _grown(self, seconds, wanted, repeated, line):
+        """Return the size of a pass that may take `wanted` seconds, when one of the current size took `seconds`."""
+        if line:
+            start, each = line
+            return min(_power_of_two((wanted - start) / each), MOST_GROWTH * self._current)
+        grown = _power_of_two(self._current * wanted / max(seconds, 1e-6))
+        if repeated and seconds < wanted:
+            # Where starting a pass is most of it, its time would never let it grow
+            times = MOST_GROWTH if seconds < wanted / 2 and not self._in_parts else 2
+            grown = max(grown, times * self._current)
+        return grown
 
     def _in_time(self, size, left):
         """Return the largest size up to `size` that the seconds `left` are enough for, or the least one where they are
@@ -77,18 +102,37 @@ class PassSizes:
             size = max(least, size // 2)
         return size if self._expected(size) <= 2 * left else 0
 
+    def _wanted(self):
+        """Return the seconds that a pass is to take."""
+        if not self._in_parts:
+            return PASS_SECONDS
+        # All of it may start the pass, as long as that is not known
+        start, _ = self._line() or (self._seconds[self._asked], 0.0)
+        return min(max(start / START_SHARE, PASS_SECONDS), MOST_SECONDS)
+
     def _expected(self, size):
-        """Return the seconds that a pass will take: those that one of this size took, or by a line through the smallest
-        and the largest that there were."""
+        """Return the seconds that a pass will take: those that one of this size took, or by a line, or, where that is
+        not known, as if nothing of it started the pass."""
         if size in self._seconds:
             return self._seconds[size]
-        small, large = min(self._seconds), max(self._seconds)
-        longest = self._seconds[large]
-        each = longest / large
-        if small < large:
-            slope = (longest - self._seconds[small]) / (large - small)
-            each = min(max(slope, LEAST_SHARE * each), each)
-        return longest + each * (size - large)
+        line = self._line()
+        if not line:
+            large, longest = max((self._known or self._seconds).items())
+            line = 0.0, longest / large
+        start, each = line
+        return start + each * size
+
+    def _line(self):
+        """Return the seconds that it takes to start a pass, and those of each sample per pixel, by the largest size and
+        the least that is not far from it; None where it is not known."""
+        large = max(self._known, default=0)
+        small = min((size for size in self._known if MOST_GROWTH * size >= large), default=0)
+        if small == large:
+            return None
+        longest = self._known[large]
+        each = (longest - self._known[small]) / (large - small)
+        each = min(max(each, LEAST_SHARE * longest / large), longest / large)
+        return longest - each * large, each
 
 
 def _power_of_two(number):

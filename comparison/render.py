@@ -67,8 +67,8 @@ def render(
     pass_spp: int | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> tuple[mi.TensorXf, Took]:
-    """Render a scene in passes of about two seconds; return the image, a `mi.TensorXf` of shape (height, width,
-    channels) as of `mi.render`, and what it took (`Took`).
+    """Render a scene in passes of about two seconds, of up to ten with `manylights`; return the image, a `mi.TensorXf`
+    of shape (height, width, channels) as of `mi.render`, and what it took (`Took`).
 
     `integrator`: a `mi.Integrator` or the name of one, by default the scene's; `sensor`: its index, or "all" for a list
     of what is returned for each sensor, one after the other. The render ends as soon as one of these is reached, of
@@ -77,7 +77,7 @@ def render(
     `seed`: of the first pass; the others have hashes of it. `denoise`: return the denoised image, see denoising.py.
     `progress`: called after each pass with what it took so far and the image so far, and, by the integrators of this
     project, whenever a stage of a pass begins, with None for an image; if it returns False, no other pass begins, and
-    what it raises ends the render at once. `pass_spp`: samples per pixel of a pass, instead of two seconds.
+    what it raises ends the render at once. `pass_spp`: samples per pixel of a pass, instead of some seconds.
     `checkpoint`: a `checkpoint.Checkpoint` that the render of one sensor goes on from, counting its samples and
     seconds; it is kept for another one to go on from, unless this one ends by what was asked for.
 
@@ -106,7 +106,9 @@ def render(
     denoiser = Denoiser(scene, sensor, seed) if denoise else None
     progressive = Progressive(scene, seed, sensor, integrator)
     reserved = denoiser.filter_seconds if denoiser else 0.0
-    sizes = PassSizes(progressive.pixels, spp, time and time - reserved, pass_spp, many=error is not None)
+    sizes = PassSizes(
+        progressive.pixels, spp, time and time - reserved, pass_spp, error is not None, progressive.in_parts
+    )
     ending = Ending(spp, time and time - reserved, error, reserved)
     if checkpoint:
         begin -= checkpoint.restore(progressive)

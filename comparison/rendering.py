@@ -30,9 +30,10 @@ def pass_sizes(spp, pixels, pass_spp=None):
     return [size] * full + ([rest] if rest else [])
 
 
-def largest_pass(pixels):
-    """Return how many samples per pixel, at least one, make up to `MAXIMUM_PASS_SAMPLES` samples in all pixels."""
-    return max(1, MAXIMUM_PASS_SAMPLES // pixels)
+def largest_pass(pixels, times=1):
+    """Return how many samples per pixel, at least one, make up to `MAXIMUM_PASS_SAMPLES` samples in all pixels, or
+    `times` as many."""
+    return max(1, times * MAXIMUM_PASS_SAMPLES // pixels)
 
 
 @dataclass
@@ -141,6 +142,11 @@ class Progressive(Passes):
     def is_late(self):
         """Was there no time for a pass? It is not for this one to know."""
         return False
+
+    @property
+    def in_parts(self):
+        """Is a pass rendered in parts, between which it can be stopped, and of which memory holds one at a time?"""
+        return getattr(self.integrator, "renders_in_parts", False)
 
     @property
     def pixels(self):

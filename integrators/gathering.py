@@ -111,6 +111,8 @@ class GatheringIntegrator(mi.SamplingIntegrator):
 
     aovs: tuple[str, ...] = ()  # channels that are asked for, where derived classes have a knob of that name
     along_curve = True  # whether gather points are sorted by their place
+    # Whether images are rendered part by part, stop in between, and take little more memory for more samples
+    renders_in_parts = False
     knobs = PATH_KNOBS
 
     def __init__(self, props):

@@ -130,6 +130,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
         ),
     )  # fmt: skip
 
+    renders_in_parts = True
+
     def __init__(self, props):
         super().__init__(props)
         self._kept = KeptLights()

@@ -10,9 +10,9 @@ from comparison.rendering import MAXIMUM_PASS_SAMPLES, Pass
 SQUARE = 256 * 256
 
 
-def render(pixels, start, each, compilation=3.0, **limits):
-    """Passes that take `start` seconds and `each` per sample, and once for each kernel `compilation`: (passes, why the
-    render ended)."""
+def render(pixels, start, each, compilation=3.0, more=None, **limits):
+    """Passes that take `start` seconds and `each` per sample, and once for each kernel `compilation`, or `more` but for
+    the first: (passes, why the render ended)."""
     sizes, passes, elapsed, kernels = PassSizes(pixels, **limits), [], 0.0, set()
     while len(passes) < 2000:
         spp = sizes.next(passes, elapsed)
@@ -20,6 +20,7 @@ def render(pixels, start, each, compilation=3.0, **limits):
             return passes, spp
         kernel = spp if spp < 4 or spp & (spp - 1) else "usual"
         seconds = start + each * spp + (0 if kernel in kernels else compilation)
+        compilation = compilation if more is None else more
         kernels.add(kernel)
         passes.append(Pass(0, spp, seconds))
         elapsed += seconds
@@ -57,10 +58,52 @@ def test_large_images_begin_with_one_sample():
     assert [one.spp for one in passes] == [1, 4, 4, 4, 4, 3]
 
 
+@pytest.mark.parametrize("start", [0.7, 1.4, 2.4])
+@pytest.mark.parametrize("each", [0.01, 0.2, 1.0])
+def test_in_parts_a_quarter_of_a_pass_starts_it(start, each):
+    passes, _ = render(SQUARE // 16, start, each, time=200, more=0.1, in_parts=True)
+    usual, count = Counter(one.spp for one in passes).most_common(1)[0]
+    assert count > 0.5 * len(passes)
+    # Sizes are powers of two
+    assert 0.12 < start / (start + each * usual) < 0.4 or usual * SQUARE // 16 == 4 * MAXIMUM_PASS_SAMPLES
+    assert max(one.seconds for one in passes) < 1.5 * 10
+
+
+@pytest.mark.parametrize("each", [0.02, 0.3])
+def test_in_parts_passes_that_cost_nothing_to_start_are_no_longer(each):
+    passes, _ = render(SQUARE // 16, 0.0, each, time=120, more=0.1, in_parts=True)
+    assert passes[-2].seconds <= 1.5 * PASS_SECONDS
+    assert sum(one.seconds > 2 * PASS_SECONDS for one in passes) <= 3
+
+
+def test_in_parts_large_images_are_not_left_with_one_sample():
+    passes, _ = render(1 << 20, 2.4, 0.9, time=60, more=0.1, in_parts=True)
+    assert {one.spp for one in passes[3:-1]} <= {4, 8}
+    passes, _ = render(1 << 20, 6.0, 1.5, time=60, more=0.1, in_parts=True)
+    assert {one.spp for one in passes[3:-1]} <= {2, 4}
+
+
+@pytest.mark.parametrize("spp", [*range(1, 20), 64, 100, 1023])
+def test_in_parts_samples_are_those_that_were_asked_for_and_no_small_pass_ends_them(spp):
+    passes, ended_by = render(SQUARE // 2, 0.7, 0.05, spp=spp, more=0.1, in_parts=True)
+    assert sum(one.spp for one in passes) == spp and ended_by == "spp"
+    assert passes[-1].spp >= passes[-2].spp / 2 if len(passes) > 1 else passes[-1].spp < 8
+    assert max(one.spp for one in passes) <= 4 * MAXIMUM_PASS_SAMPLES // (SQUARE // 2)
+
+
+def test_in_parts_an_error_still_has_many_passes():
+    passes, done = render(SQUARE, 2.0, 0.01, time=300, many=True, more=0.1, in_parts=True)[0], 0
+    for one in passes:
+        assert one.spp <= max(4, done / 8)
+        done += one.spp
+
+
+@pytest.mark.parametrize("start", [0.05, 1.0])
 @pytest.mark.parametrize("each", [0.002, 0.1, 0.4])
 @pytest.mark.parametrize("time", [5, 11, 60])
-def test_time_is_used_and_not_exceeded_by_much(each, time):
-    passes, ended_by = render(SQUARE // 4, 0.05, each, time=time)
+@pytest.mark.parametrize("in_parts", [False, True])
+def test_time_is_used_and_not_exceeded_by_much(start, each, time, in_parts):
+    passes, ended_by = render(SQUARE // 4, start, each, time=time, more=0.1, in_parts=in_parts)
     assert ended_by == "time"
     least = min(one.seconds for one in passes)
     assert abs(sum(one.seconds for one in passes) - time) <= least + 0.1

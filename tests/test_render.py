@@ -43,6 +43,11 @@ def test_the_image_is_the_average_of_its_passes(scene):
     assert took.error > 0
 
 
+def test_passes_of_manylights_are_rendered_in_parts(scene):
+    plugins = (mi.load_dict({"type": name}) for name in ("manylights", "lightcuts", "path"))
+    assert [rendering.Progressive(scene, 0, integrator=plugin).in_parts for plugin in plugins] == [True, False, False]
+
+
 def test_passes_of_integrators_that_clone_the_sampler_have_the_samples_that_were_asked_for(scene):
     image, took = manylights.render(scene, "prb", spp=5, pass_spp=4, seed=3)
     assert (took.spp, took.passes) == (5, 2)

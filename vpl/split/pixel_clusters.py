@@ -127,7 +127,8 @@ def light_clusters(transport: Transport, clusters: PixelClusters, allowed: np.nd
 
     ``allowed``: per cluster, by how much a pair may add to what the vertices of its pixel contribute together.
     """
-    allowed = allowed / np.maximum(clusters.weight, np.finfo(np.float64).tiny)
+    with np.errstate(over="ignore"):  # of a cluster without weight, anything is allowed
+        allowed = allowed / np.maximum(clusters.weight, np.finfo(np.float64).tiny)
     threshold, sizes, _ = limited_cuts(transport.lights, clusters.receivers, upload_thresholds(allowed), max_cut)
     rays = 0
     for number, chunk in enumerate(collect_cuts(transport.lights, clusters.receivers, threshold, sizes)):
