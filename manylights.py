@@ -9,11 +9,11 @@ Unless one is chosen, the integrator is `manylights`, in place of the scene's wh
 participating medium. `-i scene` keeps the scene's integrator in any case.
 
 An image ends by itself: with --spp samples per pixel, after --time seconds, or when the relative standard error of 95%
-of the pixels is below --error, whichever comes first. It is rendered in passes of about two seconds, or of up to ten
-where starting one takes long, whose average is written at the end, every ten seconds, and after Ctrl-C. The first pass
-has the seed that was given, pass k a hash of that and k; see comparison/rendering.py. An EXR file gets all channels,
-and how it was made as metadata; a PNG file is tone-mapped. With --denoise an EXR file FILE.exr gets a denoised one,
-FILE.denoised.exr, beside it; a PNG file shows the denoised image.
+of the pixels is below --error, whichever comes first. It is rendered in passes of about two seconds, or of about ten
+where starting one takes long, whose average is written at the end, about every ten seconds, and after Ctrl-C. The first
+pass has the seed that was given, pass k a hash of that and k; see comparison/rendering.py. An EXR file gets all
+channels, and how it was made as metadata; a PNG file is tone-mapped. With --denoise an EXR file FILE.exr gets a
+denoised one, FILE.denoised.exr, beside it; a PNG file shows the denoised image.
 
 With --workers passes are rendered by several processes or machines, see docs/cluster.md. Several scenes, --frames with
 {frame} in the values of -D, and --sensor all make many images, one after the other; what fails is told, the others are

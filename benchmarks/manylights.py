@@ -13,6 +13,8 @@ Parts, each with both integrators in turn in one run, and with the better of the
   much the mean of the image differs from pass to pass, each with lights of its own.
 - ``denoised``: error of one pass through Open Image Denoise against the reference, its noise taken off; the time of
   `path` for the same error, from passes of growing size.
+- ``timed``: the same of images that `manylights.render` ends after so many ``--seconds``, first passes included, with
+  the sampler `independent`, in as many ``--passes`` with seeds of their own.
 - ``lights``: variance × time of `manylights` with fewer and more light paths than it chooses.
 - ``cold``: seconds of the first render, 16 samples a pixel, with an empty kernel cache, and peak memory, whole process.
 """
@@ -40,11 +42,12 @@ mi.set_variant("llvm_ad_rgb")
 import integrators  # noqa: E402, F401
 from benchmarks import scenes  # noqa: E402
 from benchmarks.views import move_cameras  # noqa: E402
+from comparison.render import render  # noqa: E402
 from vpl.split import balance, decision  # noqa: E402
 
 NAMES = (*scenes.NAMES, "classroom", "hall")
 KINDS, SAMPLERS = ("path", "manylights"), ("independent", "multijitter")
-PARTS = ("product", "denoised", "lights", "cold")
+PARTS = ("product", "timed", "denoised", "lights", "cold")
 # Light paths, as multiples of what is chosen
 SWEEP = (1 / 4, 1 / 2, 1, 2, 4)
 DEPTH, TRIMMED, COLD_SPP = 6, 0.001, 16
@@ -143,6 +146,21 @@ class Rival:
         return float(np.mean(means)), float(np.std(means, ddof=1) / np.sqrt(len(means)))
 
 
+class Timed(Rival):
+    """One integrator on one scene, whose images end by time."""
+
+    def __init__(self, scene, kind: str, seconds: float):
+        self.kind, self.images, self.seconds, self._wanted = kind, [], [], seconds
+        self._scene, self.integrator = scene, mi.load_dict({"type": kind, "max_depth": DEPTH})
+
+    def render(self, seed: int):
+        """(An image, float64, and its seconds)."""
+        # A render has a seed for each of its passes
+        image, took = render(self._scene, self.integrator, time=self._wanted, seed=1000 * seed)
+        self.spp = took.spp
+        return np.array(image, np.float64)[..., :3], took.seconds
+
+
 def measure_in_turn(rivals: list[Rival], passes: int) -> None:
     """So many passes more of each, one after the other."""
     for number in range(passes):
@@ -198,6 +216,22 @@ def product_of(name: str, width: int, seconds: float, passes: int, view: int) ->
         flush=True,
     )
     return ratio
+
+
+def timed(names, width: int, seconds: float, passes: int) -> None:
+    """Print variance × time of images that end by time, and the ratio."""
+    print(f"timed, {width} wide, {passes} images of {seconds:g} s; variance × time, with samples of an image")
+    ratios = []
+    for name in names:
+        scene = load(name, width)
+        rivals = [Timed(scene, kind, seconds) for kind in KINDS]
+        measure_in_turn(rivals, passes)
+        scale = scale_of(name, [image for rival in rivals for image in rival.images], width)
+        theirs, ours = (rival.product(scale) for rival in rivals)
+        ratios.append(theirs / ours)
+        columns = (f"{value:.4g} ({rival.spp})" for value, rival in zip((theirs, ours), rivals, strict=True))
+        print(f"{name:18s}" + "".join(f"{column:>22s}" for column in columns) + f"{ratios[-1]:8.2f}", flush=True)
+    print(f"geometric mean {scenes.geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
 
 
 def denoised(names, width: int, seconds: float, passes: int) -> None:
@@ -280,7 +314,7 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS)
     parser.add_argument("--scenes", nargs="+", default=list(NAMES), metavar="NAME")
     parser.add_argument("--width", type=int, default=256, metavar="PIXELS")
-    parser.add_argument("--seconds", type=float, default=2.5, help="of one pass, about (default: 2.5)")
+    parser.add_argument("--seconds", type=float, default=2.5, help="of one pass, or image, about (default: 2.5)")
     parser.add_argument("--passes", type=int, default=6, help="of each (default: 6)")
     parser.add_argument("--views", type=int, default=0, help="how many other cameras the product is of (default: none)")
     options = parser.parse_args()
@@ -289,6 +323,8 @@ def main() -> None:
     names = scenes.available(options.scenes)
     if "product" in options.parts:
         product(names, options.width, options.seconds, options.passes, options.views)
+    if "timed" in options.parts:
+        timed(names, options.width, options.seconds, options.passes)
     if "denoised" in options.parts:
         denoised(names, 256, options.seconds, options.passes)
     if "lights" in options.parts:

@@ -3,7 +3,7 @@
 `scene_files`   parse a scene file, change its integrator or its size, and load it
 `rendering`     average passes of different seeds, within samples or seconds
 `render`, `pass_sizes`, `convergence`, `interruption`
-                an image that ends by itself: passes of about two seconds, the error that is left, Ctrl-C
+                an image that ends by itself: passes of some seconds, the error that is left, Ctrl-C
 `checkpoint`    what a render goes on from that was not finished
 `one_image`, `batch`
                 an image of the command, rendered here or by workers; which images, of frames, scenes and sensors

@@ -5,7 +5,7 @@ from itertools import count
 import numpy as np
 
 from .pass_sizes import FIRST_SAMPLES
-from .rendering import largest_pass, pass_seed, pass_sizes
+from .rendering import pass_seed, pass_sizes
 
 LONG_PASS = 60.0  # seconds; with given samples, only small passes compile for passes longer than this
 WARM_SPP = 4  # Mitsuba compiles other kernels for passes of fewer samples per pixel, and for no power of two
@@ -25,7 +25,7 @@ def measure(progressive, job):
         return progressive.passes[0].seconds
     unused = (pass_seed(job.seed, index) for index in count(UNUSED_PASSES))
     if job.spp:
-        sizes = pass_sizes(job.spp, progressive.pixels, job.pass_spp)
+        sizes = pass_sizes(job.spp, job.pass_spp or progressive.largest_pass)
         cold = _compile(progressive, sizes, unused)
         progressive.restart()
         for spp in sizes:
@@ -48,11 +48,11 @@ def measure(progressive, job):
 def _render_cold(progressive, job):
     """Render the passes of a job from the first on; in a budget their sizes double as long as it has room for more."""
     if job.spp:
-        for spp in pass_sizes(job.spp, progressive.pixels, job.pass_spp):
+        for spp in pass_sizes(job.spp, job.pass_spp or progressive.largest_pass):
             progressive.render(spp)
         return
     first = WARM_SPP if WARM_SPP * progressive.pixels <= FIRST_SAMPLES else 1
-    spp, largest = job.pass_spp or first, job.pass_spp or largest_pass(progressive.pixels)
+    spp, largest = job.pass_spp or first, job.pass_spp or progressive.largest_pass
     least, expected = {}, 0.0  # seconds, by size and of the next pass
     while (left := job.budget - progressive.seconds) > expected / 2:
         seconds, is_first = progressive.render(spp).seconds, spp not in least
@@ -103,7 +103,7 @@ def _samples_of_a_pass(progressive, budget, seeds):
     trees) would take more than `START_SHARE` of the time; one sample, and no time to start that is known, if even that
     takes half of the budget.
     """
-    largest = largest_pass(progressive.pixels)
+    largest = progressive.largest_pass
     if largest < WARM_SPP:
         return 1, 0.0
     first = progressive.render(1, next(seeds)).seconds

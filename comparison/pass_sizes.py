@@ -1,13 +1,14 @@
 """How many samples per pixel the next pass of a render has: passes of about two seconds, whatever they cost.
 
 Passes that are rendered in parts, and so can be stopped in between, are longer where they cost much to start: so long
-that starting one is a quarter of it, but ten seconds at most.
+that starting one is a quarter of it, but about ten seconds at most, or twice as long as it takes to start.
 
 Sizes are powers of two, from 4 on if a pixel allows it: Mitsuba compiles one kernel for all of these, and others for
-numbers between and, with some filters of the film, for fewer. The first pass is small, since nothing is known; each
-later one is as large as the one before, or larger by a factor that the time of that one allows. As the first pass of a
-kernel compiles it, time says at most what a pass costs, so that growing by it is safe; shrinking needs a second pass of
-the same size, and so does growing at the risk of twice the time, where passes cost much to start.
+numbers between and, with some filters of the film, for fewer. To start another pass in parts takes longer than that, so
+these may have 2 samples, and the last one what is missing. The first pass is small, since nothing is known; each later
+one is as large as the one before, or larger by a factor that the time of that one allows. As the first pass of a kernel
+compiles it, time says at most what a pass costs, so that growing by it is safe; shrinking needs a second pass of the
+same size, and so does growing at the risk of twice the time, where passes cost much to start.
 """
 
 import math
@@ -15,14 +16,15 @@ import math
 from .rendering import largest_pass
 
 PASS_SECONDS = 2.0
-START_SHARE, MOST_SECONDS = 0.25, 10.0  # of a pass in parts: share of its time that starts it; all of it, at most
-LONGEST = 2.0  # times as much: only longer passes are made smaller
-MOST_GROWTH = 4  # from one size to the next, where it is not safe
+START_SHARE = 0.25  # of the time of a pass in parts, which may go into starting it
+MOST_SECONDS, LEAST_REST = 10.0, 1.0  # of such a pass; but what follows its start takes so many times as long
+LONGEST = 2.0  # times the seconds that are wanted: only longer passes are made smaller
+CHANGED = 1.5  # times as long, or as short, as a pass of the same size: others tell nothing any more
+MOST_GROWTH = 4  # from one size to the next, where it is not safe; sizes that tell of each other
 USUAL = 4  # samples per pixel from which on all powers of two have the same kernels
 FIRST_SAMPLES = 2**19  # pixel samples that a first pass may have, unless one per pixel is more
 LEAST_SHARE = 0.1  # of a pass's time that is taken to depend on its samples, at least
 PARTS = 8  # where an error is asked for: no pass has more than this part of the samples that there are
-MORE_IN_PARTS = 4  # times as many pixel samples may a pass have that is rendered in parts
 
 
 class PassSizes:
@@ -33,19 +35,21 @@ class PassSizes:
 
     def __init__(self, pixels, spp=None, time=None, fixed=None, many=False, in_parts=False):
         self._spp, self._time, self._fixed, self._many, self._in_parts = spp, time, fixed, many, in_parts
-        self._largest = _power_of_two(largest_pass(pixels, MORE_IN_PARTS if in_parts else 1))
+        self._largest = _power_of_two(largest_pass(pixels, in_parts))
         self._least = USUAL if USUAL * pixels <= FIRST_SAMPLES else 1
         self._current, self._seconds, self._asked = fixed or self._least, {}, None
-        self._known = {}  # of these, by size, those in which nothing is compiled any more
+        self._known = {}  # by size, what the last pass took; but for the first of all here, which compiles most kernels
+        self._here = None  # how many passes there were before
 
     def next(self, passes, elapsed):
         """Return the samples per pixel of the pass that follows `passes` (list of `Pass`) after `elapsed` seconds, or
         what has ended the render: "spp" or "time"."""
         done = sum(one.spp for one in passes)
-        if passes and self._asked is None:  # it goes on from these
-            self._asked = passes[-1].spp
+        if self._here is None:  # it goes on from these
+            self._here = len(passes)
+            self._asked = passes[-1].spp if passes else None
         if passes:
-            self._learn(passes[-1].seconds, done)
+            self._learn(passes[-1].seconds, done, compiles=len(passes) == self._here + 1)
         size = self._current
         if self._spp is not None:
             if done >= self._spp:
@@ -60,17 +64,20 @@ class PassSizes:
 
     def _of_the_rest(self, size, left):
         """Return the size of the next pass, of about `size` samples, where `left` are missing."""
-        if self._in_parts and not self._fixed and size < left < min(2 * size, self._largest + 1):
-            return left  # to start another pass takes longer than to compile kernels for another size
-        return min(size, left if self._fixed or self._in_parts or left < USUAL else _power_of_two(left))
+        if self._in_parts and not self._many and not self._fixed and left < 2 * size and left <= self._largest:
+            return left
+        return min(size, left if self._fixed or left < USUAL else _power_of_two(left))
 
-    def _learn(self, seconds, done):
+    def _learn(self, seconds, done, compiles):
         """Take note of what the last pass took, and choose the usual size of those to come."""
         repeated = self._asked in self._seconds
         # The first of a size may have compiled its kernels
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
-        if repeated or len(self._seconds) > 1:
-            self._known[self._asked] = self._seconds[self._asked]
+        if not compiles:
+            before = self._known.get(self._asked, seconds)
+            if not 1 / CHANGED < seconds / max(before, 1e-6) < CHANGED:
+                self._known.clear()  # the machine is no longer what it was
+            self._known[self._asked] = seconds
         if self._fixed or self._asked != self._current:
             return
         wanted, line = self._wanted(), self._in_parts and self._line()
@@ -99,16 +106,19 @@ class PassSizes:
         nearer to one more pass than to none, 0 where they are not."""
         least = size if self._fixed else min(size, self._least)
         while size > least and self._expected(size) > left:
-            size = max(least, size // 2)
+            size = max(least, _power_of_two(size - 1))
         return size if self._expected(size) <= 2 * left else 0
 
     def _wanted(self):
         """Return the seconds that a pass is to take."""
         if not self._in_parts:
             return PASS_SECONDS
-        # All of it may start the pass, as long as that is not known
-        start, _ = self._line() or (self._seconds[self._asked], 0.0)
-        return min(max(start / START_SHARE, PASS_SECONDS), MOST_SECONDS)
+        line, seconds = self._line(), self._seconds[self._asked]
+        if line:
+            return max(min(line[0] / START_SHARE, MOST_SECONDS), (1 + LEAST_REST) * line[0], PASS_SECONDS)
+        # All of it may have started the pass
+        most = MOST_SECONDS if seconds < MOST_SECONDS else (1 + LEAST_REST) * seconds
+        return max(min(seconds / START_SHARE, most), PASS_SECONDS)
 
     def _expected(self, size):
         """Return the seconds that a pass will take: those that one of this size took, or by a line, or, where that is

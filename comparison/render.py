@@ -67,8 +67,8 @@ def render(
     pass_spp: int | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> tuple[mi.TensorXf, Took]:
-    """Render a scene in passes of about two seconds, of up to ten with `manylights`; return the image, a `mi.TensorXf`
-    of shape (height, width, channels) as of `mi.render`, and what it took (`Took`).
+    """Render a scene in passes of about two seconds, or ten with `manylights`; return the image, a `mi.TensorXf` of
+    shape (height, width, channels) as of `mi.render`, and what it took (`Took`).
 
     `integrator`: a `mi.Integrator` or the name of one, by default the scene's; `sensor`: its index, or "all" for a list
     of what is returned for each sensor, one after the other. The render ends as soon as one of these is reached, of

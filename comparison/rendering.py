@@ -13,6 +13,7 @@ from .convergence import ErrorEstimate
 from .images import colour
 
 MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of one pass: it bounds memory, and the wait for the first image
+MORE_IN_PARTS = 4  # times as many has a pass that is rendered in parts
 
 
 def pass_seed(seed, index):
@@ -23,17 +24,16 @@ def pass_seed(seed, index):
     return int(np.random.SeedSequence((seed, index)).generate_state(1)[0])
 
 
-def pass_sizes(spp, pixels, pass_spp=None):
-    """Split `spp` samples per pixel into passes (a list of ints) of `pass_spp`, by default `largest_pass(pixels)`."""
-    size = pass_spp or largest_pass(pixels)
+def pass_sizes(spp, size):
+    """Split `spp` samples per pixel into passes of `size` (a list of ints)."""
     full, rest = divmod(spp, size)
     return [size] * full + ([rest] if rest else [])
 
 
-def largest_pass(pixels, times=1):
+def largest_pass(pixels, in_parts=False):
     """Return how many samples per pixel, at least one, make up to `MAXIMUM_PASS_SAMPLES` samples in all pixels, or
-    `times` as many."""
-    return max(1, times * MAXIMUM_PASS_SAMPLES // pixels)
+    `MORE_IN_PARTS` times as many."""
+    return max(1, (MORE_IN_PARTS if in_parts else 1) * MAXIMUM_PASS_SAMPLES // pixels)
 
 
 @dataclass
@@ -145,8 +145,13 @@ class Progressive(Passes):
 
     @property
     def in_parts(self):
-        """Is a pass rendered in parts, between which it can be stopped, and of which memory holds one at a time?"""
+        """Is a pass rendered in parts, between which it can be stopped, and with little memory for each sample?"""
         return getattr(self.integrator, "renders_in_parts", False)
+
+    @property
+    def largest_pass(self):
+        """Most samples per pixel of a pass."""
+        return largest_pass(self.pixels, self.in_parts)
 
     @property
     def pixels(self):

@@ -111,7 +111,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
 
     aovs: tuple[str, ...] = ()  # channels that are asked for, where derived classes have a knob of that name
     along_curve = True  # whether gather points are sorted by their place
-    # Whether images are rendered part by part, stop in between, and take little more memory for more samples
+    # Whether images are rendered in parts, stop in between, and take little memory for more samples (50 bytes each)
     renders_in_parts = False
     knobs = PATH_KNOBS
 

@@ -196,9 +196,9 @@ METHODS = {
 def test_expectation_equals_direct(mixed, reference, method):
     plugin, more = METHODS[method]
     # A cut at every point takes seconds
-    count = 16 if method == "unoccluded" else 32
+    count, spp = (24, 1) if method == "unoccluded" else (32, 4)
     # So coarse an error that pixels end at very different times
-    ours = repeat(mixed, plugin, count, 4, error=0.2, **more)
+    ours = repeat(mixed, plugin, count, spp, error=0.2, **more)
     assert len({image.mean() for image in ours}) == len(ours)
     assert_same_expectation(ours, reference)
 

@@ -113,10 +113,12 @@ def test_pass_seeds_differ_and_begin_with_the_seed():
 
 
 def test_pass_sizes():
-    assert rendering.pass_sizes(5, 10**9) == [1] * 5
-    assert rendering.pass_sizes(100, 2**16) == [32, 32, 32, 4]
-    assert rendering.pass_sizes(3, 16) == [3]
-    assert rendering.pass_sizes(5, 16, pass_spp=2) == [2, 2, 1]
+    assert rendering.largest_pass(10**9) == rendering.largest_pass(10**9, in_parts=True) == 1
+    assert rendering.largest_pass(2**16) == 32
+    assert rendering.largest_pass(2**16, in_parts=True) == 128
+    assert rendering.pass_sizes(100, 32) == [32, 32, 32, 4]
+    assert rendering.pass_sizes(3, 128) == [3]
+    assert rendering.pass_sizes(5, 2) == [2, 2, 1]
 
 
 def test_progressive_is_the_weighted_mean_of_its_passes():

@@ -7,6 +7,7 @@ import pytest
 
 from vpl.core.arrays import download, upload, upload_vectors
 from vpl.lights.light_set import LightSet
+from vpl.split.gather_vertices import LitVertices
 from vpl.split.irradiance import learn_emitters
 from vpl.split.learned_emitters import LearnedEmitters
 from vpl.split.site_choice import SiteChoice
@@ -220,13 +221,13 @@ def test_the_weights_of_gather_vertices_are_finite():
 def test_later_vertices_are_lit_where_no_first_one_is(monkeypatch, lights_cost_nothing):
     """As in an image of one pixel, of which few samples are lit, and meet nothing."""
     plugin, scene = mi.load_dict({"type": "manylights", "max_depth": 5}), mi.load_dict(closed_box(bulbs(), 8))
-    gather = plugin._gather
+    lit = LitVertices.of
 
-    def without_first(view, lights, chosen, vertices, *more):
-        vertices[0].weight *= 0
-        return gather(view, lights, chosen, vertices, *more)
+    def without_first(first, *more):
+        first.weight *= 0
+        return lit(first, *more)
 
-    plugin._gather = without_first
+    monkeypatch.setattr(LitVertices, "of", without_first)
     render(scene, plugin, 16)
     assert plugin.statistics["light_paths"] > 0 and plugin.statistics.get("later", 0) > 0
 

@@ -13,7 +13,7 @@ class Recorded(rendering.Progressive):
         self._pixels, self._seconds, self._start, self.asked = pixels, list(seconds), start, []
         self.restart()
 
-    pixels = property(lambda self: self._pixels)
+    pixels, integrator = property(lambda self: self._pixels), None
 
     def render(self, spp, seed=None):
         self.asked.append((spp, seed is not None))

@@ -10,9 +10,9 @@ from comparison.rendering import MAXIMUM_PASS_SAMPLES, Pass
 SQUARE = 256 * 256
 
 
-def render(pixels, start, each, compilation=3.0, more=None, **limits):
-    """Passes that take `start` seconds and `each` per sample, and once for each kernel `compilation`, or `more` but for
-    the first: (passes, why the render ended)."""
+def render(pixels, start, each, compilation=3.0, more=None, slow=None, **limits):
+    """Passes that take `start` seconds and `each` per sample, three times that from number `slow` on, and once for each
+    kernel `compilation`, or `more` but for the first: (passes, why the render ended)."""
     sizes, passes, elapsed, kernels = PassSizes(pixels, **limits), [], 0.0, set()
     while len(passes) < 2000:
         spp = sizes.next(passes, elapsed)
@@ -21,6 +21,7 @@ def render(pixels, start, each, compilation=3.0, more=None, **limits):
         kernel = spp if spp < 4 or spp & (spp - 1) else "usual"
         seconds = start + each * spp + (0 if kernel in kernels else compilation)
         compilation = compilation if more is None else more
+        seconds *= 3 if slow is not None and len(passes) >= slow else 1
         kernels.add(kernel)
         passes.append(Pass(0, spp, seconds))
         elapsed += seconds
@@ -89,6 +90,35 @@ def test_in_parts_samples_are_those_that_were_asked_for_and_no_small_pass_ends_t
     assert sum(one.spp for one in passes) == spp and ended_by == "spp"
     assert passes[-1].spp >= passes[-2].spp / 2 if len(passes) > 1 else passes[-1].spp < 8
     assert max(one.spp for one in passes) <= 4 * MAXIMUM_PASS_SAMPLES // (SQUARE // 2)
+
+
+@pytest.mark.parametrize("start", [9.0, 12.0, 25.0])
+def test_in_parts_a_start_of_ten_seconds_is_worth_many_samples(start):
+    passes, _ = render(SQUARE // 4, start, 0.01, time=600, more=0.1, in_parts=True)
+    usual = Counter(one.spp for one in passes).most_common(1)[0][0]
+    # 512 samples are all that a pass may have
+    assert usual >= 256
+    assert max(one.seconds for one in passes) < 3 * start
+
+
+@pytest.mark.parametrize("in_parts", [False, True])
+@pytest.mark.parametrize("start", [0.1, 1.0])
+def test_sizes_settle_when_the_machine_gets_slower(start, in_parts):
+    passes, _ = render(SQUARE // 16, start, 0.1, time=300, slow=10, more=0.1, in_parts=in_parts)
+    assert len({one.spp for one in passes[-10:-2]}) == 1
+
+
+@pytest.mark.parametrize("spp", [5, 6, 7, 60])
+def test_in_parts_an_error_has_more_than_one_pass_however_few_the_samples(spp):
+    passes, _ = render(SQUARE, 1.0, 0.1, spp=spp, many=True, more=0.1, in_parts=True)
+    assert len(passes) > 1 and sum(one.spp for one in passes) == spp
+
+
+@pytest.mark.parametrize("time", [10, 12, 13, 14, 20])
+def test_in_parts_only_a_last_pass_has_an_odd_size(time):
+    passes, ended_by = render(SQUARE, 0.3, 0.1, spp=100, time=time, more=0.1, in_parts=True)
+    odd = [one.spp for one in passes if one.spp & (one.spp - 1)]
+    assert odd == [] or (odd == [passes[-1].spp] and ended_by == "spp")
 
 
 def test_in_parts_an_error_still_has_many_passes():

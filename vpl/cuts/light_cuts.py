@@ -135,7 +135,7 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
         return threshold, sizes, visits
     index = upload(mi.UInt32, rows)
     part = batch.select(index)
-    # In NumPy: they are few, and as kernels they would take longer to compile than to compute
+    # In NumPy: they are mostly few, and as kernels they would take longer to compile than to compute
     spent, fitting = np.zeros(len(rows), np.uint32), [np.zeros(len(rows), np.uint32) for _ in sizes.count]
 
     def too_large(values):
