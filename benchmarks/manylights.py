@@ -13,8 +13,8 @@ Parts, each with both integrators in turn in one run, and with the better of the
   much the mean of the image differs from pass to pass, each with lights of its own.
 - ``denoised``: error of one pass through Open Image Denoise against the reference, its noise taken off; the time of
   `path` for the same error, from passes of growing size.
-- ``timed``: the same of images that `manylights.render` ends after so many ``--seconds``, first passes included, with
-  the sampler `independent`, in as many ``--passes`` with seeds of their own.
+- ``timed``: variance × time of images that `manylights.render` ends after so many ``--seconds``, first passes included,
+  with the sampler `independent`; so many images as ``--passes`` says, with seeds of their own.
 - ``lights``: variance × time of `manylights` with fewer and more light paths than it chooses.
 - ``cold``: seconds of the first render, 16 samples a pixel, with an empty kernel cache, and peak memory, whole process.
 """

@@ -39,17 +39,17 @@ class PassSizes:
         self._least = USUAL if USUAL * pixels <= FIRST_SAMPLES else 1
         self._current, self._seconds, self._asked = fixed or self._least, {}, None
         self._known = {}  # by size, what the last pass took; but for the first of all here, which compiles most kernels
-        self._here = None  # how many passes there were before
+        self._before = None  # how many passes there were when this render began or went on
 
     def next(self, passes, elapsed):
         """Return the samples per pixel of the pass that follows `passes` (list of `Pass`) after `elapsed` seconds, or
         what has ended the render: "spp" or "time"."""
         done = sum(one.spp for one in passes)
-        if self._here is None:  # it goes on from these
-            self._here = len(passes)
+        if self._before is None:  # it goes on from these
+            self._before = len(passes)
             self._asked = passes[-1].spp if passes else None
         if passes:
-            self._learn(passes[-1].seconds, done, compiles=len(passes) == self._here + 1)
+            self._learn(passes[-1].seconds, done, compiles=len(passes) == self._before + 1)
         size = self._current
         if self._spp is not None:
             if done >= self._spp:

@@ -133,7 +133,7 @@ def test_in_parts_an_error_still_has_many_passes():
 @pytest.mark.parametrize("time", [5, 11, 60])
 @pytest.mark.parametrize("in_parts", [False, True])
 def test_time_is_used_and_not_exceeded_by_much(start, each, time, in_parts):
-    passes, ended_by = render(SQUARE // 4, start, each, time=time, more=0.1, in_parts=in_parts)
+    passes, ended_by = render(SQUARE // 4, start, each, time=time, more=0.1 if in_parts else None, in_parts=in_parts)
     assert ended_by == "time"
     least = min(one.seconds for one in passes)
     assert abs(sum(one.seconds for one in passes) - time) <= least + 0.1
