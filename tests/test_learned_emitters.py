@@ -15,7 +15,7 @@ from vpl.split.sites import Sites
 from vpl.split.view_lights import ViewLights
 
 from .catalogue import EMITTERS, SENSORS, film, image, rgb
-from .conftest import closed_box, render, render_with_statistics, sensor, unit_vectors
+from .conftest import area_light, closed_box, render, render_with_statistics, sensor, unit_vectors
 from .test_tree_emitters import interactions
 
 
@@ -37,6 +37,18 @@ def learned(scene, known=lambda normal: normal[:, 0] < 2, seed=0):
     seen = known(normal)
     learn_emitters(scene, emission, (position[seen], normal[seen]), 1 << 18, seed)
     return emission, position, normal
+
+
+def test_an_image_does_not_depend_on_the_order_of_the_emitters():
+    """Mitsuba loads a scene's shapes in another order each time."""
+    lamps = {"red": area_light(radiance=(4, 1, 1)), "blue": area_light(0.5, (1, 1, 9)), "sky": {"type": "constant"}}
+    lamps |= bulbs()
+    images = []
+    for names in (list(lamps), list(reversed(lamps))):
+        box = closed_box({name: lamps[name] for name in names})
+        del box["left"]
+        images.append(render(mi.load_dict(box), "manylights", 16, max_depth=4))
+    assert np.abs(images[0] - images[1]).max() < 1e-5 * images[0].mean()
 
 
 # ---------------------- Densities ----------------------

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import download, finite_or_zero
+from ..core.arrays import download, finite_or_zero, upload
 from ..core.registry import RegistryTable
 from ..direct.environment_regions import regions_of
 from .emitter_samples import EmitterSample, MetEmitter
@@ -30,11 +30,15 @@ class LearnedEmitters:
     lights = None
 
     def __init__(self, scene):
-        self._scene, self._emitters, self._count = scene, scene.emitters_dr(), len(scene.emitters())
+        order = _reproducible_order(scene.emitters())
+        emitters = [scene.emitters()[number] for number in order]
+        self._scene, self._count = scene, len(emitters)
+        self._emitters = dr.gather(mi.EmitterPtr, scene.emitters_dr(), upload(mi.UInt32, order))
+        dr.eval(self._emitters)
         # Emitters with a weight of 0 are never sampled, as in Mitsuba
-        weight = np.array([emitter.sampling_weight() for emitter in scene.emitters()])
+        weight = np.array([emitter.sampling_weight() for emitter in emitters])
         self._environment = scene.environment()
-        of_environment = np.array([emitter.is_environment() for emitter in scene.emitters()])
+        of_environment = np.array([emitter.is_environment() for emitter in emitters])
         self._environment_number = int(of_environment.argmax()) if self._environment is not None else -1
         self._regions = None
         if weight[of_environment].any():
@@ -139,3 +143,17 @@ class LearnedEmitters:
                 lambda origin, site, direction, density: density,
             )
         return MetEmitter(emitted, density)
+
+
+def _reproducible_order(emitters: list) -> np.ndarray:
+    """Sort emitters by class, bounding box and printed properties: (n,) indices.
+
+    Mitsuba 3.9.1 lists the shapes of a scene, and with them their emitters, in an order that differs from one loading
+    of a file to the next.  With the order of the list, the same seed would give another image each time.
+    """
+
+    def key(number: int):
+        box = emitters[number].bbox()
+        return emitters[number].class_name(), *np.array(box.min), *np.array(box.max), str(emitters[number])
+
+    return np.array(sorted(range(len(emitters)), key=key), np.uint32)
