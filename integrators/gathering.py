@@ -5,16 +5,16 @@ from __future__ import annotations
 import signal
 import threading
 from dataclasses import dataclass
-from time import perf_counter
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from vpl.core.arrays import add_at, download, usable
+from vpl.core.clock import Clock
 from vpl.core.exclusive import exclusive
 from vpl.core.shared_code import share_code
-from vpl.core.stages import Stage, tell
+from vpl.core.stages import Stage
 from vpl.lights.emitters import Emitters, read_emitters
 from vpl.points.camera_paths import CameraPaths, PixelGrid, SceneTraits, follow_camera_rays, refuse_media, scene_traits
 
@@ -23,35 +23,6 @@ from .knobs import PATH_KNOBS, Integer, read_knobs, show_knobs
 
 # Of Mitsuba, whose own constructor does not show what it has read
 _SAMPLES_PER_PASS = Integer("samples_per_pass", 2**32 - 1, "Most samples of a pixel in a pass.", minimum=1)
-
-
-class Clock:
-    """Seconds by stage, of which the first begins at once.  A stage ends when the next one begins or the clock is
-    stopped, and the device has finished; who listens (:func:`vpl.core.stages.listening`) is told of each."""
-
-    def __init__(self, stage: Stage):
-        self.seconds: dict[str, float] = {}
-        self._stage: Stage | None = None
-        self.begin(stage)
-
-    def begin(self, stage: Stage) -> None:
-        """End the current stage and begin another one."""
-        self.stop()
-        tell(stage)
-        self._stage, self._start = stage, perf_counter()
-
-    def stop(self) -> None:
-        """End the current stage."""
-        if self._stage is not None:
-            dr.sync_thread()
-            self.add({self._stage: perf_counter() - self._start})
-            self._stage = None
-
-    def add(self, seconds: dict[str, float]) -> None:
-        """Add the times of stages that were taken elsewhere."""
-        for stage, spent in seconds.items():
-            # By plain text, as statistics are printed
-            self.seconds[str(stage)] = self.seconds.get(stage, 0.0) + spent
 
 
 def whole_sum(values) -> int:

@@ -1,17 +1,17 @@
-"""Cells of space where paths from the camera arrive, and random lines through them that meet surfaces there (NumPy).
+"""Random lines through the space where camera paths arrive, which meet surfaces there with a known density (NumPy).
 
-Lights are wanted where the second vertices of camera paths lie.  These are sorted into an octree, and each of its
-leaves has a box around what arrived in it.  A box is chosen, and a line through it is drawn so that all lines that meet
-the box are alike: from a point that is uniform on its surface, inwards by the cosine.  Such lines meet every surface
-inside with the same density, whatever its shape and orientation (Cauchy and Crofton): the line through a convex body of
-surface S is expected to hit each side of a surface of area A inside of it A / S times.  So points on surfaces are drawn
-with a known density by nothing but ray tracing, for any kind of shape, and few of them far from where they matter.
+Virtual lights are wanted where the second vertices of camera paths lie.  These *arrivals* are sorted into an octree, and
+a box surrounds the arrivals in each leaf.  A box is drawn, and then a line through the box so that all lines through it
+are equally likely: from a uniform point on its surface, inwards by the cosine.  By the formulas of Cauchy and Crofton, a
+line through a convex body of surface area S is expected to hit each side of a surface of area A inside the body A / S
+times, whatever the shape and orientation of the surface.  So points on all kinds of shapes are drawn with a known
+density by ray tracing alone, and few of them far from the arrivals.
 
-Camera paths arrive at one side of most surfaces.  A line is turned round to meet the side that the mean normal M of a
-box faces with probability |M|: of all lines that hit a side with normal n, those that run against M are a share of
-(1 + cos) / 2, so that the density on it is A / S (1 + n·M).
+Camera paths arrive at one side of most surfaces.  With M the mean normal of the arrivals in a box, a line is reversed
+with probability |M| if it runs along M.  Of all lines that hit a side with normal n, those that run against M are a
+fraction (1 + cos(n, M)) / 2, so the density on that side is A / S (1 + n·M).
 
-Parents of the leaves and the whole scene are chosen now and then, too, so that no surface is left out.
+Parents of the leaves and the whole scene are drawn now and then, too, so the density is positive on all surfaces.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ import numpy as np
 
 from ..core.morton import interleave
 
-# Arrivals in a cell that is not divided any more, and how often it may be divided at most
+# Largest number of arrivals in a leaf; largest depth of the octree, as many levels as a Morton code has bits per axis
 _LARGEST_LEAF, _LEVELS = 16, 20
-# Shares of the lines that go through parents of leaves, and through the whole scene
+# Fraction of the lines through parents of leaves and through the whole scene: keeps the density positive everywhere
 _PARENT_SHARE, _SCENE_SHARE = 0.15, 0.05
-# How much of a leaf's cell its box extends beyond what arrived there, and how much lines are turned at most
+# Margin of a box around its arrivals, as a fraction of the leaf; largest |M|, below 1 so that both sides are met
 _MARGIN, _LARGEST_TURN = 0.1, 0.9
-# A cell is numbered by the bits of its Morton code behind a leading 1: the first number of each level
+# The number of a node is its Morton code behind a leading 1: the first number of each level
 _FIRST_OF_LEVEL = 8 ** np.arange(_LEVELS + 1, dtype=np.uint64)
 
 
 @dataclass
 class Lines:
-    """``origin``, ``direction`` (n, 3) float32; ``length`` (n,) float32: of the part inside of the box."""
+    """Line segments inside boxes: ``origin``, ``direction`` (n, 3), ``length`` (n,), float32, world units."""
 
     origin: np.ndarray
     direction: np.ndarray
@@ -43,8 +43,11 @@ class Lines:
 
 @dataclass
 class Boxes:
-    """``number`` of the cell of each, sorted; ``level`` of it; ``low``, ``size``: (n, 3), world units; ``turn``:
-    (n, 3), M; ``chance``: (n,) of being chosen."""
+    """Boxes in nodes of an octree.
+
+    ``number`` (n,) of the node, sorted, and its ``level``; ``low``, ``size`` (n, 3): world units; ``turn`` (n, 3): M;
+    ``chance`` (n,): probability of being drawn.
+    """
 
     number: np.ndarray
     level: np.ndarray
@@ -55,16 +58,16 @@ class Boxes:
 
     @property
     def surface(self) -> np.ndarray:
-        """Area of each, (n,)."""
+        """Surface area of each box, (n,)."""
         x, y, z = self.size.T
         return 2 * (x * y + y * z + z * x)
 
 
-class Cells:
-    """An octree over points (n, 3) with unit normals (n, 3) and weights (n,) of a positive sum.
+class ArrivalOctree:
+    """Octree over arrivals: positions (n, 3), unit normals (n, 3), weights (n,) with a positive sum.
 
-    ``scene_low``, ``scene_size``: a cube that holds all surfaces, world units.  The octree lies at random, so that its
-    sides are not those of walls.
+    ``scene_low``, ``scene_size``: a cube that holds all surfaces, world units.  The octree has a random position, so that
+    its planes do not coincide with walls.
     """
 
     def __init__(self, position, normal, weight, scene_low, scene_size: float, generator):
@@ -87,13 +90,13 @@ class Cells:
         self.choose_by(self.leaf_weight)
 
     def choose_by(self, importance: np.ndarray) -> None:
-        """Choose leaves in proportion to ``importance``, (leaves,) float64."""
+        """Draw leaves in proportion to ``importance``, (leaves,) float64."""
         share = importance / importance.sum()
         self._leaves.chance = (1 - _PARENT_SHARE - _SCENE_SHARE) * share
         self._parents.chance = _PARENT_SHARE * np.bincount(self._parent_of_leaf, share, len(self._parents.number))
 
     def lines(self, count: int, generator) -> Lines:
-        """Random lines through boxes, stratified over them."""
+        """Draw ``count`` random lines, stratified over the boxes."""
         parts = (self._leaves, self._parents)
         chance = np.concatenate([*(part.chance for part in parts), [_SCENE_SHARE]])
         low = np.concatenate([*(part.low for part in parts), self._scene_low[None]])
@@ -102,7 +105,7 @@ class Cells:
         sample = (np.arange(count) + generator.random(count)) / count
         row = np.minimum(np.searchsorted(np.cumsum(chance), sample * chance.sum(), side="right"), len(chance) - 1)
         place, direction, length = _chords(size[row], generator)
-        # Turned round, the line enters where it left
+        # A reversed line begins where it ended
         back = (generator.random(count) < np.linalg.norm(turn[row], axis=1)) & ((direction * turn[row]).sum(1) > 0)
         place = np.where(back[:, None], place + direction * length[:, None], place)
         direction = np.where(back[:, None], -direction, direction)
@@ -110,7 +113,7 @@ class Cells:
         return Lines(*(column.astype(np.float32) for column in columns))
 
     def density(self, position, normal) -> np.ndarray:
-        """Hits per area of one line, on the side of a surface that ``normal`` (n, 3) is on: (n,) float64."""
+        """Expected hits per area of one line, on the side of a surface with the ``normal`` (n, 3): (n,) float64."""
         position = np.asarray(position, np.float64)
         found = np.full(len(position), _SCENE_SHARE / (6 * self._scene_size**2))
         for boxes in (self._leaves, self._parents):
@@ -121,7 +124,7 @@ class Cells:
         return found
 
     def _found(self, boxes: Boxes, position):
-        """Level by level, (the box that may hold each position, whether it does)."""
+        """Level by level, the box that may hold each position, and whether it does."""
         finest = self._finest(position)
         for level in np.unique(boxes.level):
             number = finest >> np.uint64(3 * (_LEVELS - level))
@@ -139,7 +142,7 @@ class Cells:
         turn *= _LARGEST_TURN / np.maximum(chance, np.finfo(np.float64).tiny)[:, None]
         level = np.searchsorted(_FIRST_OF_LEVEL, number, side="right") - 1
         boxes = Boxes(number, level, low, high - low, turn, chance)
-        # Within its cell, a box reaches as far beyond what arrived as arrivals are apart
+        # Within its node, a box extends beyond the arrivals by the distance between them
         margin = (_MARGIN * self._size * 0.5**level)[:, None] + (high - low) / np.sqrt(count)[:, None]
         corner, size = self._corner(boxes), (self._size * 0.5**level)[:, None]
         boxes.low = np.maximum(low - margin, corner)
@@ -151,7 +154,7 @@ class Cells:
         return interleave(np.clip(cell, 0, 2**_LEVELS - 1)) + _FIRST_OF_LEVEL[_LEVELS]
 
     def _corner(self, boxes: Boxes) -> np.ndarray:
-        """Lower corners of the cells of boxes, (n, 3)."""
+        """Lower corners of the nodes of boxes, (n, 3)."""
         code = boxes.number - _FIRST_OF_LEVEL[boxes.level]
         cell = np.zeros((len(code), 3))
         for bit in range(_LEVELS):
@@ -161,7 +164,7 @@ class Cells:
 
 
 def _leaves(finest: np.ndarray) -> np.ndarray:
-    """The number of the leaf that each point is in: the largest cell with few enough points."""
+    """Number of the leaf of each point: the largest node with few enough points."""
     leaf = finest.copy()
     for level in range(_LEVELS - 1, -1, -1):
         number = finest >> np.uint64(3 * (_LEVELS - level))
@@ -172,7 +175,7 @@ def _leaves(finest: np.ndarray) -> np.ndarray:
 
 
 def _chords(size: np.ndarray, generator):
-    """A random line through each of some boxes (n, 3): (entry relative to the lower corner, direction, length)."""
+    """Draw a line through each box of ``size`` (n, 3): (entry relative to the lower corner, direction, length)."""
     count, lane = len(size), np.arange(len(size))
     x, y, z = size.T
     areas = np.cumsum(np.stack([y * z, z * x, x * y], axis=1), axis=1)
