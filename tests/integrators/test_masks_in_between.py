@@ -1,0 +1,61 @@
+"""Masks between lights and what they light: every one that light passes is an edge of its path, as in ``prb``."""
+
+import mitsuba as mi
+import pytest
+
+from tests.support.catalogue import plugin, rgb
+from tests.conftest import assert_same_mean_over_seeds, closed_box, render, wall
+
+ALL_LIGHTS = {"clamping": 0.0, "vpl_count": 1000}
+WITH_LIGHTS = (
+    "vpl", "lightcuts", "mdlightcuts", "lightslice", "matrixrecovery", "illuminationcut", "illuminationcut-adaptive",
+)  # fmt: skip
+
+
+def veiled_room(veils=4, lamp=None):
+    """A room that is halved by masks; its back wall shines, if no other lamp is given."""
+    box = closed_box(lamp or {}, 16)
+    if lamp is None:
+        box["back"]["emitter"] = {"type": "area", "radiance": rgb(1.0)}
+    for k in range(veils):
+        mask = {"type": "mask", "opacity": 0.4, "nested": {"type": "diffuse"}}
+        box[f"veil{k}"] = wall([0, 0, -0.6 + 0.1 * k], [0, 1, 0], 0, 1.0, bsdf=mask)
+    return box
+
+
+def assert_image_of_prb(description, max_depth, seeds=10):
+    scene = mi.load_dict(description)
+    pairs = [
+        (render(scene, "vpl", 4, seed, max_depth=max_depth, **ALL_LIGHTS),
+         render(scene, "prb", 256, 1000 + seed, max_depth=max_depth))
+        for seed in range(seeds)
+    ]  # fmt: skip
+    assert_same_mean_over_seeds(pairs)
+
+
+@pytest.mark.parametrize("name", [*WITH_LIGHTS, "manylights"])
+def test_no_light_where_paths_are_too_short_to_pass(name):
+    """From a wall through four masks to the lamp there are six edges with that from the camera."""
+    scene = mi.load_dict(veiled_room())
+    for max_depth in (3, 4):
+        assert render(scene, mi.load_dict(plugin(name, max_depth=max_depth)), 16).max() == 0
+
+
+@pytest.mark.parametrize("max_depth", [5, 6, 8])
+def test_light_through_four_masks(max_depth):
+    assert_image_of_prb(veiled_room(), max_depth)
+
+
+@pytest.mark.parametrize("lamp", ["point", "spot", "directional"])
+def test_light_from_one_point_or_direction_does_not_pass(lamp):
+    """Next-event estimation alone finds such an emitter, and masks block it."""
+    aimed = mi.ScalarTransform4f().look_at([0, 0, -0.9], [0.8, -1, 0.4], [0, 1, 0])
+    emitter = {
+        "point": {"type": "point", "position": [0, 0, -0.8], "intensity": rgb(1.0)},
+        "spot": {"type": "spot", "to_world": aimed, "cutoff_angle": 60, "intensity": rgb(1.0)},
+        "directional": {"type": "directional", "direction": [0.1, -0.2, 1.0], "irradiance": rgb(1.0)},
+    }[lamp]
+    box = veiled_room(1, {"lamp": emitter})
+    if lamp == "directional":
+        del box["back"], box["left"]
+    assert_image_of_prb(box, 5)

@@ -1,0 +1,47 @@
+"""Scenes of many emitters and materials: means are those of ``path``."""
+
+import mitsuba as mi
+import numpy as np
+
+from tests.support.catalogue import rgb
+from tests.conftest import area_light, assert_same_mean_over_seeds, closed_box, render
+
+PLACES = np.random.default_rng(1).uniform(-0.9, 0.9, (8, 3)).tolist()
+
+
+def bulbs(count):
+    """As many point emitters as asked for, at eight places, of the same power in all."""
+    power = rgb(4.0 / count)
+    return {
+        f"bulb{i}": {"type": "point", "position": PLACES[i % len(PLACES)], "intensity": power} for i in range(count)
+    }
+
+
+def balls(count):
+    """Small balls, each of a material of its own."""
+    kinds = ("diffuse", "roughplastic", "roughconductor", "principled")
+    objects = {}
+    for i, center in enumerate(np.random.default_rng(2).uniform(-0.8, 0.8, (count, 3)).tolist()):
+        bsdf = {"type": kinds[i % len(kinds)]}
+        objects[f"ball{i}"] = {"type": "sphere", "center": center, "radius": 0.5 / count**0.5, "bsdf": bsdf}
+    return objects
+
+
+def assert_means_of(scene, expected_scene, name, seeds, **more):
+    pairs = [
+        (render(scene, name, 64, seed, **more), render(expected_scene, "path", 64, 100 + seed, max_depth=4))
+        for seed in range(seeds)
+    ]
+    assert_same_mean_over_seeds(pairs)
+
+
+def test_many_emitters():
+    """The oracle has eight: in ``path`` thousands take minutes."""
+    scene, few = (mi.load_dict(closed_box(bulbs(number), 16)) for number in (2000, len(PLACES)))
+    assert_means_of(scene, few, "manylights", 8, max_depth=4)
+
+
+def test_many_materials():
+    description = closed_box({"light": area_light()}, 16)
+    scene = mi.load_dict({"type": "scene", **balls(100), **description})
+    assert_means_of(scene, scene, "manylights", 8, max_depth=4)

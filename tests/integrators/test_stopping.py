@@ -1,0 +1,84 @@
+"""Integrators that are cancelled while they render: they do not go on to the end.  Ctrl-C."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from vpl.cuts import light_cuts
+from vpl.transport import evaluation
+
+from tests.conftest import area_light, closed_box, render
+
+
+@pytest.fixture
+def scene():
+    return mi.load_dict(closed_box({"lamp": area_light()}, size=24))
+
+
+def create(name):
+    return mi.load_dict({"type": name, "vpl_count": 2000, "max_depth": 4})
+
+
+def small_kernels(monkeypatch):
+    monkeypatch.setattr(light_cuts, "_PAIRS_PER_CHUNK", 3000)
+    monkeypatch.setattr(evaluation, "_RAYS_PER_KERNEL", 24 * 24 * 4 * 100)
+
+
+@pytest.mark.parametrize("name", ["vpl", "lightcuts"])
+def test_a_render_stops_between_kernels(monkeypatch, scene, name):
+    small_kernels(monkeypatch)
+    whole, counted = create(name), []
+    monkeypatch.setattr(type(whole), "should_stop", lambda self: counted.append(1) and False)
+    render(scene, whole)
+    assert len(counted) > 8
+    plugin, asked = create(name), []
+    monkeypatch.setattr(type(plugin), "should_stop", lambda self: asked.append(1) or len(asked) > 4)
+    render(scene, plugin)
+    assert len(asked) < 8
+    assert plugin.statistics["shadow_rays"] < 0.7 * whole.statistics["shadow_rays"]
+
+
+@pytest.mark.parametrize("name", ["vpl", "lightcuts"])
+def test_sizes_of_kernels_do_not_change_the_image(monkeypatch, scene, name):
+    expected = render(scene, create(name))
+    small_kernels(monkeypatch)
+    np.testing.assert_allclose(render(scene, create(name)), expected, rtol=1e-4, atol=1e-6)
+
+
+# In a process of its own, which a handler that was left behind would end
+INTERRUPTED = """
+import signal, sys
+import mitsuba as mi
+import manylights
+
+mi.set_variant("llvm_ad_rgb")
+signal.signal(signal.SIGINT, signal.default_int_handler)
+bulb = {"type": "point"}
+scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "bulb": bulb, "ball": {"type": "sphere"}})
+plugin = mi.load_dict({"type": sys.argv[1]})
+if sys.argv[2] == "during":
+    original = type(plugin)._sample
+    type(plugin)._sample = lambda *given: (signal.raise_signal(signal.SIGINT), original(*given))[1]
+try:
+    plugin.render(scene, spp=1)
+    if sys.argv[2] == "after":
+        del plugin
+        signal.raise_signal(signal.SIGINT)
+    print("went on")
+except KeyboardInterrupt:
+    print("ended")
+"""
+
+
+@pytest.mark.parametrize("name", ["adaptivedirect", "lightcuts", "manylights"])
+@pytest.mark.parametrize("when", ["during", "after"])
+def test_ctrl_c_is_heard_during_and_after_a_render(name, when):
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, name, when], cwd=Path(__file__).resolve().parents[2],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0 and done.stdout.endswith("ended\n"), done.stdout + done.stderr

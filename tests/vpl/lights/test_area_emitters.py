@@ -1,0 +1,81 @@
+"""Area emitters on shapes that Mitsuba does not sample as it shows them: turned or textured spheres, smooth meshes."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from vpl.core.arrays import upload
+
+from tests.conftest import assert_same_mean_over_seeds, closed_box, render
+
+# Plugins that find emitters in ways of their own, with light paths of two edges
+DIRECT = {
+    "nee": ("lightcuts", {"direct": "nee"}),
+    "vpl": ("vpl", {"direct": "vpl", "direct_count": 2000, "clamping": 0.0}),
+    "adaptivedirect": ("adaptivedirect", {"error": 0.1}),
+    "unoccludeddirect": ("unoccludeddirect", {"error": 0.5, "max_samples": 200}),
+    "manylights": ("manylights", {}),
+}
+
+
+def ball(radiance):
+    """A glowing sphere in the middle of the closed box, turned so that its axes are not those of the world."""
+    turned = mi.ScalarTransform4f().translate([0, 0.1, 0]).rotate([0, 0, 1], 25).rotate([1, 0, 0], 60).scale(0.35)
+    return {"ball": {"type": "sphere", "to_world": turned, "emitter": {"type": "area", "radiance": radiance}}}
+
+
+def half_bright():
+    """A texture of large patches, one half much brighter than the other."""
+    pixels = np.random.default_rng(3).uniform(0, 4, (4, 8, 3)).astype(np.float32)
+    pixels[1, :4] = 20
+    return {"type": "bitmap", "raw": True, "filter_type": "nearest", "bitmap": mi.Bitmap(pixels)}
+
+
+def smooth_octahedron(flip=False, size=0.4):
+    """A glowing mesh with the normals of a ball: near its outline, faces that are seen shine the other way."""
+    props = mi.Properties()
+    props["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": 4.0}})
+    props["flip_normals"] = flip
+    corners = np.concatenate([np.eye(3), -np.eye(3)])
+    faces = [[x, y, z] if np.linalg.det(corners[[x, y, z]]) > 0 else [x, z, y]
+             for x in (0, 3) for y in (1, 4) for z in (2, 5)]  # fmt: skip
+    mesh = mi.Mesh("octahedron", len(corners), len(faces), props, has_vertex_normals=True)
+    parameters = mi.traverse(mesh)
+    turned = corners @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    parameters["vertex_positions"] = upload(mi.Float, size * turned + [0, 0.1, 0])
+    parameters["vertex_normals"] = upload(mi.Float, turned)
+    parameters["faces"] = upload(mi.UInt32, np.array(faces))
+    parameters.update()
+    return {"lamp": mesh}
+
+
+def assert_light_of_path(emitters, plugin, spp, seeds=12, path_spp=64, **more):
+    scene = mi.load_dict(closed_box(emitters, 16))
+    depth = {"max_depth": more.pop("max_depth", 2)}
+    assert_same_mean_over_seeds(
+        (render(scene, plugin, spp, seed, **depth, **more), render(scene, "path", path_spp, seed, **depth))
+        for seed in range(seeds)
+    )
+
+
+@pytest.mark.parametrize("method", DIRECT)
+def test_a_textured_sphere_lights_from_where_its_texture_is_bright(method):
+    plugin, more = DIRECT[method]
+    assert_light_of_path(ball(half_bright()), plugin, 16, **more)
+
+
+def test_light_paths_leave_a_turned_sphere_outwards():
+    white = {"type": "rgb", "value": 4.0}
+    assert_light_of_path(ball(white), "vpl", 16, max_depth=3, vpl_count=2000, clamping=0.0)
+
+
+@pytest.mark.parametrize("method", ["adaptivedirect", "unoccludeddirect"])
+def test_a_mesh_with_vertex_normals_emits_to_the_side_of_its_shading_normals(method):
+    """``path`` itself takes shading normals for the density of what it draws by area: BSDF samples are right."""
+    plugin, more = DIRECT[method]
+    scene = mi.load_dict(closed_box(smooth_octahedron(), 16))
+    bsdf_samples = {"emitter_samples": 0, "bsdf_samples": 1}
+    assert_same_mean_over_seeds(
+        (render(scene, plugin, 16, seed, **more), render(scene, "direct", 1024, seed, **bsdf_samples))
+        for seed in range(12)
+    )

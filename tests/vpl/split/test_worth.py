@@ -1,0 +1,78 @@
+"""Russian roulette by what paths are worth: when it pays, what it knows, and that the image stays that of `path`."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from vpl.core.arrays import upload_vectors
+from vpl.split.balance import importance
+from vpl.split.worth import Worth
+
+from tests.conftest import (
+    assert_same_mean_over_seeds,
+    closed_box,
+    render,
+    render_with_statistics,
+    sensor,
+    unit_vectors,
+    wall,
+)
+from tests.integrators.test_manylights import lamp_behind_the_camera
+
+
+def test_paths_end_where_they_bring_little_and_cost_much():
+    brought, edges = np.full(10_000, 0.01), np.full(10_000, 5)
+    multiple = importance(brought, brought, edges, 10_000, whole=1.0)
+    assert multiple * 0.01 < 0.2
+    # Where all of the noise is theirs, and nobody can tell which of them will bring it
+    rare = np.where(np.arange(10_000) % 100 == 0, 10.0, 0.0)
+    assert importance(np.ones(10_000), rare, edges, 10_000, whole=1.0) == np.inf
+
+
+def test_those_that_bring_more_are_followed():
+    """Half of the paths bring all: the others may end."""
+    bright = np.arange(10_000) % 2 == 0
+    worth = np.where(bright, 1.0, 0.01)
+    multiple = importance(worth, worth, np.full(10_000, 8), 10_000, whole=1.0)
+    assert 0.5 <= multiple and multiple * 0.01 < 0.5
+
+
+def test_what_a_vertex_sent_back_does_not_tell_of_itself():
+    rng, count = np.random.default_rng(0), 500
+    # Ten to a place
+    position = np.repeat(rng.random((count // 10, 3)).astype(np.float32), 10, 0)
+    normal = np.repeat(unit_vectors(rng, count // 10), 10, 0)
+    radiance = np.zeros(count)
+    radiance[7] = 100.0
+    worth, expected = Worth.of(position, normal, radiance)
+    assert expected[7] < 0.5 * expected[8] and expected[8] == expected.max()
+    # The device has what all of them tell
+    site = worth.sites.at(
+        *(upload_vectors(kind, x[7:8]) for kind, x in ((mi.Point3f, position), (mi.Normal3f, normal)))
+    )
+    assert np.array(worth.radiance)[np.array(site)[0]] == pytest.approx(np.max(np.array(worth.radiance)))
+
+
+@pytest.mark.parametrize("lights", [True, False])
+def test_the_image_is_that_of_path(monkeypatch, lights_cost_nothing, lights):
+    """Most paths end at their second vertices here, as all are thought to be worth little."""
+    monkeypatch.setattr("vpl.split.decision.importance", lambda *_: 0.3)
+    scene, pairs = mi.load_dict(closed_box(lamp_behind_the_camera(), size=16)), []
+    for seed in range(16):
+        found, statistics = render_with_statistics("manylights", scene, 32, seed, virtual_lights=lights)
+        assert ("lights" in statistics) == lights and statistics["worth"] > 0
+        pairs.append((found, render(scene, "path", 32, 1000 + seed)))
+    assert_same_mean_over_seeds(pairs)
+
+
+def test_alpha_is_that_of_path_where_a_pixel_sees_masks_behind_masks(monkeypatch):
+    monkeypatch.setattr("vpl.split.decision.importance", lambda *_: 1e-6)
+    mask = {"type": "mask", "opacity": 0.3, "nested": {"type": "twosided", "nested": {"type": "diffuse"}}}
+    veils = {f"veil{k}": wall([0, 0, -0.3 * k], [0, 1, 0], 0, 8, bsdf=mask) for k in range(6)}
+    description = {"type": "scene", "sensor": sensor(16), "lamp": {"type": "point", "position": [0, 0, 3]}, **veils}
+    description["sensor"]["film"]["pixel_format"] = "rgba"
+    scene = mi.load_dict(description)
+    given = {"max_depth": 10, "rr_depth": 20}
+    found, statistics = render_with_statistics("manylights", scene, 64, **given)
+    assert statistics["worth"] > 0
+    assert found[..., 3].mean() == pytest.approx(render(scene, "path", 64, 1, **given)[..., 3].mean(), rel=0.02)
