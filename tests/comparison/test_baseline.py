@@ -7,9 +7,7 @@ import pytest
 import compare
 from comparison import analysis, baseline, report
 from comparison.command_line import UsageError
-
-from tests.conftest import SWEEP
-from tests.comparison.test_report import results_of
+from tests.support.comparisons import SWEEP, results_of
 
 
 def fake_results(speed_up):

@@ -9,16 +9,8 @@ import pytest
 import manylights
 from comparison import batch, images
 from comparison.command_line import UsageError
-
-from tests.conftest import CORNELL
-
-TWO_SENSORS = """
-<scene version="3.0.0"><emitter type="constant"/><integrator type="path"/>
-<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="4"/>
-</film></sensor>
-<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="6"/><integer name="height" value="6"/>
-</film></sensor></scene>
-"""
+from tests.support.comparisons import TWO_SENSORS
+from tests.support.paths import CORNELL
 
 
 def options(**given):

@@ -14,8 +14,8 @@ import pytest
 
 import manylights
 from comparison import command_line, images, one_image
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 CORNELL = str(ROOT / "scenes" / "cornell.xml")
 TINY = ["-D", "resx=16", "-D", "resy=16"]
 

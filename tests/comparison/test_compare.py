@@ -3,7 +3,6 @@
 import html
 import json
 import re
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -12,10 +11,9 @@ import pytest
 import compare
 from comparison import images, rendering, worker
 from comparison.scene_files import SceneFile
+from tests.support.paths import CORNELL, ROOT
+from tests.support.scenes import cornell
 
-from tests.conftest import CORNELL, cornell
-
-ROOT = Path(__file__).resolve().parents[2]
 HALL, HALL_REFERENCE = (str(ROOT / "scenes" / name) for name in ("hall.xml", "hall_reference.exr"))
 
 

@@ -8,8 +8,7 @@ from scipy import stats
 
 from comparison import curves
 from comparison.curves import Curve, Point
-
-from tests.conftest import examples
+from tests.support.properties import examples
 
 SEEDS = (0, 1, 2)
 

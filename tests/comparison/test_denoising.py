@@ -12,9 +12,10 @@ import compare
 import manylights
 from comparison import images
 from comparison.denoising import Denoiser, auxiliary_features
-
-from tests.conftest import CORNELL, cornell, render, sensor, wall
-from tests.comparison.test_report import results_of
+from tests.support.comparisons import results_of
+from tests.support.paths import CORNELL
+from tests.support.rendering import render
+from tests.support.scenes import cornell, sensor, wall
 
 RED = (0.6, 0.1, 0.2)
 

@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from comparison import metrics
-
-from tests.conftest import examples
+from tests.support.properties import examples
 
 ERRORS = ("relative_l1", "rmse", "relmse", "relmse_trimmed", "bias")
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from comparison import images, page_images, report
-
 from tests.support import chromium
 
 

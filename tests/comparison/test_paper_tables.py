@@ -8,8 +8,7 @@ import pytest
 from comparison import metrics, paper_tables, report
 from comparison.published import TABLES
 from comparison.quantities import QUANTITIES
-
-from tests.comparison.test_report import SCHEMA, results_of
+from tests.support.comparisons import SCHEMA, results_of
 
 ALL = dict.fromkeys(metrics.NAMES, 0.0)
 

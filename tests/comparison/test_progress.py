@@ -14,9 +14,8 @@ from comparison.ending import Ending
 from comparison.progress import ImageBar
 from comparison.render import Took
 from integrators import PLUGINS
+from tests.support.scenes import cornell
 from vpl.core.stages import Stage, listening, tell
-
-from tests.conftest import cornell
 
 SMALL = {"vpl_count": 500, "max_depth": 3}
 

@@ -1,17 +1,13 @@
 """References: batches and their standard errors, kept and continued; the one that is shipped."""
 
-from pathlib import Path
-
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from comparison import references, rendering
 from comparison.scene_files import SceneFile
-
-from tests.conftest import cornell
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.paths import ROOT
+from tests.support.scenes import cornell
 
 
 def test_batches_are_mean_and_standard_error(tmp_path):

@@ -12,8 +12,8 @@ import pytest
 import manylights
 from comparison import convergence, rendering
 from comparison import render as render_module
-
-from tests.conftest import area_light, closed_box, cornell, render_with_statistics, sensor
+from tests.support.rendering import render_with_statistics
+from tests.support.scenes import area_light, closed_box, cornell, sensor
 
 
 @pytest.fixture

@@ -5,25 +5,14 @@ import json
 import re
 from pathlib import Path
 
-import jsonschema
 import mitsuba as mi
 import numpy as np
 import pytest
 
 import compare
 from comparison import analysis, images, metrics, plots, references, strip, tables
-
-from tests.conftest import CORNELL
-
-ROOT = Path(__file__).resolve().parents[2]
-SCHEMA = json.loads((ROOT / "comparison" / "results.schema.json").read_text())
-
-
-def results_of(out):
-    results = json.loads((out / "results.json").read_text())
-    jsonschema.validate(results, SCHEMA, jsonschema.Draft202012Validator)
-    return results
-
+from tests.support.comparisons import results_of
+from tests.support.paths import CORNELL
 
 # --- results.json ---
 

@@ -15,9 +15,8 @@ import pytest
 
 import compare
 from comparison import images, runs, worker
-
-from tests.conftest import CORNELL
-from tests.comparison.test_report import ROOT, SCHEMA
+from tests.support.comparisons import SCHEMA
+from tests.support.paths import CORNELL, ROOT
 
 
 def command(out):

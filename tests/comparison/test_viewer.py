@@ -7,7 +7,6 @@ import pytest
 
 from comparison import images, metrics, report, verdict
 from comparison.pictures import REFERENCE, Pictures
-
 from tests.support import chromium
 
 SIZE = 32

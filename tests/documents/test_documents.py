@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.paths import ROOT
+
 PAGES = [ROOT / "README.md", ROOT / "scenes" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PLUGINS = {file for file in (ROOT / "integrators").glob("*.py") if "\nmi.register_integrator(" in file.read_text()}
 

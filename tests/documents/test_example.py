@@ -4,15 +4,14 @@ which has the mean of the sum of all lights."""
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from integrators.knobs import knobs_of
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = {"max_depth": 4, "vpl_count": 500}
 
 

@@ -4,18 +4,16 @@ import html
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import mitsuba as mi
 import pytest
 
 import integrators
 from integrators.knobs import knobs_of
-
 from tests.support import chromium
 from tests.support.chromium import Chromium
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 MOST_BYTES = 2_000_000
 WIDTHS = (420, 1600)
 

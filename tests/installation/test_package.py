@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 
 import integrators
+from tests.support.paths import ROOT
+from tests.support.registration import FIRST, LATER, LOAD
 
-from tests.installation.test_registration import FIRST, LATER, LOAD
-
-ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("comparison", "integrators", "vpl")
 NO_SOURCES = shutil.ignore_patterns(".*", "__pycache__", "build", "dist", "*.egg-info", "output", "shared", "tests")
 

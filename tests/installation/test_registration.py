@@ -3,25 +3,12 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 import integrators
-
-ROOT = Path(__file__).resolve().parents[2]
-
-FIRST = "import manylights, mitsuba as mi\n"
-LATER = "import mitsuba as mi\nmi.set_variant('scalar_rgb')\nimport manylights\n"
-LOAD = """
-for variant in ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_mono"):
-    mi.set_variant(variant)
-    for name in manylights.integrators.PLUGINS:
-        try:
-            print(type(mi.load_dict({"type": name})).__name__)
-        except RuntimeError as error:
-            print(f'does not support the variant "{variant}"' in str(error))
-"""
+from tests.support.paths import ROOT
+from tests.support.registration import FIRST, LATER, LOAD
 
 
 def script(folder, text):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.paths import ROOT
 
 # Notes what it is asked, and has what the files beside the project say.
 PYTHON = r"""#!/bin/sh

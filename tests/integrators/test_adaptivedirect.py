@@ -8,10 +8,10 @@ import pytest
 from scipy import stats
 
 from benchmarks.printed_passes import PrintedEstimates, PrintedPasses, as_printed
+from tests.support.rendering import render
+from tests.support.scenes import area_light, closed_box, sensor, wall
 from vpl.direct import adaptive
 from vpl.direct.passes import SiteEstimates
-
-from tests.conftest import area_light, closed_box, render, sensor, wall
 
 PLUGINS = ("adaptivedirect", "unoccludeddirect")
 AOVS = ("noise", "passes", "shadow_rays", "visible")

@@ -7,8 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tests.support.catalogue import MATERIALS, PLUGINS, image, one_of, plugin, rgb, stage
-from tests.conftest import area_light, closed_box, render, wall
+from tests.support.catalogue import MATERIALS, PLUGINS, one_of, plugin, stage
+from tests.support.rendering import render
+from tests.support.scenes import area_light, closed_box, image, rgb, wall
 
 BAD = {"nan": math.nan, "inf": math.inf, "negative": -1.0, "huge": 3e38, "big": 1e29, "tiny": 1e-38, "denormal": 1e-42}
 QUICK = ("nan", "huge", "negative")

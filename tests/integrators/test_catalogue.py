@@ -18,10 +18,10 @@ from tests.support.catalogue import (
     film,
     one_of,
     plugin,
-    rgb,
     stage,
-)  # fmt: skip
-from tests.conftest import render, wall
+)
+from tests.support.rendering import render
+from tests.support.scenes import rgb, wall
 
 # A few materials that nothing else tests by every plugin, and emitters that compile quickly, for the short run
 QUICK_EMITTERS = ("point", "rectangle", "sphere", "envmap", "spot", "directional")

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tests.support.catalogue import PLUGINS, plugin, rgb
-from tests.conftest import closed_box, render, sensor, wall
+from tests.support.catalogue import PLUGINS, plugin
+from tests.support.rendering import render
+from tests.support.scenes import closed_box, rgb, sensor, wall
 
 pytestmark = pytest.mark.usefixtures("lights_cost_nothing")
 SEEDS = 12

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.support.pairs import prepared
+from tests.support.rendering import render
+from tests.support.rooms import GLOSSY, ODD_SCENES, glossy_room, many_kinds
+from tests.support.scenes import area_light, closed_box, sensor, wall
+from tests.support.statistics import relative_error
 from vpl.core.arrays import download, upload
-
-from tests.conftest import area_light, closed_box, relative_error, render, sensor, wall
-from tests.integrators.test_integrators import ODD_SCENES
-from tests.integrators.test_lightcuts import GLOSSY, many_kinds, prepared
-from tests.vpl.cuts.test_pairs import glossy_room
 
 NAME = "illuminationcut"
 COUNTED = ("shadow_rays", "bound_computations", "cut_size")

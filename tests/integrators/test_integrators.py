@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tests.conftest import area_light, closed_box, render, sensor, wall
+from tests.support.rendering import render
+from tests.support.rooms import ODD_SCENES
+from tests.support.scenes import area_light, closed_box, sensor, wall
 
 EXACT = {"clamping": 0.0, "vpl_count": 2000}
 
@@ -243,32 +245,6 @@ def test_a_medium_is_refused_by_name(capfd):
     assert said in str(error.value.__cause__)
     # `mi.render` raises another error, which does not say it
     assert said in "".join(capfd.readouterr())
-
-
-ODD_SCENES = {
-    "no emitters": lambda: closed_box({}),
-    "no geometry": lambda: {"type": "scene", "sensor": sensor(), "sky": {"type": "constant"}},
-    "nothing at all": lambda: {"type": "scene", "sensor": sensor()},
-    "camera sees nothing": lambda: {
-        "type": "scene", "sensor": sensor(), "ball": {"type": "sphere", "center": [0, 0, 90]}, "bulb": {"type": "point"}
-    },
-    "zero-power lights": lambda: closed_box(
-        {"lamp": area_light(radiance=[0, 0, 0]), "bulb": {"type": "point", "intensity": 0.0}}
-    ),
-    "light in a closed box": lambda: closed_box(
-        {"case": {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.2)}, "bulb": {"type": "point"}}
-    ),
-    "NaN light": lambda: closed_box(
-        {"lamp": area_light(), "bad": {"type": "point", "intensity": {"type": "rgb", "value": [math.nan] * 3}}}
-    ),
-    "NaN texture": lambda: closed_box(
-        {"lamp": area_light()},
-        bad=wall([0, 0, -0.9], [0, 1, 0], 0, 0.5, bsdf={
-            "type": "diffuse",
-            "reflectance": {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.full((2, 2, 3), np.nan, np.float32))},
-        }),
-    ),
-}  # fmt: skip
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -5,8 +5,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tests.support.catalogue import PLUGINS, plugin, rgb
-from tests.conftest import area_light, closed_box, relative_error, render
+from tests.support.catalogue import PLUGINS, plugin
+from tests.support.rendering import render
+from tests.support.scenes import area_light, closed_box, rgb
+from tests.support.statistics import relative_error
 
 QUICK = ("lightcuts", "adaptivedirect")
 

@@ -8,12 +8,11 @@ import mitsuba as mi
 import pytest
 
 import integrators
+from tests.support.scenes import area_light, closed_box
 from vpl.core.registry import RegistryTable
 from vpl.lights.emitters import read_emitters
 from vpl.points.camera_paths import shape_in
 from vpl.split import irradiance, surface_lights
-
-from tests.conftest import area_light, closed_box
 
 MITSUBAS = 2  # one makes the camera's rays, one puts samples on the film; both hold the image's width
 SETTINGS = {"manylights": {}, "adaptivedirect": {}, "unoccludeddirect": {}}

@@ -7,6 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.pairs import prepared
+from tests.support.rendering import render
+from tests.support.rooms import COATED, GLOSSY, many_kinds
+from tests.support.scenes import area_light, closed_box, sensor, wall
 from vpl.core.arrays import download, upload
 from vpl.cuts.light_cuts import CutChunk, collect_cuts, cut_sizes, evaluate_cuts, limited_cuts
 from vpl.lights.light_set import LightGroup, LightSet, light_tree
@@ -14,39 +18,6 @@ from vpl.lights.virtual_lights import VirtualLights
 from vpl.points.surfaces import LambertianSurface, ScatteringSurface
 from vpl.transport.contribution import contribution
 from vpl.transport.evaluation import sum_all_lights
-
-from tests.conftest import area_light, closed_box, render, sensor, wall
-
-GLOSSY = {"type": "roughconductor", "alpha": 0.2, "distribution": "ggx"}
-COATED = {"type": "roughplastic", "alpha": 0.15, "diffuse_reflectance": {"type": "rgb", "value": [0.2, 0.3, 0.4]}}
-
-
-def many_kinds():
-    """A closed box with point, spot and area emitters, a directional one that cannot get in, and glossy things."""
-    rng = np.random.default_rng(0)
-    lights = {"lamp": area_light(), "sun": {"type": "directional", "direction": [0, -1, 0]}}
-    for k in range(12):
-        x, y, z = map(float, rng.uniform(-0.8, 0.8, 3))
-        color = {"type": "rgb", "value": list(map(float, rng.uniform(0, 0.3, 3)))}
-        lights[f"point{k}"] = {"type": "point", "position": [x, y, z], "intensity": color}
-        aim = mi.ScalarTransform4f().look_at([x, y, z], [z, x, y], [0, 0, 1])
-        lights[f"spot{k}"] = {"type": "spot", "to_world": aim, "intensity": color, "cutoff_angle": 20.0 + 3 * k}
-    return closed_box(
-        lights,
-        ball={"type": "sphere", "radius": 0.3, "center": [0.3, -0.7, -0.3], "bsdf": GLOSSY},
-        panel=wall([-0.5, -0.4, -0.6], [0, 1, 0], 30, 0.4, bsdf=COATED),
-    )
-
-
-def prepared(scene, seed=0, size=32, **more):
-    """The plugin and its jobs for one sample a pixel."""
-    plugin = mi.load_dict({"type": "lightcuts", "vpl_count": 3000, "max_depth": 5, **more})
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, size * size)
-    index = dr.arange(mi.UInt32, size * size)
-    position = mi.Point2f((mi.Float(index % size) + 0.5) / size, (mi.Float(index // size) + 0.5) / size)
-    ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
-    return plugin, plugin.prepare(scene, sampler, mi.Ray3f(ray)).jobs
 
 
 def test_error_zero_is_the_sum_of_all_lights():

@@ -11,6 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
+from tests.support.pairs import batch_of, prepared
+from tests.support.properties import assert_properties_are_shown, assert_property_is_refused, examples, unit_vectors
+from tests.support.rendering import render, render_with_statistics
+from tests.support.rooms import glossy_room, many_kinds
+from tests.support.scenes import area_light, closed_box, wall
+from tests.support.statistics import assert_same_mean_over_seeds, relative_error
 from vpl.core import arrays
 from vpl.core.arrays import download, upload
 from vpl.matrix import light_matrix
@@ -19,22 +25,6 @@ from vpl.matrix.light_matrix import ColumnWeights, DeviceForest, NearRows, Sampl
 from vpl.matrix.slice_columns import _Chosen, _drawn_lights, fine_forest, slice_lights
 from vpl.points.point_clusters import PointClusters
 from vpl.points.slices import build_slices
-
-from tests.conftest import (
-    area_light,
-    assert_properties_are_shown,
-    assert_property_is_refused,
-    assert_same_mean_over_seeds,
-    closed_box,
-    examples,
-    relative_error,
-    render,
-    render_with_statistics,
-    unit_vectors,
-    wall,
-)
-from tests.integrators.test_lightcuts import many_kinds, prepared
-from tests.vpl.cuts.test_pairs import batch_of, glossy_room
 
 NAME = "lightslice"
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from tests.support.catalogue import PLUGINS, plugin
-from tests.conftest import area_light, closed_box, render
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.paths import ROOT
+from tests.support.rendering import render
+from tests.support.scenes import area_light, closed_box
 
 
 def resident() -> int:

@@ -6,21 +6,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tests.support.catalogue import EMITTERS, MATERIALS, ONE_PIXEL, SENSORS, film, image, one_of, rgb, stage
-from tests.conftest import (
-    LEAST_P,
-    area_light,
-    assert_same_mean_over_seeds,
-    closed_box,
-    render,
-    render_with_statistics,
-    same_mean_over_seeds,
-    sensor,
-    wall,
-)  # fmt: skip
-from tests.vpl.lights.test_area_emitters import smooth_octahedron
-from tests.integrators.test_masks_in_between import veiled_room
-from tests.vpl.direct.test_small_suns import sunny
+from tests.support.catalogue import EMITTERS, MATERIALS, ONE_PIXEL, SENSORS, film, one_of, stage
+from tests.support.rendering import render, render_with_statistics
+from tests.support.rooms import bulb, lamp_behind_the_camera, smooth_octahedron, sunny, veiled_room
+from tests.support.scenes import area_light, closed_box, image, rgb, sensor, wall
+from tests.support.statistics import LEAST_P, assert_same_mean_over_seeds, same_mean_over_seeds
 
 # What the quick run tests
 QUICK_EMITTERS = ("point", "spot", "directional", "rectangle", "envmap", "constant", "sunsky")
@@ -46,16 +36,6 @@ def assert_image_of_path(description, spp=32, seeds=16, reference="path", lights
 
     if same_mean_over_seeds([pair(seed) for seed in range(seeds)]) <= LEAST_P:
         assert_same_mean_over_seeds([pair(seeds + seed) for seed in range(4 * seeds)])
-
-
-def lamp_behind_the_camera():
-    """A square lamp that the camera of the closed box does not see: it would be most of the noise."""
-    transform = mi.ScalarTransform4f().translate([0, 0.9, 0.6]).rotate([1, 0, 0], 90).scale(0.3)
-    return {"light": {"type": "rectangle", "to_world": transform, "emitter": {"type": "area", "radiance": rgb(4.0)}}}
-
-
-def bulb():
-    return {"bulb": {"type": "point", "position": [0.3, 0.4, 0.6], "intensity": rgb(1.0)}}
 
 
 def room_of(material, emitters):

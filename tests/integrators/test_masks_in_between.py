@@ -3,24 +3,16 @@
 import mitsuba as mi
 import pytest
 
-from tests.support.catalogue import plugin, rgb
-from tests.conftest import assert_same_mean_over_seeds, closed_box, render, wall
+from tests.support.catalogue import plugin
+from tests.support.rendering import render
+from tests.support.rooms import veiled_room
+from tests.support.scenes import rgb
+from tests.support.statistics import assert_same_mean_over_seeds
 
 ALL_LIGHTS = {"clamping": 0.0, "vpl_count": 1000}
 WITH_LIGHTS = (
     "vpl", "lightcuts", "mdlightcuts", "lightslice", "matrixrecovery", "illuminationcut", "illuminationcut-adaptive",
 )  # fmt: skip
-
-
-def veiled_room(veils=4, lamp=None):
-    """A room that is halved by masks; its back wall shines, if no other lamp is given."""
-    box = closed_box(lamp or {}, 16)
-    if lamp is None:
-        box["back"]["emitter"] = {"type": "area", "radiance": rgb(1.0)}
-    for k in range(veils):
-        mask = {"type": "mask", "opacity": 0.4, "nested": {"type": "diffuse"}}
-        box[f"veil{k}"] = wall([0, 0, -0.6 + 0.1 * k], [0, 1, 0], 0, 1.0, bsdf=mask)
-    return box
 
 
 def assert_image_of_prb(description, max_depth, seeds=10):

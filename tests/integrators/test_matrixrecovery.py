@@ -1,7 +1,6 @@
 """The integrator ``matrixrecovery``: slices, columns, predictors, separation, and images against ``vpl``."""
 
 from functools import partial
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +11,13 @@ from hypothesis import strategies as st
 
 from benchmarks.separated_light import light_of_entries
 from comparison.scene_files import SceneFile
+from tests.support.pairs import batch_of
+from tests.support.paths import ROOT
+from tests.support.properties import assert_properties_are_shown, assert_property_is_refused, examples, unit_vectors
+from tests.support.rendering import render, render_with_statistics
+from tests.support.rooms import glossy_room, many_kinds
+from tests.support.scenes import area_light, closed_box, sensor, wall
+from tests.support.statistics import relative_error
 from vpl.core.arrays import download, upload
 from vpl.matrix import recovery as matrix_recovery
 from vpl.matrix.reduced_columns import _nearby
@@ -20,24 +26,7 @@ from vpl.matrix.separation import Separation, SeparationLimits, separate, sketch
 from vpl.points.point_clusters import PointClusters
 from vpl.points.slice_rows import build_row_slices, golden_steps, rows_of, tangent_places
 
-from tests.conftest import (
-    area_light,
-    assert_properties_are_shown,
-    assert_property_is_refused,
-    closed_box,
-    examples,
-    relative_error,
-    render,
-    render_with_statistics,
-    sensor,
-    unit_vectors,
-    wall,
-)
-from tests.integrators.test_lightcuts import many_kinds
-from tests.vpl.cuts.test_pairs import batch_of, glossy_room
-
 NAME = "matrixrecovery"
-ROOT = Path(__file__).resolve().parents[2]
 PREDICTED = "nearest,linear,bayes"
 SMALL = {"max_depth": 4, "vpl_count": 3000, "direct": "vpl"}
 # Every light a column of its own, every row traced

@@ -9,27 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.pairs import batch_of
+from tests.support.properties import assert_properties_are_shown, assert_property_is_refused, examples
+from tests.support.rendering import render
+from tests.support.rooms import glossy_room, many_kinds
+from tests.support.scenes import area_light, closed_box, sensor, wall
+from tests.support.statistics import assert_same_mean_over_seeds, relative_error
 from vpl.core.arrays import download, upload
 from vpl.cuts.pixel_cuts import PixelCuts
 from vpl.cuts.product_cuts import Pairs
 from vpl.points import gather_tree
 from vpl.points.gather_tree import build_gather_tree
 from vpl.points.point_clusters import PointClusters
-
-from tests.conftest import (
-    area_light,
-    assert_properties_are_shown,
-    assert_property_is_refused,
-    assert_same_mean_over_seeds,
-    closed_box,
-    examples,
-    relative_error,
-    render,
-    sensor,
-    wall,
-)
-from tests.integrators.test_lightcuts import many_kinds
-from tests.vpl.cuts.test_pairs import batch_of, glossy_room
 
 NAME = "mdlightcuts"
 

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from tests.support.catalogue import EMITTERS, stage
-from tests.conftest import area_light, closed_box, relative_error, render
+from tests.support.rendering import render
+from tests.support.scenes import area_light, closed_box
+from tests.support.statistics import relative_error
 
 
 @pytest.fixture(autouse=True)

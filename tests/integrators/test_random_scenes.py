@@ -7,12 +7,13 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from tests.support.catalogue import PLUGINS, plugin
+from tests.support.properties import examples
+from tests.support.rendering import render
+from tests.support.scenes import rgb, sensor
 from vpl.core.arrays import LARGEST_VALUE, download, upload
 from vpl.core.sampling import Choice
 from vpl.lights.virtual_lights import VirtualLights
-
-from tests.support.catalogue import PLUGINS, plugin, rgb
-from tests.conftest import examples, render, sensor
 
 COORDINATES = st.one_of(st.floats(-1.5, 1.5, width=32), st.sampled_from([0.0, 1.0, -1.0, 1e-6, 1e-20, 1e6, -1e6, 1e20]))
 SIZES = st.one_of(st.floats(0.0625, 2.0, width=32), st.sampled_from([0.0, 1e-20, 1e-6, 1e-3, 30.0, 1e6]))

@@ -4,10 +4,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.rendering import render
+from tests.support.scenes import sensor, wall
 from vpl.direct.adaptive import _BatchLight
 from vpl.split import balance
-
-from tests.conftest import render, sensor, wall
 
 SIZE = 16
 

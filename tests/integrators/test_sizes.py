@@ -3,8 +3,9 @@
 import mitsuba as mi
 import numpy as np
 
-from tests.support.catalogue import rgb
-from tests.conftest import area_light, assert_same_mean_over_seeds, closed_box, render
+from tests.support.rendering import render
+from tests.support.scenes import area_light, closed_box, rgb
+from tests.support.statistics import assert_same_mean_over_seeds
 
 PLACES = np.random.default_rng(1).uniform(-0.9, 0.9, (8, 3)).tolist()
 

@@ -8,10 +8,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.rendering import render
+from tests.support.scenes import area_light, closed_box
 from vpl.cuts import light_cuts
 from vpl.transport import evaluation
-
-from tests.conftest import area_light, closed_box, render
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import manylights
-
-from tests.conftest import area_light, closed_box, render
+from tests.support.rendering import render
+from tests.support.scenes import area_light, closed_box
 
 PLUGINS = ["vpl", "adaptivedirect", "manylights"]
 REFUSAL = "another thread is rendering with the same "

@@ -11,8 +11,6 @@ import pytest
 from comparison.images import read_exr
 from comparison.scene_files import SceneFile
 
-from tests.conftest import VARIANT
-
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 # Of each: the generator, its options, how many emitters there are (point, area, environment), how many of them an
 # average pixel may see, and how much of the image may show the sky.
@@ -46,7 +44,7 @@ def scalar_variant(variant):
     """These scenes are looked at and rendered a little each, which is soonest done without compiling."""
     mi.set_variant("scalar_rgb")
     yield
-    mi.set_variant(VARIANT)
+    mi.set_variant(variant)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ import importlib.util
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -13,10 +12,9 @@ import numpy as np
 import pytest
 
 from comparison.scene_files import SceneFile
+from tests.support.paths import ROOT
+from tests.support.rendering import render
 
-from tests.conftest import render
-
-ROOT = Path(__file__).resolve().parents[2]
 SHARED = ROOT.parent / "shared" / "scenes"
 
 

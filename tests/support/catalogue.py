@@ -6,7 +6,7 @@ Functions that return dictionaries for ``mi.load_dict``; they are called when th
 import mitsuba as mi
 import numpy as np
 
-from tests.conftest import sensor, wall
+from tests.support.scenes import image, rgb, sensor, wall
 
 # Every plugin of ours, with parameters that make a small render quick
 PLUGINS = {
@@ -26,16 +26,6 @@ PLUGINS = {
 def plugin(name, **more):
     """The dictionary of a plugin of the list above."""
     return {"type": name.split("-")[0], **PLUGINS[name], **more}
-
-
-def rgb(*value):
-    """A constant colour."""
-    return {"type": "rgb", "value": list(value) if len(value) == 3 else [value[0]] * 3}
-
-
-def image(values):
-    """A bitmap texture, linear, of an array (height, width, channels)."""
-    return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.asarray(values, np.float32))}
 
 
 def _random(*shape):

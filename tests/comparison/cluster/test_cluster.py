@@ -15,17 +15,15 @@ import compare
 import manylights
 from comparison import checkpoint, images, one_image, rendering
 from comparison.cluster import compatibility, connection, passes, pool, runs, scene_travel
-from comparison.cluster.render import DistributedRender
 from comparison.scene_files import SceneFile
 from comparison.worker import Job
-
-from tests.conftest import CORNELL
-from tests.comparison.test_batch import TWO_SENSORS
-from tests.comparison.test_report import SCHEMA
+from tests.support.comparisons import SCHEMA, TWO_SENSORS
+from tests.support.distributed_renders import TINY, in_one_process, prepared
+from tests.support.paths import CORNELL
 
 distributed = pytest.importorskip("distributed")
 
-TINY = {"resx": "16", "resy": "16"}
+
 USUAL = ["-D", "resx=16", "-D", "resy=16", "-i", "path", "-t", "1", "--pass-spp", "4", "--seed", "5"]
 
 
@@ -74,12 +72,6 @@ def alone(tmp_path_factory):
     file = tmp_path_factory.mktemp("alone") / "a.exr"
     assert run(CORNELL, *USUAL, "--spp", 42, "-o", file) == 0
     return file
-
-
-def prepared(pool, integrator="path", **more):
-    file = SceneFile(CORNELL, TINY)
-    file.set_integrator(integrator)
-    return DistributedRender(pool, one_image.LazyScene(file), seed=5, pass_spp=4, **more)
 
 
 # ---------------------- The image ----------------------
@@ -164,11 +156,6 @@ def rendered_with_a_worker_killed(address, pause=0.0):
         image, took = prepared(workers, spp=200).render(progress=progress)
     assert killed and took.spp == 200
     return image.numpy()
-
-
-def in_one_process():
-    scene = SceneFile(CORNELL, TINY).load(1)
-    return manylights.render(scene, spp=200, pass_spp=4, seed=5)[0].numpy()
 
 
 def test_a_worker_that_is_killed_during_a_pass_changes_nothing(two):

@@ -15,11 +15,9 @@ import pytest
 
 from comparison.cluster import connection
 from comparison.images import read_exr
+from tests.support.distributed_renders import in_one_process, prepared
+from tests.support.paths import CORNELL, ROOT
 
-from tests.conftest import CORNELL
-from tests.comparison.cluster.test_cluster import in_one_process, prepared
-
-ROOT = Path(__file__).resolve().parents[3]
 distributed = pytest.importorskip("distributed")
 
 # A scheduler with a worker, in one process

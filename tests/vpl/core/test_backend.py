@@ -4,13 +4,11 @@ import glob
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from tests.support.paths import ROOT
 from vpl.core.backend import check_backend, import_drjit
-
-ROOT = Path(__file__).resolve().parents[3]
 
 # What a user would run, with the kernel that aborts LLVM 15 and 16 behind the check.
 RENDER = """

@@ -4,25 +4,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.calls import calls_of
+from tests.support.rendering import render
+from tests.support.scenes import area_light, closed_box, rgb
 from vpl.direct import cluster_sampling, emitter_sampling
 from vpl.lights.emitters import read_emitters
 from vpl.split.cells import Lines
 from vpl.split.surface_lights import _rays_to_surfaces
-
-from tests.support.catalogue import rgb
-from tests.conftest import area_light, closed_box, render
-
-
-def calls_of(monkeypatch, module, name):
-    """A list that grows by 1 whenever a function of a module is called."""
-    calls, original = [], getattr(module, name)
-
-    def counted(*arguments):
-        calls.append(1)
-        return original(*arguments)
-
-    monkeypatch.setattr(module, name, counted)
-    return calls
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.support.rendering import render
+from tests.support.scenes import area_light, sensor, wall
 from vpl.core.arrays import download, upload
 from vpl.core.sampling import Choice, RowChoice, SpreadSamples, independent_sampler, precise_sample
-
-from tests.conftest import area_light, render, sensor, wall
 
 SEQUENCES, MEMBERS = 2000, 64
 

@@ -7,9 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.scenes import area_light, closed_box
 from vpl.core.shared_code import share_code
-
-from tests.conftest import area_light, closed_box
 
 
 @pytest.fixture

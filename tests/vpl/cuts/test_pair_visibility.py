@@ -5,6 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.pairs import batch_of, lit_by
+from tests.support.scenes import sensor, wall
 from vpl.core.arrays import download, upload
 from vpl.cuts import adaptive_visibility as pair_visibility
 from vpl.cuts.adaptive_visibility import decide_visibility
@@ -14,9 +16,6 @@ from vpl.lights.virtual_lights import VirtualLights
 from vpl.points.camera_paths import scene_traits
 from vpl.points.point_clusters import PointClusters
 from vpl.transport.evaluation import Transport, sum_all_lights
-
-from tests.conftest import sensor, wall
-from tests.vpl.cuts.test_pairs import batch_of, lit_by
 
 OPAQUE = {"type": "diffuse"}
 VEIL = {"type": "mask", "opacity": 0.5, "nested": OPAQUE}

@@ -5,57 +5,22 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.pairs import CLAMP, batch_of, exact, lit_by, prepared, scene_of, unit
+from tests.support.rooms import glossy_room
 from vpl.core.arrays import download, upload
 from vpl.cuts import product_cuts as pairs
 from vpl.cuts.pair_lists import evaluate_lists, list_pairs
 from vpl.cuts.product_cuts import BoundCounter, Pairs, find_pairs
-from vpl.lights.light_set import LightGroup, LightSet, light_tree
-from vpl.lights.virtual_lights import KINDS, DeviceLights, VirtualLights
-from vpl.points.bsdf_proxies import MaterialProxy
+from vpl.lights.light_set import LightGroup
+from vpl.lights.virtual_lights import KINDS, VirtualLights
 from vpl.points.point_clusters import PointClusters
-from vpl.points.surfaces import Batch, LambertianSurface
 from vpl.transport.bounds import contribution_bound
 from vpl.transport.contribution import contribution
 from vpl.transport.evaluation import evaluate_pairs, sum_all_lights
 
-from tests.vpl.transport.test_bounds import exact, scene_of, unit
-from tests.integrators.test_lightcuts import COATED, GLOSSY, many_kinds, prepared
-
-PAIRS, CLAMP = 1500, 0.05
-
-
+PAIRS = 1500
 # Surface lights are gathered by Lambertian points alone, and have an oracle of their own in tests/vpl/split
 PAIRED = tuple(kind for kind in KINDS if kind != "surface")
-
-
-def lit_by(lights: VirtualLights, seed=5, max_depth=9):
-    """A set of lights of one kind."""
-    group = LightGroup(lights.kind, DeviceLights(lights), light_tree(lights, seed))
-    return LightSet([group], CLAMP if lights.kind == "oriented" else 0.0, max_depth, 0, 0, {})
-
-
-def vectors(array_type, values):
-    return array_type(*(upload(mi.Float, values[:, k]) for k in range(3)))
-
-
-def batch_of(position, normal, peak=None, no_cosine=None):
-    """Lambertian points made of arrays; with ``peak``, (n,), their proxies have lobes of that height as well."""
-    count, rng = len(position), np.random.default_rng(0)
-    albedo = vectors(mi.Color3f, rng.uniform(0.05, 0.3, (count, 3)))
-    interaction = dr.zeros(mi.Interaction3f, count)
-    interaction.p, interaction.n = vectors(mi.Point3f, position), vectors(mi.Normal3f, normal)
-    shading = vectors(mi.Normal3f, normal)
-    surfaces = LambertianSurface(interaction, dr.full(mi.UInt32, 1, count), shading, albedo)
-    no = dr.full(mi.Bool, False, count)
-    proxy = MaterialProxy(albedo, None, None, None, no, no, False, False)
-    if peak is not None:
-        proxy.peak = mi.Color3f(upload(mi.Float, peak)) * mi.Color3f(1, 0.5, 0.2)
-        proxy.exponent, proxy.glossy = upload(mi.Float, 10 ** rng.uniform(0, 2, count)), True
-        proxy.axis = vectors(mi.Vector3f, unit(rng, count))
-    if no_cosine is not None:
-        proxy.no_cosine, proxy.without_cosines = upload(mi.UInt32, no_cosine) == 1, True
-    dr.eval(surfaces.interaction, surfaces.depth, surfaces.normal, surfaces.albedo, shading, vars(proxy))
-    return Batch(dr.arange(mi.UInt32, count), surfaces, shading, proxy)
 
 
 def light_ranges(group: LightGroup):
@@ -108,13 +73,6 @@ def worst_pairs(clusters: PointClusters, lights: VirtualLights, rng):
         light = truth[tree.first[i] : tree.first[i] + tree.count[i], begin[j] : end[j]].sum(1).max()
         ratio[k] = light / max(bound[k], 1e-300) if light > 1e-12 * truth.max() else 0
     return ratio.max(), ratio[(tree.count[nodes] > 1) & (end[below] - begin[below] > 1)].max()
-
-
-def glossy_room():
-    """Of ``many_kinds()`` the camera sees little that is glossy: here two walls are as well."""
-    scene = many_kinds()
-    scene["floor"]["bsdf"], scene["left"]["bsdf"] = GLOSSY, COATED
-    return mi.load_dict(scene)
 
 
 def lights_of(kind, rng, spread):

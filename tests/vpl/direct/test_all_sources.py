@@ -4,10 +4,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.rendering import render
+from tests.support.scenes import closed_box, sensor, wall
+from tests.support.statistics import relative_error
 from vpl.direct.environment_regions import EnvironmentRegions
 from vpl.lights.emission import solid_angle_radiance
-
-from tests.conftest import closed_box, relative_error, render, sensor, wall
 
 
 def checkered():

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.properties import examples
 from vpl.direct.emitter_clusters import ClusterForest, build_cluster_forest
-
-from tests.conftest import examples
 
 DTYPES = {name: np.uint32 for name in ("escape", "first", "last", "depth", "roots", "leaf_order")}
 

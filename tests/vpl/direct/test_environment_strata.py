@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from tests.support.properties import examples
 from vpl.direct.environment_strata import _assign, _cells, _components, _farthest_first, cones, stratify
-
-from tests.conftest import examples
 
 SUN, LAMP = (0.5, 0.3, 0.8), (-0.2, 0.9, -0.4)
 

@@ -5,12 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.properties import examples
 from vpl.direct.cluster_cuts import GroupCuts, PointGroups, cut_clusters, has_wide_source
 from vpl.direct.emitter_clusters import build_cluster_forest
 from vpl.direct.sites import BLOCK, bound_groups, find_groups, find_sites, normal_class
 from vpl.direct.sources import Nodes
-
-from tests.conftest import examples
 
 SEEDS = st.integers(0, 2**32 - 1)
 UP, DOWN = (0.0, 0, 1), (0.0, 0, -1)

@@ -5,23 +5,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.rendering import render
+from tests.support.rooms import sunny
+from tests.support.scenes import sensor, wall
 from vpl.core.arrays import download
 from vpl.core.sampling import independent_sampler
 from vpl.direct.environment_regions import EnvironmentRegions
 
-from tests.conftest import render, sensor, wall
-
 COUNT = 200_000
 # Rows and columns of an image, and the texel of the sun
 SKIES = [((64, 128), (20, 30)), ((250, 500), (80, 123)), ((1024, 2048), (300, 700)), ((1024, 4096), (150, 700))]
-
-
-def sunny(shape=(250, 500), sun=(80, 123), level=1e5, turn=0.0):
-    """A grey sky with a sun of one texel."""
-    pixels = np.full((*shape, 3), 0.2, np.float32)
-    pixels[sun] = level
-    turned = mi.ScalarTransform4f().rotate([0, 1, 0], turn).rotate([0, 0, 1], turn / 3)
-    return {"sky": {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": turned}}
 
 
 def floor_under(sky):

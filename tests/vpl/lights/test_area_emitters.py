@@ -4,9 +4,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.core.arrays import upload
-
-from tests.conftest import assert_same_mean_over_seeds, closed_box, render
+from tests.support.rendering import render
+from tests.support.rooms import smooth_octahedron
+from tests.support.scenes import closed_box
+from tests.support.statistics import assert_same_mean_over_seeds
 
 # Plugins that find emitters in ways of their own, with light paths of two edges
 DIRECT = {
@@ -29,24 +30,6 @@ def half_bright():
     pixels = np.random.default_rng(3).uniform(0, 4, (4, 8, 3)).astype(np.float32)
     pixels[1, :4] = 20
     return {"type": "bitmap", "raw": True, "filter_type": "nearest", "bitmap": mi.Bitmap(pixels)}
-
-
-def smooth_octahedron(flip=False, size=0.4):
-    """A glowing mesh with the normals of a ball: near its outline, faces that are seen shine the other way."""
-    props = mi.Properties()
-    props["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": 4.0}})
-    props["flip_normals"] = flip
-    corners = np.concatenate([np.eye(3), -np.eye(3)])
-    faces = [[x, y, z] if np.linalg.det(corners[[x, y, z]]) > 0 else [x, z, y]
-             for x in (0, 3) for y in (1, 4) for z in (2, 5)]  # fmt: skip
-    mesh = mi.Mesh("octahedron", len(corners), len(faces), props, has_vertex_normals=True)
-    parameters = mi.traverse(mesh)
-    turned = corners @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    parameters["vertex_positions"] = upload(mi.Float, size * turned + [0, 0.1, 0])
-    parameters["vertex_normals"] = upload(mi.Float, turned)
-    parameters["faces"] = upload(mi.UInt32, np.array(faces))
-    parameters.update()
-    return {"lamp": mesh}
 
 
 def assert_light_of_path(emitters, plugin, spp, seeds=12, path_spp=64, **more):

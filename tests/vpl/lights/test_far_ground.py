@@ -4,16 +4,17 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.catalogue import EMITTERS
+from tests.support.rendering import render
+from tests.support.rooms import lamp_behind_the_camera
+from tests.support.scenes import closed_box, rgb, wall
+from tests.support.statistics import assert_same_mean_over_seeds
 from vpl.core.arrays import download
 from vpl.core.sampling import independent_sampler
 from vpl.lights.emission import ParallelRays, bounding_sphere
 from vpl.lights.emitters import read_emitters
 from vpl.lights.focus import Focus, spacing
 from vpl.lights.tracing import PathLimits, trace_lights
-
-from tests.support.catalogue import EMITTERS, rgb
-from tests.conftest import assert_same_mean_over_seeds, closed_box, render, wall
-from tests.integrators.test_manylights import lamp_behind_the_camera
 
 LIGHTS = {
     "lamp": lamp_behind_the_camera,

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from tests.support.properties import examples
 from vpl.lights.light_set import moments_below
 from vpl.lights.light_tree import (
     BOX_MAX,
@@ -21,8 +22,6 @@ from vpl.lights.light_tree import (
     LightTree,
     build_light_tree,
 )
-
-from tests.conftest import examples
 
 
 def random_unit(rng, count):

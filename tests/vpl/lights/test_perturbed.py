@@ -4,8 +4,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tests.support.catalogue import image, rgb
-from tests.conftest import assert_same_mean_over_seeds, closed_box, render, sensor, wall
+from tests.support.rendering import render
+from tests.support.scenes import closed_box, image, rgb, sensor, wall
+from tests.support.statistics import assert_same_mean_over_seeds
 
 WHITE = {"type": "diffuse", "reflectance": rgb(0.8)}
 # Plugins with virtual lights, with what lets them find nearly the sum of all

@@ -8,14 +8,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.scenes import area_light, closed_box, wall
 from vpl.core.arrays import download, upload
 from vpl.core.sampling import Choice, derived_seed
 from vpl.lights import tracing
 from vpl.lights.emission import bounding_box, emission_groups
 from vpl.lights.emitters import read_emitters
 from vpl.lights.tracing import PathLimits, trace_lights
-
-from tests.conftest import area_light, closed_box, wall
 
 
 def traced(scene, count=20_000, seed=0, deepest=math.inf, rr_depth=5, lobe_limit=1.0):

@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.properties import examples
 from vpl.core.arrays import download, upload
 from vpl.points.point_clusters import NodeBounds
 from vpl.points.point_tree import build_point_tree, point_codes
-
-from tests.conftest import examples
 
 
 def random_unit(rng, count):

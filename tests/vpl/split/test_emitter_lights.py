@@ -7,13 +7,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.calls import calls_of
+from tests.support.catalogue import EMITTERS
+from tests.support.many_emitters import bulbs, emission_of, interactions, panels, vertices
+from tests.support.rendering import render
+from tests.support.scenes import closed_box, image, rgb, wall
+from tests.support.statistics import assert_same_mean_over_seeds
 from vpl.split import balance as balances
 from vpl.split import decision
-
-from tests.support.catalogue import EMITTERS, image, rgb
-from tests.conftest import assert_same_mean_over_seeds, closed_box, render, wall
-from tests.vpl.core.test_loops import calls_of
-from tests.vpl.split.test_tree_emitters import bulbs, emission_of, interactions, panels, vertices
 
 
 def spots(number, rng):

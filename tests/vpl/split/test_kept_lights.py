@@ -7,11 +7,11 @@ import pytest
 import manylights
 from comparison import images
 from comparison.scene_files import SceneFile
+from tests.support.catalogue import EMITTERS
+from tests.support.scenes import area_light, closed_box, image, rgb, sensor
+from tests.support.statistics import assert_same_mean_over_seeds
 from vpl.core.parameters import fingerprint, fingerprint_without_camera
 from vpl.split import kept_lights
-
-from tests.support.catalogue import EMITTERS, image, rgb
-from tests.conftest import area_light, assert_same_mean_over_seeds, closed_box, sensor
 
 pytestmark = pytest.mark.usefixtures("lights_cost_nothing")
 

@@ -5,6 +5,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.catalogue import EMITTERS, SENSORS, film
+from tests.support.many_emitters import interactions
+from tests.support.properties import unit_vectors
+from tests.support.rendering import render, render_with_statistics
+from tests.support.scenes import closed_box, image, rgb, sensor
 from vpl.core.arrays import download, upload, upload_vectors
 from vpl.lights.light_set import LightSet
 from vpl.split.gather_vertices import LitVertices
@@ -13,10 +18,6 @@ from vpl.split.learned_emitters import LearnedEmitters
 from vpl.split.site_choice import SiteChoice
 from vpl.split.sites import Sites
 from vpl.split.view_lights import ViewLights
-
-from tests.support.catalogue import EMITTERS, SENSORS, film, image, rgb
-from tests.conftest import closed_box, render, render_with_statistics, sensor, unit_vectors
-from tests.vpl.split.test_tree_emitters import interactions
 
 
 def bulbs(**second):

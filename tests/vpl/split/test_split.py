@@ -11,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from tests.support.catalogue import EMITTERS, MATERIALS, one_of, stage
+from tests.support.properties import examples, unit_vectors
 from vpl.core.arrays import upload
 from vpl.lights.light_set import ScatteredGroup
 from vpl.lights.perturbed import Perturbed
@@ -25,9 +27,6 @@ from vpl.split.remainder import power_heuristic
 from vpl.split.view import View
 from vpl.transport.bounds import contribution_bound
 from vpl.transport.contribution import contribution
-
-from tests.support.catalogue import EMITTERS, MATERIALS, one_of, stage
-from tests.conftest import examples, unit_vectors
 
 
 def points(columns):

@@ -5,56 +5,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.catalogue import EMITTERS
+from tests.support.many_emitters import bulbs, emission_of, interactions, panels, vertices
+from tests.support.rendering import render
+from tests.support.scenes import closed_box, rgb, wall
+from tests.support.statistics import assert_same_mean_over_seeds
 from vpl.core.arrays import upload_vectors
 from vpl.lights.emitters import read_emitters
 from vpl.split.emitter_tree import EmitterTree
-from vpl.split.irradiance import Places, learn_emitters
-from vpl.split.tree_emitters import TreeEmitters
-
-from tests.support.catalogue import EMITTERS, rgb
-from tests.conftest import assert_same_mean_over_seeds, closed_box, render, unit_vectors, wall
 
 COUNT = 300
-
-
-def panels(number, rng):
-    """Small area emitters in the upper half of the closed box, that face down."""
-    turned = mi.ScalarTransform4f().rotate([1, 0, 0], 90).scale(0.02)
-    places = rng.uniform([-0.9, 0.0, -0.9], [0.9, 0.9, 0.9], (number, 3))
-    return {
-        f"panel{i}": {
-            "type": "rectangle",
-            "to_world": mi.ScalarTransform4f().translate(list(place)) @ turned,
-            "emitter": {"type": "area", "radiance": rgb(float(rng.uniform(1, 5)))},
-        }
-        for i, place in enumerate(places)
-    }
-
-
-def bulbs(number, rng):
-    """Point emitters in the closed box."""
-    places = rng.uniform(-0.9, 0.9, (number, 3))
-    return {
-        f"bulb{i}": {"type": "point", "position": list(place), "intensity": rgb(float(rng.uniform(0.1, 2)))}
-        for i, place in enumerate(places)
-    }
-
-
-def vertices(rng, count=4000):
-    return rng.uniform(-0.9, 0.9, (count, 3)).astype(np.float32), unit_vectors(rng, count)
-
-
-def interactions(position, normal):
-    facing = upload_vectors(mi.Normal3f, normal)
-    return Places(upload_vectors(mi.Point3f, position), facing, facing).interaction()
-
-
-def emission_of(scene, rng, learns):
-    """Emission of a scene, which has learned from vertices all over the closed box, or not."""
-    emission = TreeEmitters(scene, read_emitters(scene), 1 << 17)
-    if learns:
-        assert learn_emitters(scene, emission, vertices(rng), 1 << 17, 0)
-    return emission
 
 
 def drawn(emission, si, seed):

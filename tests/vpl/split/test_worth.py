@@ -4,20 +4,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.properties import unit_vectors
+from tests.support.rendering import render, render_with_statistics
+from tests.support.rooms import lamp_behind_the_camera
+from tests.support.scenes import closed_box, sensor, wall
+from tests.support.statistics import assert_same_mean_over_seeds
 from vpl.core.arrays import upload_vectors
 from vpl.split.balance import importance
 from vpl.split.worth import Worth
-
-from tests.conftest import (
-    assert_same_mean_over_seeds,
-    closed_box,
-    render,
-    render_with_statistics,
-    sensor,
-    unit_vectors,
-    wall,
-)
-from tests.integrators.test_manylights import lamp_behind_the_camera
 
 
 def test_paths_end_where_they_bring_little_and_cost_much():

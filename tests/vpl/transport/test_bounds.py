@@ -5,20 +5,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.pairs import exact, scene_of, unit
 from vpl.core.arrays import download, upload
 from vpl.lights.light_set import light_tree
 from vpl.lights.light_tree import CONE_COS, DeviceTree, build_light_tree
-from vpl.lights.virtual_lights import VirtualLights
 from vpl.points.bsdf_proxies import MaterialProxy
 from vpl.points.surfaces import Receiver
 from vpl.transport.bounds import contribution_bound
 
 POINTS = 400
-
-
-def unit(rng, count):
-    vectors = rng.normal(size=(count, 3))
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def proxy_of(albedo, peak, exponent, axis):
@@ -27,37 +22,6 @@ def proxy_of(albedo, peak, exponent, axis):
     direction = mi.Vector3f(*(upload(mi.Float, axis[:, k]) for k in range(3)))
     no = dr.full(mi.Bool, False, len(albedo))
     return MaterialProxy(*color, upload(mi.Float, exponent), direction, no, no, True, False)
-
-
-def exact(kind, position, normal, albedo, peak, exponent, axis, lights, clamp):
-    """Mean contribution of every light at every point, (points, lights) float64, for a BSDF equal to its proxy."""
-    if kind in ("directional", "environment"):
-        to_light = np.broadcast_to(-lights.direction.astype(np.float64), (len(position), lights.count, 3))
-        factor = np.ones(to_light.shape[:2])
-    else:
-        offset = lights.position[None].astype(np.float64) - position[:, None]
-        distance = np.linalg.norm(offset, axis=2)
-        to_light = offset / np.maximum(distance, 1e-300)[..., None]
-        emission = -np.sum(to_light * lights.direction[None], axis=2)
-        factor = 1 / np.maximum(distance, clamp if kind == "oriented" else 0) ** 2
-        if kind == "oriented":
-            factor = factor * np.maximum(emission, 0)
-        elif kind == "spot":
-            factor = factor * (emission >= np.cos(lights.cone[None, :, 0].astype(np.float64)))
-    cosine = np.maximum(np.sum(to_light * normal[:, None], axis=2), 0)
-    mirror = np.maximum(np.sum(to_light * axis[:, None], axis=2), 0)
-    lobe = (mirror ** exponent[:, None]) * (cosine > 0)
-    material = albedo[:, None] * cosine[..., None] + peak[:, None] * lobe[..., None]
-    return factor * np.mean(material * lights.intensity[None], axis=2)
-
-
-def scene_of(kind, rng, spread, count=64):
-    position = rng.uniform(-1, 1, (count, 3)) * spread
-    direction = unit(rng, count) * 0.3 + [0, 0, 1]
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    cone = np.stack([rng.uniform(0.2, 0.9, count), np.full(count, 0.1)], axis=1)
-    where = None if kind in ("directional", "environment") else position
-    return VirtualLights.of(kind, where, direction, rng.uniform(0, 1, (count, 3)) ** 4 + 1e-6, 0, cone)
 
 
 @pytest.mark.parametrize("kind", ["point", "spot", "oriented", "directional", "environment"])
