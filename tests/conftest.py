@@ -1,4 +1,6 @@
-"""Fixtures of all tests."""
+"""Fixtures of all tests, and the number of processes that run them."""
+
+import os
 
 import drjit as dr
 import mitsuba as mi
@@ -8,6 +10,13 @@ from tests.support.comparisons import SWEEP
 from vpl.split import balance
 
 VARIANT = "llvm_ad_rgb"
+MOST_PROCESSES = 4  # each holds some 2 GiB
+
+
+def pytest_xdist_auto_num_workers(config):
+    """One process per core for the whole suite, and none besides this one for a few files: each imports for seconds."""
+    is_whole = config.args_source == pytest.Config.ArgsSource.TESTPATHS
+    return min(len(os.sched_getaffinity(0)), MOST_PROCESSES) if is_whole else 0
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import jsonschema
@@ -17,6 +16,7 @@ import compare
 from comparison import images, runs, worker
 from tests.support.comparisons import SCHEMA
 from tests.support.paths import CORNELL, ROOT
+from tests.support.processes import PATIENCE, wait_until
 
 
 def command(out):
@@ -36,10 +36,7 @@ def start(out, *more):
         [sys.executable, str(ROOT / "compare.py"), *command(out), *more], stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    end = time.monotonic() + 120
-    while len(finished(out)) < 2:
-        assert process.poll() is None and time.monotonic() < end, process.communicate()
-        time.sleep(0.02)
+    wait_until(lambda: len(finished(out)) >= 2, process)
     return process
 
 
@@ -62,7 +59,7 @@ def workers_of(out):
 def test_interruption_leaves_a_report_of_what_is_finished(tmp_path, signal_number):
     process = start(tmp_path)
     process.send_signal(signal_number)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
     assert errors == f"\ncompare: interrupted; what was finished is in {tmp_path}; --resume goes on\n"
     results = json.loads((tmp_path / "results.json").read_text())
@@ -79,10 +76,7 @@ def test_killed_comparison_goes_on_where_it_stopped(tmp_path, monkeypatch):
     process = start(tmp_path)
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
-    end = time.monotonic() + 30
-    while workers_of(tmp_path):  # they end with it
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_until(lambda: not workers_of(tmp_path))  # they end with it
     (tmp_path / ".cornell.path.123.exr").write_text("as if killed while writing")
     before = {file: file.read_text() for file in finished(tmp_path)}
 
@@ -131,7 +125,7 @@ def test_a_full_disk_is_reported_with_the_name_of_the_file(tmp_path, limit, prin
     arguments = [CORNELL, "-i", "path", "--spp", "1", "--reference", str(reference), "-o", str(tmp_path / "out")]
     done = subprocess.run(
         [sys.executable, "-c", LIMITED, str(limit), str(ROOT / "compare.py"), *arguments],
-        capture_output=True, text=True, timeout=120,
+        capture_output=True, text=True, timeout=PATIENCE,
     )  # fmt: skip
     assert done.returncode == 1 and "Traceback" not in done.stderr
     assert re.search(printed, done.stdout, re.MULTILINE)
@@ -146,7 +140,7 @@ def test_a_comparison_goes_on_after_a_full_disk(tmp_path, limit):
     images.write_exr(reference, np.ones((16, 16, 3)), ["R", "G", "B"])
     arguments = [CORNELL, "-i", "path", "--spp", "1", "--reference", str(reference), "-o", str(out)]
     full = [sys.executable, "-c", LIMITED, str(limit), str(ROOT / "compare.py"), *arguments]
-    assert subprocess.run(full, capture_output=True, timeout=120).returncode == 1
+    assert subprocess.run(full, capture_output=True, timeout=PATIENCE).returncode == 1
     assert compare.main([*arguments, "--resume"]) == 0
     results = json.loads((out / "results.json").read_text())
     assert results["complete"] and "errors" in results["scenes"][0]["renders"][0]

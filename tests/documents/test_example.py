@@ -11,6 +11,7 @@ import pytest
 
 from integrators.knobs import knobs_of
 from tests.support.paths import ROOT
+from tests.support.processes import PATIENCE
 
 SETTINGS = {"max_depth": 4, "vpl_count": 500}
 
@@ -37,7 +38,7 @@ def rendered(scene, name, **more):
 def test_the_first_image(tmp_path):
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
     (tmp_path / "first.py").write_text(printed("start.md"))
-    subprocess.run([sys.executable, "first.py"], cwd=tmp_path, check=True, timeout=300)
+    subprocess.run([sys.executable, "first.py"], cwd=tmp_path, check=True, timeout=PATIENCE)
     assert np.array(mi.Bitmap(str(tmp_path / "hall.png"))).mean() > 20
 
 

@@ -7,6 +7,8 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+from tests.support.processes import PATIENCE
+
 FOLDER = Path(__file__).resolve().parents[2] / "notebooks"
 notebooks = pytest.mark.parametrize("file", sorted(FOLDER.glob("*.ipynb")), ids=lambda file: file.stem)
 
@@ -27,7 +29,7 @@ def test_notebook_runs(file, tmp_path):
     (tmp_path / "notebooks").mkdir()
     notebook = nbformat.read(file, as_version=4)
     client = NotebookClient(
-        notebook, timeout=120, kernel_name="python3", resources={"metadata": {"path": tmp_path / "notebooks"}}
+        notebook, timeout=PATIENCE, kernel_name="python3", resources={"metadata": {"path": tmp_path / "notebooks"}}
     )
     asyncio.run(client.async_execute())
     assert any(cell.get("outputs") for cell in notebook.cells)

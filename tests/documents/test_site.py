@@ -13,6 +13,7 @@ from integrators.knobs import knobs_of
 from tests.support import chromium
 from tests.support.chromium import Chromium
 from tests.support.paths import ROOT
+from tests.support.processes import PATIENCE
 
 MOST_BYTES = 2_000_000
 WIDTHS = (420, 1600)
@@ -25,7 +26,7 @@ def site(tmp_path_factory):
     command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet", "--fresh-env"]
     done = subprocess.run(
         [*command, "-c", "docs", "-d", str(folder / "read"), ".", str(folder / "built")],
-        cwd=ROOT, capture_output=True, text=True, timeout=600,
+        cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE,
     )  # fmt: skip
     assert done.returncode == 0 and done.stderr == "", done.stderr
     return folder / "built"

@@ -13,6 +13,7 @@ import pytest
 
 import integrators
 from tests.support.paths import ROOT
+from tests.support.processes import PATIENCE
 from tests.support.registration import FIRST, LATER, LOAD
 
 PACKAGES = ("comparison", "integrators", "vpl")
@@ -88,7 +89,7 @@ def environment(wheel, tmp_path_factory):
 def pip(*arguments):
     """Run pip, without a network."""
     command = [sys.executable, "-m", "pip", "-q", "--disable-pip-version-check", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
 
 
@@ -97,7 +98,7 @@ def run(environment, *command, folder=None):
     variables = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(
         [environment / "bin" / command[0], *command[1:]], cwd=folder or environment, env=variables,
-        capture_output=True, text=True, timeout=240,
+        capture_output=True, text=True, timeout=PATIENCE,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -166,7 +167,7 @@ def draw(scene: mi.Scene) -> None:
 def test_types_of_the_public_module_reach_the_user(environment, tmp_path):
     (tmp_path / "typed.py").write_text(TYPED)
     command = [sys.executable, "-m", "mypy", "--strict", "--python-executable", environment / "bin/python", "typed.py"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -189,14 +190,14 @@ def test_readme_gets_to_an_image_in_a_few_lines(environment, tmp_path):
 def test_readme_gets_from_an_empty_environment_to_an_image(tmp_path):
     """All lines, as they stand, in a copy of the sources; downloads Mitsuba."""
     download = [sys.executable, "-m", "pip", "-q", "download", "--no-deps", "-d", tmp_path, "tqdm"]
-    found = subprocess.run(download, capture_output=True, text=True, timeout=120)
+    found = subprocess.run(download, capture_output=True, text=True, timeout=PATIENCE)
     if found.returncode:
         pytest.skip(f"no package index can be reached: {found.stderr.strip().splitlines()[-1]}")
     shutil.copytree(ROOT, tmp_path / "sources", ignore=NO_SOURCES)
     variables = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     done = subprocess.run(
         ["sh", "-ec", first_commands()], cwd=tmp_path / "sources", env=variables, capture_output=True, text=True,
-        timeout=900,
+        timeout=PATIENCE,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "sources" / "hall.exr").stat().st_size > 1e5

@@ -8,6 +8,7 @@ import pytest
 
 import integrators
 from tests.support.paths import ROOT
+from tests.support.processes import PATIENCE
 from tests.support.registration import FIRST, LATER, LOAD
 
 
@@ -17,7 +18,7 @@ def script(folder, text):
     path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     return subprocess.run(
         [sys.executable, str(folder / "script.py")], cwd=folder, env=os.environ | {"PYTHONPATH": path},
-        capture_output=True, text=True, timeout=120,
+        capture_output=True, text=True, timeout=PATIENCE,
     )  # fmt: skip
 
 

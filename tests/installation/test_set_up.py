@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.paths import ROOT
+from tests.support.processes import PATIENCE
 
 # Notes what it is asked, and has what the files beside the project say.
 PYTHON = r"""#!/bin/sh
@@ -82,7 +83,7 @@ class Project:
             input=stdin,
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=PATIENCE,
             start_new_session=True,  # so that the stand-in for pip can kill all of it
         )
         assert result.returncode == status, result.stderr
@@ -156,11 +157,11 @@ def test_works_through_a_link_and_by_name(project):
 
 def test_becomes_the_command_so_that_signals_reach_it(project):
     project.run("--", "true")
-    call = [project.folder / "run", "--", "sh", "-c", "echo $$; exec sleep 60"]
+    call = [project.folder / "run", "--", "sh", "-c", "echo $$; exec sleep 1000"]
     with subprocess.Popen(call, env=project.environment, stdout=subprocess.PIPE, text=True) as process:
         assert int(process.stdout.readline()) == process.pid
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=30) == -signal.SIGINT
+        assert process.wait(timeout=PATIENCE) == -signal.SIGINT
 
 
 def test_completes_after_an_error_and_after_being_killed(project):
@@ -211,7 +212,7 @@ def test_sets_up_again_when_what_it_depends_on_changes(project):
 def test_two_calls_at_once_set_up_once(project):
     call = [project.folder / "run", "--", "true"]
     both = [subprocess.Popen(call, env=project.environment, stderr=subprocess.DEVNULL) for _ in range(2)]
-    assert [process.wait(timeout=60) for process in both] == [0, 0]
+    assert [process.wait(timeout=PATIENCE) for process in both] == [0, 0]
     assert project.calls("-e .[test]") == 1
 
 
@@ -263,5 +264,5 @@ def test_libraries_that_cannot_be_had(project):
 @pytest.mark.skipif(Path(sys.prefix) != ROOT / ".venv", reason="these tests do not run in the environment of ./run")
 def test_the_real_environment():
     call = [ROOT / "run", "--", "python", "-c", "import mitsuba, sys; print(sys.prefix)"]
-    result = subprocess.run(call, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120)
+    result = subprocess.run(call, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=PATIENCE)
     assert result.stdout == f"{ROOT / '.venv'}\n", result.stderr

@@ -1,21 +1,21 @@
 """Adaptive direct light as Mitsuba's users meet it: against ``direct`` and ``path``, and what the manual promises."""
 
 import math
+from functools import cache
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from scipy import stats
 
 from benchmarks.printed_passes import PrintedEstimates, PrintedPasses, as_printed
 from tests.support.rendering import render
 from tests.support.scenes import area_light, closed_box, sensor, wall
+from tests.support.statistics import assert_same_mean
 from vpl.direct import adaptive
 from vpl.direct.passes import SiteEstimates
 
 PLUGINS = ("adaptivedirect", "unoccludeddirect")
 AOVS = ("noise", "passes", "shadow_rays", "visible")
-TILE = 8  # pixels
 
 
 def rgb(*value):
@@ -72,8 +72,14 @@ def mixed(variant):
 
 @pytest.fixture(scope="module")
 def reference(mixed):
-    """Renders of ``mixed`` by Mitsuba."""
-    return repeat(mixed, "direct", 24, 256, 1000, emitter_samples=1, bsdf_samples=1)
+    """Function from a seed to the image of ``mixed`` by Mitsuba."""
+    return cache(lambda seed: render(mixed, "direct", 512, 1000 + seed, emitter_samples=1, bsdf_samples=1))
+
+
+@pytest.fixture(scope="module")
+def expected(reference):
+    """Mean of images of ``mixed`` by Mitsuba."""
+    return np.mean([reference(seed) for seed in range(8)], axis=0)
 
 
 @pytest.fixture(scope="module")
@@ -112,21 +118,9 @@ def view(scene, integrator, sensor, spp=4, seed=0):
     return np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed), dtype=np.float64)
 
 
-def assert_same_expectation(ours, reference, alpha=0.002):
-    """Welch's t test over seeds of tile means and of the image mean, Šidák-corrected over all of them."""
-
-    def statistics(renders):
-        count, height, width, channels = renders.shape
-        tiles = renders.reshape(count, height // TILE, TILE, width // TILE, TILE, channels).mean((2, 4))
-        return np.concatenate([tiles.reshape(count, -1), renders.reshape(count, -1, channels).mean(1)], axis=1)
-
-    assert np.isfinite(ours).all()
-    ours, reference = statistics(ours), statistics(reference)
-    noisy = np.abs(ours.mean(0) - reference.mean(0)) > 1e-5 * np.abs(reference.mean(0))
-    if noisy.any():
-        p_values = stats.ttest_ind(ours[:, noisy], reference[:, noisy], equal_var=False).pvalue
-        corrected = 1 - (1 - alpha) ** (1 / ours.shape[1])
-        assert p_values.min() > corrected, (p_values.min(), ours.mean(0)[-3:] / reference.mean(0)[-3:] - 1)
+def assert_mean_of_reference(scene, reference, spp=4, seeds=12, finds=0.01, plugin="adaptivedirect", **more):
+    """``reference``: function from a seed to an image."""
+    assert_same_mean(lambda seed: (render(scene, plugin, spp, seed, error=0.2, **more), reference(seed)), seeds, finds)
 
 
 # ---- Properties
@@ -196,20 +190,16 @@ METHODS = {
 def test_expectation_equals_direct(mixed, reference, method):
     plugin, more = METHODS[method]
     # A cut at every point takes seconds
-    count, spp = (24, 1) if method == "unoccluded" else (32, 4)
-    # So coarse an error that pixels end at very different times
-    ours = repeat(mixed, plugin, count, spp, error=0.2, **more)
-    assert len({image.mean() for image in ours}) == len(ours)
-    assert_same_expectation(ours, reference)
+    assert_mean_of_reference(mixed, reference, 1 if method == "unoccluded" else 4, plugin=plugin, **more)
 
 
 def test_bsdf_samples_do_not_change_the_expectation_but_the_noise(mixed, reference):
+    for share in (0.0, 1.0):
+        assert_mean_of_reference(mixed, reference, 1, lights="clusters", bsdf_share=share)
     without, many = (
-        repeat(mixed, "adaptivedirect", 12, 1, lights="clusters", error=0.2, bsdf_share=share) for share in (0.0, 1.0)
+        render(mixed, "adaptivedirect", 1, lights="clusters", error=0.2, bsdf_share=share) for share in (0.0, 1.0)
     )
-    assert_same_expectation(without, reference)
-    assert_same_expectation(many, reference)
-    assert not np.allclose(without[0], many[0], rtol=1e-3)
+    assert not np.allclose(without, many, rtol=1e-3)
 
 
 def test_smaller_error_gives_less_noise_for_more_rays(mixed):
@@ -233,15 +223,15 @@ class UniformPasses(PrintedPasses):
 
 def test_probabilities_learnt_from_samples_alone_leave_the_expectation(mixed, reference, monkeypatch):
     monkeypatch.setattr(adaptive, "SitePasses", UniformPasses)
-    assert_same_expectation(repeat(mixed, "adaptivedirect", 32, 4, error=0.2, lights="clusters"), reference)
+    assert_mean_of_reference(mixed, reference, lights="clusters")
 
 
-def test_the_method_as_printed_is_another_estimate_of_the_same(mixed, reference):
+def test_the_method_as_printed_is_another_estimate_of_the_same(mixed, expected):
     usual = repeat(mixed, "adaptivedirect", 2, 4, lights="clusters", error=0.05)
     with as_printed():
         printed = repeat(mixed, "adaptivedirect", 2, 4, lights="clusters", error=0.05)
     assert not np.allclose(usual, printed, rtol=1e-3)
-    assert abs(printed.mean() / reference.mean() - 1) < 0.1
+    assert abs(printed.mean() / expected.mean() - 1) < 0.1
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
@@ -252,12 +242,10 @@ def test_emitters_seen_by_the_camera_equal_path(mixed, plugin):
     assert render(mixed, plugin, 4, 3, max_depth=0).max() == 0
 
 
-def test_hidden_emitters_equal_path(mixed, reference):
-    more = {"hide_emitters": True}
-    ours = repeat(mixed, "adaptivedirect", 16, 4, error=0.2, **more)
-    hidden = repeat(mixed, "path", 16, 256, 1000, max_depth=2, **more)
-    assert_same_expectation(ours, hidden)
-    assert hidden.mean() < 0.95 * reference.mean()
+def test_hidden_emitters_equal_path(mixed, expected):
+    hidden = cache(lambda seed: render(mixed, "path", 512, 1000 + seed, max_depth=2, hide_emitters=True))
+    assert_mean_of_reference(mixed, hidden, hide_emitters=True)
+    assert hidden(0).mean() < 0.95 * expected.mean()
 
 
 @pytest.mark.parametrize("hide", [False, True])
@@ -344,7 +332,7 @@ def test_same_seed_same_image_and_other_seed_other_image(mixed, plugin):
 
 def test_order_of_emitters_does_not_matter(reference):
     scene = mi.load_dict(mixed_scene(dict(reversed(mixed_emitters().items()))))
-    assert_same_expectation(repeat(scene, "adaptivedirect", 16, 4, error=0.2, lights="clusters"), reference)
+    assert_mean_of_reference(scene, reference, lights="clusters")
 
 
 # ---- What is known besides the image
@@ -444,22 +432,22 @@ def test_films(mixed, plugin, number, shape):
     assert np.mean(np.abs(ours - path)) < (0.08 if plugin == "adaptivedirect" else 0.12) * path.mean()
 
 
-def test_passes_and_one_sample_a_pixel(mixed, reference):
+def test_passes_and_one_sample_a_pixel(mixed, expected):
     plugin = {"type": "adaptivedirect", "lights": "clusters", "error": 0.1}
     in_passes = render(mixed, mi.load_dict(plugin | {"samples_per_pass": 4}), 16)
     once = np.mean([render(mixed, mi.load_dict(plugin), 1, seed) for seed in range(16)], axis=0)
     for image in (in_passes, once):
-        assert np.mean(np.abs(image - reference.mean(0))) < 0.08 * reference.mean()
+        assert np.mean(np.abs(image - expected)) < 0.08 * expected.mean()
 
 
-def test_moment_and_aov_can_wrap_it(mixed, reference):
+def test_moment_and_aov_can_wrap_it(mixed, expected):
     nested = {"type": "adaptivedirect", "error": 0.1, "aovs": "noise,passes"}
     moment = render(mixed, mi.load_dict({"type": "moment", "nested": nested}), 4)
     assert np.isfinite(moment).all() and moment.shape[2] > 5
-    assert moment[..., :3].mean() == pytest.approx(reference.mean(), rel=0.05)
+    assert moment[..., :3].mean() == pytest.approx(expected.mean(), rel=0.05)
     depth = render(mixed, mi.load_dict({"type": "aov", "aovs": "dd:depth", "nested": nested}), 4)
     assert np.isfinite(depth).all() and depth.shape[2] == 8
-    assert depth[..., :3].mean() == pytest.approx(reference.mean(), rel=0.05)
+    assert depth[..., :3].mean() == pytest.approx(expected.mean(), rel=0.05)
 
 
 # ---- Mirrors, glass, media, variants
@@ -505,12 +493,10 @@ def test_emitter_in_glass_is_found_by_bsdf_samples(variant):
             "lamp": ball(0.3, emitter={"type": "area", "radiance": rgb(2, 3, 4)}),
         }
     )  # fmt: skip
-    path = repeat(scene, "path", 12, 512, 1000, max_depth=4)
-    ours = repeat(scene, "adaptivedirect", 12, 2, max_depth=4, bsdf_share=1.0, error=0.2, lights="clusters")
-    assert_same_expectation(ours, path)
+    path = cache(lambda seed: render(scene, "path", 2048, 1000 + seed, max_depth=4))
+    assert_mean_of_reference(scene, path, 8, max_depth=4, bsdf_share=1.0, lights="clusters")
     # Only rays that see the emitter directly are left
-    blind = repeat(scene, "adaptivedirect", 1, 4, max_depth=4, bsdf_share=0.0)
-    assert blind.mean() < 0.9 * path.mean()
+    assert render(scene, "adaptivedirect", 4, max_depth=4, bsdf_share=0.0).mean() < 0.9 * path(0).mean()
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
@@ -526,12 +512,13 @@ def test_a_medium_is_refused_by_name(plugin):
 
 def test_virtual_lights_take_adaptive_direct_light(variant):
     scene = mi.load_dict(closed_box({"lamp": area_light()}))
-    adaptive, nee = (
-        repeat(scene, "lightcuts", 12, 2, direct=direct, max_depth=3, vpl_count=1000, direct_error=0.2)
-        for direct in ("adaptive", "nee")
-    )
-    assert not np.allclose(adaptive[0], nee[0], rtol=1e-2)
-    assert_same_expectation(adaptive, nee)
+    given = {"max_depth": 3, "vpl_count": 1000, "direct_error": 0.2}
+
+    def pair(seed):
+        return tuple(render(scene, "lightcuts", 8, seed, direct=direct, **given) for direct in ("adaptive", "nee"))
+
+    assert not np.allclose(*pair(0), rtol=1e-2)
+    assert_same_mean(pair, 12)
 
 
 @pytest.mark.usefixtures("restore_variant")

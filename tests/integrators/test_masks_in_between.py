@@ -7,7 +7,7 @@ from tests.support.catalogue import plugin
 from tests.support.rendering import render
 from tests.support.rooms import veiled_room
 from tests.support.scenes import rgb
-from tests.support.statistics import assert_same_mean_over_seeds
+from tests.support.statistics import assert_same_mean
 
 ALL_LIGHTS = {"clamping": 0.0, "vpl_count": 1000}
 WITH_LIGHTS = (
@@ -17,12 +17,12 @@ WITH_LIGHTS = (
 
 def assert_image_of_prb(description, max_depth, seeds=10):
     scene = mi.load_dict(description)
-    pairs = [
-        (render(scene, "vpl", 4, seed, max_depth=max_depth, **ALL_LIGHTS),
-         render(scene, "prb", 256, 1000 + seed, max_depth=max_depth))
-        for seed in range(seeds)
-    ]  # fmt: skip
-    assert_same_mean_over_seeds(pairs)
+
+    def pair(seed):
+        found = render(scene, "vpl", 4, seed, max_depth=max_depth, **ALL_LIGHTS)
+        return found, render(scene, "prb", 1024, 1000 + seed, max_depth=max_depth)
+
+    assert_same_mean(pair, seeds)
 
 
 @pytest.mark.parametrize("name", [*WITH_LIGHTS, "manylights"])

@@ -5,7 +5,7 @@ import numpy as np
 
 from tests.support.rendering import render
 from tests.support.scenes import area_light, closed_box, rgb
-from tests.support.statistics import assert_same_mean_over_seeds
+from tests.support.statistics import assert_same_mean
 
 PLACES = np.random.default_rng(1).uniform(-0.9, 0.9, (8, 3)).tolist()
 
@@ -28,21 +28,23 @@ def balls(count):
     return objects
 
 
-def assert_means_of(scene, expected_scene, name, seeds, **more):
-    pairs = [
-        (render(scene, name, 64, seed, **more), render(expected_scene, "path", 64, 100 + seed, max_depth=4))
-        for seed in range(seeds)
-    ]
-    assert_same_mean_over_seeds(pairs)
+def assert_mean_of_path(scene, expected_scene):
+    def pair(seed):
+        return (
+            render(scene, "manylights", 256, seed, max_depth=4),
+            render(expected_scene, "path", 512, 100 + seed, max_depth=4),
+        )
+
+    assert_same_mean(pair, 8)
 
 
 def test_many_emitters():
     """The oracle has eight: in ``path`` thousands take minutes."""
     scene, few = (mi.load_dict(closed_box(bulbs(number), 16)) for number in (2000, len(PLACES)))
-    assert_means_of(scene, few, "manylights", 8, max_depth=4)
+    assert_mean_of_path(scene, few)
 
 
 def test_many_materials():
     description = closed_box({"light": area_light()}, 16)
     scene = mi.load_dict({"type": "scene", **balls(100), **description})
-    assert_means_of(scene, scene, "manylights", 8, max_depth=4)
+    assert_mean_of_path(scene, scene)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import manylights
+from tests.support.processes import PATIENCE
 from tests.support.rendering import render
 from tests.support.scenes import area_light, closed_box
 
@@ -28,11 +29,11 @@ class Waiting:
     def pause(self, *_):
         if threading.current_thread() is self._thread:
             self._reached.set()
-            assert self._go_on.wait(60)
+            assert self._go_on.wait(PATIENCE)
 
     def __enter__(self):
         self._thread.start()
-        assert self._reached.wait(60)
+        assert self._reached.wait(PATIENCE)
         return self
 
     def __exit__(self, *_):

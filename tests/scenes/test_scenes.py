@@ -13,6 +13,7 @@ import pytest
 
 from comparison.scene_files import SceneFile
 from tests.support.paths import ROOT
+from tests.support.processes import PATIENCE
 from tests.support.rendering import render
 
 SHARED = ROOT.parent / "shared" / "scenes"
@@ -71,7 +72,7 @@ def test_shipped_scenes_are_what_their_generators_make(name, tmp_path, monkeypat
 def test_shipped_room_is_what_its_generator_makes(tmp_path):
     """Which needs a variant of its own, as the add-on."""
     script = ROOT / "scenes" / "blender_room.py"
-    subprocess.run([sys.executable, script, "--output", tmp_path / "blender_room.xml"], check=True, timeout=120)
+    subprocess.run([sys.executable, script, "--output", tmp_path / "blender_room.xml"], check=True, timeout=PATIENCE)
     made = [file for file in tmp_path.rglob("*") if file.is_file() and file.suffix != ".exr"]
     assert len(made) == 10
     for file in made:

@@ -8,6 +8,8 @@ import shutil
 import signal
 import time
 
+from tests.support.processes import PATIENCE
+
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars",
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--remote-debugging-pipe",
@@ -62,7 +64,7 @@ class Chromium:
             raise RuntimeError(found["exceptionDetails"]["exception"]["description"])
         return found["result"].get("value")
 
-    def wait(self, expression, seconds=20):
+    def wait(self, expression, seconds=PATIENCE):
         """Wait until a JavaScript expression is true; raises TimeoutError."""
         end = time.monotonic() + seconds
         while not self.value(expression):

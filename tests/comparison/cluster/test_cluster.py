@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,6 +19,7 @@ from comparison.worker import Job
 from tests.support.comparisons import SCHEMA, TWO_SENSORS
 from tests.support.distributed_renders import TINY, in_one_process, prepared
 from tests.support.paths import CORNELL
+from tests.support.processes import PATIENCE, wait_until
 
 distributed = pytest.importorskip("distributed")
 
@@ -56,7 +56,7 @@ def cluster():
 def scale(cluster, count):
     cluster.scale(count)
     with distributed.Client(cluster) as client:
-        client.wait_for_workers(count, timeout=60)
+        client.wait_for_workers(count, timeout=PATIENCE)
 
 
 @pytest.fixture
@@ -100,13 +100,16 @@ def test_an_error_ends_the_render_for_all_where_it_ends_one(two, tmp_path):
 
 
 def test_time_ends_a_render(two, tmp_path):
-    began = time.monotonic()
-    arguments = [CORNELL, *USUAL, "-o", tmp_path / "a.exr", "--workers", two]
-    assert run(*arguments, "--time", 1) == 0
-    metadata = images.read_exr(tmp_path / "a.exr")[2]
-    assert metadata["ended_by"] == "time" and metadata["passes"] > 1 and time.monotonic() - began < 30
-    assert run(*arguments, "--time", 1e-6) == 0
-    assert images.read_exr(tmp_path / "a.exr")[2]["passes"] == 1
+    """After one pass or some, as the time allows."""
+
+    def passes(seconds):
+        assert run(CORNELL, *USUAL, "-o", tmp_path / "a.exr", "--workers", two, "--time", seconds) == 0
+        metadata = images.read_exr(tmp_path / "a.exr")[2]
+        assert metadata["ended_by"] == "time"
+        return metadata["passes"]
+
+    assert passes(1e-6) == 1
+    assert any(passes(seconds) > 1 for seconds in (0.5, 5, 50))
 
 
 def test_samples_of_passes_depend_on_the_image_alone():
@@ -144,12 +147,18 @@ def kill_a_worker(address):
         os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
 
 
-def rendered_with_a_worker_killed(address, pause=0.0):
+def results_wait(address):
+    """Wait until a worker holds a result."""
+    with distributed.Client(address) as client:
+        wait_until(lambda: any(client.run(lambda dask_worker: len(dask_worker.data)).values()))
+
+
+def rendered_with_a_worker_killed(address, before=lambda address: None):
     killed = []
 
     def progress(took, image):
         if took.passes == 2 and not killed:
-            time.sleep(pause)
+            before(address)
             killed.append(kill_a_worker(address))
 
     with connection.connected(address, 1) as workers:
@@ -164,7 +173,7 @@ def test_a_worker_that_is_killed_during_a_pass_changes_nothing(two):
 
 def test_passes_that_a_worker_takes_with_it_are_rendered_again(two):
     """It has finished them, and is killed before it hands them over."""
-    np.testing.assert_array_equal(rendered_with_a_worker_killed(two, pause=1.0), in_one_process())
+    np.testing.assert_array_equal(rendered_with_a_worker_killed(two, results_wait), in_one_process())
 
 
 @pytest.mark.stress

@@ -17,6 +17,7 @@ from comparison.cluster import connection
 from comparison.images import read_exr
 from tests.support.distributed_renders import in_one_process, prepared
 from tests.support.paths import CORNELL, ROOT
+from tests.support.processes import PATIENCE, wait_until
 
 distributed = pytest.importorskip("distributed")
 
@@ -68,7 +69,7 @@ def test_a_scheduler_that_is_started_anew_during_a_render_changes_nothing(port):
 
     with ExitStack() as stack:
         first = stack.enter_context(started(*command))
-        distributed.Client(address, timeout=60).close()
+        distributed.Client(address, timeout=PATIENCE).close()
         workers = stack.enter_context(connection.connected(address, 1))
         image, took = prepared(workers, spp=200).render(progress=progress)
     assert again and took.spp == 200
@@ -93,11 +94,13 @@ def test_the_example_of_tls(port, tmp_path):
         started(*_command(scheduler, programs), environment=environment),
         started(*_command(worker, programs), environment=environment),
     ):
+        with socket.socket() as one:
+            wait_until(lambda: one.connect_ex(("127.0.0.1", port)) == 0)
         small = ["-D", "resx=16", "-D", "resy=16", "-i", "path"]
         command = [sys.executable, "-m", arguments[0], *arguments[1:], *small]
-        subprocess.run(command, cwd=ROOT, env=environment, check=True, timeout=120, capture_output=True)
+        subprocess.run(command, cwd=ROOT, env=environment, check=True, timeout=PATIENCE, capture_output=True)
         assert read_exr(tmp_path / "a.exr")[2]["spp"] == 64
-        refused = subprocess.run(command, cwd=ROOT, timeout=120, capture_output=True, text=True)
+        refused = subprocess.run(command, cwd=ROOT, timeout=PATIENCE, capture_output=True, text=True)
         assert refused.returncode == 2 and address in refused.stderr and "Traceback" not in refused.stderr
 
 

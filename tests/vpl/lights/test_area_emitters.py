@@ -7,7 +7,7 @@ import pytest
 from tests.support.rendering import render
 from tests.support.rooms import smooth_octahedron
 from tests.support.scenes import closed_box
-from tests.support.statistics import assert_same_mean_over_seeds
+from tests.support.statistics import assert_same_mean
 
 # Plugins that find emitters in ways of their own, with light paths of two edges
 DIRECT = {
@@ -32,13 +32,14 @@ def half_bright():
     return {"type": "bitmap", "raw": True, "filter_type": "nearest", "bitmap": mi.Bitmap(pixels)}
 
 
-def assert_light_of_path(emitters, plugin, spp, seeds=12, path_spp=64, **more):
+def assert_light_of_path(emitters, plugin, spp, max_depth=2, **more):
     scene = mi.load_dict(closed_box(emitters, 16))
-    depth = {"max_depth": more.pop("max_depth", 2)}
-    assert_same_mean_over_seeds(
-        (render(scene, plugin, spp, seed, **depth, **more), render(scene, "path", path_spp, seed, **depth))
-        for seed in range(seeds)
-    )
+
+    def pair(seed):
+        found = render(scene, plugin, spp, seed, max_depth=max_depth, **more)
+        return found, render(scene, "path", 1024, 1000 + seed, max_depth=max_depth)
+
+    assert_same_mean(pair, 8)
 
 
 @pytest.mark.parametrize("method", DIRECT)
@@ -58,7 +59,8 @@ def test_a_mesh_with_vertex_normals_emits_to_the_side_of_its_shading_normals(met
     plugin, more = DIRECT[method]
     scene = mi.load_dict(closed_box(smooth_octahedron(), 16))
     bsdf_samples = {"emitter_samples": 0, "bsdf_samples": 1}
-    assert_same_mean_over_seeds(
-        (render(scene, plugin, 16, seed, **more), render(scene, "direct", 1024, seed, **bsdf_samples))
-        for seed in range(12)
-    )
+
+    def pair(seed):
+        return render(scene, plugin, 16, seed, **more), render(scene, "direct", 4096, 1000 + seed, **bsdf_samples)
+
+    assert_same_mean(pair, 8)

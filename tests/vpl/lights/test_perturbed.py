@@ -6,7 +6,7 @@ import pytest
 
 from tests.support.rendering import render
 from tests.support.scenes import closed_box, image, rgb, sensor, wall
-from tests.support.statistics import assert_same_mean_over_seeds
+from tests.support.statistics import assert_same_mean
 
 WHITE = {"type": "diffuse", "reflectance": rgb(0.8)}
 # Plugins with virtual lights, with what lets them find nearly the sum of all
@@ -57,11 +57,11 @@ def indirect_of_path(scene, seed, spp=512):
 
 def assert_indirect_light_of_path(description, plugin, seeds=12, **more):
     scene, settings = mi.load_dict(description), {"direct": "none", "clamping": 0.0, "vpl_count": 2000, **more}
-    pairs = [
-        (render(scene, plugin, 16, seed, max_depth=3, **settings), indirect_of_path(scene, 1000 + seed))
-        for seed in range(seeds)
-    ]
-    assert_same_mean_over_seeds(pairs)
+
+    def pair(seed):
+        return render(scene, plugin, 16, seed, max_depth=3, **settings), indirect_of_path(scene, 1000 + seed)
+
+    assert_same_mean(pair, seeds)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -97,9 +97,9 @@ def test_light_goes_on_between_perturbed_walls(shape):
         box["group"] = {"type": "shapegroup", "floor": box.pop("floor")}
         box["floor"] = {"type": "instance", "of": {"type": "ref", "id": "group"}}
     scene = mi.load_dict(box)
-    pairs = [
-        (render(scene, "vpl", 8, seed, max_depth=5, clamping=0.0, vpl_count=1000),
-         render(scene, "path", 64, 1000 + seed, max_depth=5))
-        for seed in range(10)
-    ]  # fmt: skip
-    assert_same_mean_over_seeds(pairs)
+
+    def pair(seed):
+        found = render(scene, "vpl", 8, seed, max_depth=5, clamping=0.0, vpl_count=1000)
+        return found, render(scene, "path", 256, 1000 + seed, max_depth=5)
+
+    assert_same_mean(pair, 10)

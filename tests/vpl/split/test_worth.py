@@ -8,7 +8,7 @@ from tests.support.properties import unit_vectors
 from tests.support.rendering import render, render_with_statistics
 from tests.support.rooms import lamp_behind_the_camera
 from tests.support.scenes import closed_box, sensor, wall
-from tests.support.statistics import assert_same_mean_over_seeds
+from tests.support.statistics import assert_same_mean
 from vpl.core.arrays import upload_vectors
 from vpl.split.balance import importance
 from vpl.split.worth import Worth
@@ -51,12 +51,14 @@ def test_what_a_vertex_sent_back_does_not_tell_of_itself():
 def test_the_image_is_that_of_path(monkeypatch, lights_cost_nothing, lights):
     """Most paths end at their second vertices here, as all are thought to be worth little."""
     monkeypatch.setattr("vpl.split.decision.importance", lambda *_: 0.3)
-    scene, pairs = mi.load_dict(closed_box(lamp_behind_the_camera(), size=16)), []
-    for seed in range(16):
-        found, statistics = render_with_statistics("manylights", scene, 32, seed, virtual_lights=lights)
+    scene = mi.load_dict(closed_box(lamp_behind_the_camera(), size=16))
+
+    def pair(seed):
+        found, statistics = render_with_statistics("manylights", scene, 512, seed, virtual_lights=lights)
         assert ("lights" in statistics) == lights and statistics["worth"] > 0
-        pairs.append((found, render(scene, "path", 32, 1000 + seed)))
-    assert_same_mean_over_seeds(pairs)
+        return found, render(scene, "path", 512, 1000 + seed)
+
+    assert_same_mean(pair, 8)
 
 
 def test_alpha_is_that_of_path_where_a_pixel_sees_masks_behind_masks(monkeypatch):
