@@ -1,4 +1,4 @@
-"""Fixtures of all tests, and the number of processes that run them."""
+"""Fixtures of all tests, and the number of processes of a run."""
 
 import os
 
@@ -36,8 +36,8 @@ def threads():
 
 @pytest.fixture(autouse=True)
 def restore_threads(threads):
-    """A command keeps to the threads that it was given, and so would all later tests: with one, Mitsuba waits for ever
-    when it reads EXR files."""
+    """Restore the number of threads, which a command sets for the whole process: with one thread, Mitsuba hangs when it
+    reads EXR files."""
     yield
     dr.set_thread_count(threads)
 
@@ -61,6 +61,6 @@ def swept(tmp_path_factory, variant):
 
 @pytest.fixture
 def lights_cost_nothing(monkeypatch):
-    """So that ``manylights`` has virtual lights wherever there is any use for them."""
+    """Let ``manylights`` use virtual lights wherever lights can carry anything."""
     monkeypatch.setattr(balance, "_PAYS_BELOW", 1e30)
     monkeypatch.setattr(balance, "_FEWEST", 4000)

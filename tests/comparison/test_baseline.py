@@ -11,7 +11,7 @@ from tests.support.comparisons import SWEEP, results_of
 
 
 def fake_results(speed_up):
-    """Results of two integrators whose errors are inverse to their time, the second of them so many times faster."""
+    """Results of two integrators with errors inverse to time; the second is faster by the given factor."""
     renders = [
         {
             "label": label, "setting": f"spp={spp}", "seed": 0, "seconds": spp / factor, "rays_per_sample": None,

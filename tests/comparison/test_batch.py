@@ -1,4 +1,4 @@
-"""Many images by one command: which they are, and what their files are called."""
+"""Several images by one command: selection and file names."""
 
 from argparse import ArgumentTypeError, Namespace
 from pathlib import Path

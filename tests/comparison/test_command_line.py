@@ -21,7 +21,7 @@ TINY = ["-D", "resx=16", "-D", "resy=16"]
 
 
 def run(*arguments):
-    """Run the command in this process; return its exit status."""
+    """Run the command in this process and return its exit status."""
     try:
         return manylights.main([str(argument) for argument in arguments])
     except SystemExit as error:
@@ -235,7 +235,7 @@ def test_message_of_an_integrator_is_not_hidden(capsys):
 
 @pytest.fixture
 def interruptible():
-    """Ctrl-C is heard, also where the tests were started in the background of a script, which has it ignored."""
+    """Install the default handler of Ctrl-C, since a script that runs tests in the background ignores the signal."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -271,7 +271,7 @@ def test_image_ends_by_itself(tmp_path, capsys):
     assert metadata["ended_by"] == "error" and 0 < metadata["estimated_error"] <= 0.3 and metadata["passes"] >= 8
     assert f"error {metadata['estimated_error']:.2%}" in capsys.readouterr().out
     assert run(CORNELL, *TINY, "-o", output, "--time", "1e-6") == 0
-    # What was there before has no part in it
+    # The earlier file contributes nothing
     metadata = images.read_exr(output)[2]
     assert (metadata["ended_by"], metadata["passes"], metadata["spp"]) == ("time", 1, 4)
 
@@ -292,7 +292,7 @@ def test_image_is_written_while_it_is_rendered(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("passes", "disk"), [(0, "free"), (3, "free"), (3, "full")])
 def test_interruption_does_not_wait_for_a_pass(tmp_path, passes, disk):
-    """Of an integrator that hears nothing for as long as it renders."""
+    """The integrator handles no signal while it renders."""
     output = tmp_path / "a.exr"
     script = f"""
 import sys, time

@@ -1,4 +1,4 @@
-"""compare.py and what it is made of: scene files, passes, workers, the command."""
+"""compare.py and its parts: scene files, passes, workers, the command."""
 
 import html
 import json
@@ -133,7 +133,7 @@ def test_progressive_is_the_weighted_mean_of_its_passes():
 
 
 def test_passes_count_the_samples_that_were_taken():
-    """Mitsuba rounds them up for samplers that have strata, and says so in its log."""
+    """Mitsuba rounds the number up for stratified samplers, and its log says so."""
     file = cornell(max_depth="2")
     file.set_sampler("ldsampler")
     file.set_integrator("vpl", {"vpl_count": 10, "direct": "vpl"})
@@ -254,7 +254,7 @@ def test_reference_by_vpl_shares_the_lights(tmp_path, capsys):
 
 
 def test_comparison_is_of_path_and_manylights_unless_others_are_named(tmp_path, capsys):
-    """And says what that chose; samples are enough for virtual lights to pay."""
+    """The report states the choice; the samples suffice for virtual lights to pay."""
     status = compare.main([
         CORNELL, "--spp", "64", "--width", "192", "--reference", "path:512", "--cache", str(tmp_path / "cache"), "-o",
         str(tmp_path),

@@ -1,4 +1,4 @@
-"""Curves of error against cost, and what is read off them."""
+"""Curves of error against cost, and numbers read from the curves."""
 
 import numpy as np
 import pytest
@@ -105,7 +105,7 @@ def test_what_the_noise_hides_is_in_no_curve():
 
 
 def test_what_the_noise_hides_is_a_bound():
-    """Its error is at most the noise: an error above that is reached, one below it may be or not."""
+    """The true error is at most the noise: a larger error is reached, a smaller error may or may not be."""
     curve = Curve("a", [point("a", "1", 1, 1.0), point("a", "2", 4, 0.25, noise=0.3), point("a", "3", 8, 0.5)])
     assert curve.cost_at(0.7)[0] == pytest.approx(8 ** (np.log(0.7) / np.log(0.5)))
     assert curve.cost_at(0.5) == (None, 4)  # not the 8 of the curve

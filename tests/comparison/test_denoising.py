@@ -1,4 +1,4 @@
-"""Denoising: what guides it, that it helps, and the files that it leaves."""
+"""Denoising: auxiliary features, the error, and files."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""Which passes make an image, for a time budget or given samples, and which of them are measured."""
+"""Passes of an image for a time budget or a number of samples, and the measured passes among them."""
 
 import pytest
 
@@ -6,8 +6,7 @@ from comparison import measuring, rendering, worker
 
 
 class Recorded(rendering.Progressive):
-    """A render that takes as long as it is told, by default a second a sample after ``start``, and remembers what it
-    was asked for."""
+    """A render with prescribed durations, by default one second per sample after ``start``; it records requests."""
 
     def __init__(self, pixels, *seconds, start=0.0):
         self._pixels, self._seconds, self._start, self.asked = pixels, list(seconds), start, []

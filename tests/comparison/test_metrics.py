@@ -61,7 +61,7 @@ def test_noise_of_the_reference_is_taken_off(reference):
     noisy = truth + random.normal(size=truth.shape) * error
     exact = metrics.compare(truth, noisy, error)
     assert set(exact["below_noise"]) == {"relative_l1", "rmse", "relmse", "relmse_trimmed"}
-    # The same image with an error of its own as large as twice the noise: what is left is that error.
+    # The image has an error of its own of twice the noise; the excess equals this error.
     image = truth + random.normal(size=truth.shape) * 2 * error
     result = metrics.compare(image, noisy, error)
     assert result["below_noise"] == []
@@ -71,7 +71,7 @@ def test_noise_of_the_reference_is_taken_off(reference):
 
 
 def test_relative_l1_of_exact_images_is_hidden_by_the_noise():
-    """Which it is not taken off from, so that it scatters about it."""
+    """The excess over a known noise: unbiased, so it scatters about the true error."""
     random, truth = np.random.default_rng(4), np.full((16, 16, 3), 2.0)
     for _ in range(20):
         result = metrics.compare(truth, truth + random.normal(size=truth.shape) * 0.1, np.full(truth.shape, 0.1))

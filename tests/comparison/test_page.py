@@ -1,4 +1,4 @@
-"""The report's page: its images, and what it does in a browser."""
+"""The report's page: its images and its behaviour in a browser."""
 
 import base64
 import json

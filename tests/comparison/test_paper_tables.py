@@ -1,4 +1,4 @@
-"""The tables of the papers: what fills them, by hand from runs that nobody made, and where they are shown."""
+"""The tables of the papers: values from made-up runs, and the places of display."""
 
 import json
 
@@ -162,7 +162,7 @@ def test_errors_that_the_noise_hides_are_marked():
 
 
 def test_ratios_are_between_runs_of_one_setting():
-    """Beside those at equal error, which need curves."""
+    """Equal-time ratios appear beside the equal-error ratios, which need curves."""
     reference = curve("unoccludeddirect", [("error=0.1", 8.0, 0.2), ("error=0.05", 30.0, 0.1)], rays_per_sample=4)
     adaptive = curve("adaptivedirect", [("error=0.1", 4.0, 0.2), ("error=0.05", 10.0, 0.1)], rays_per_sample=2)
     found = table([*reference, *adaptive], "IAS", "Tables 2 and 3, same rule")
@@ -226,7 +226,7 @@ def test_equal_rays_are_read_off_curves_alone():
     assert "MSR Table 1, equal rays" not in names([*ours[:1], *other[:1]])
 
 
-# --- What is declared, and where it is shown ---
+# --- Declarations and display ---
 
 
 def test_declared_tables_have_columns_that_exist():

@@ -96,7 +96,7 @@ def test_in_parts_samples_are_those_that_were_asked_for_and_no_small_pass_ends_t
 def test_in_parts_a_start_of_ten_seconds_is_worth_many_samples(start):
     passes, _ = render(SQUARE // 4, start, 0.01, time=600, more=0.1, in_parts=True)
     usual = Counter(one.spp for one in passes).most_common(1)[0][0]
-    # 512 samples are all that a pass may have
+    # A pass has at most 512 samples
     assert usual >= 256
     assert max(one.seconds for one in passes) < 3 * start
 

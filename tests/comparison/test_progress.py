@@ -1,4 +1,4 @@
-"""What a render tells while it goes on: stages, the end that is to be expected, the bar of the command."""
+"""Progress of a render: stages, expected end, bar of the command."""
 
 import io
 import sys
@@ -26,7 +26,7 @@ def scene():
 
 
 def plugin(name):
-    """A plugin that makes few lights, where it has a number of them."""
+    """A plugin with few virtual lights, if it has a number of lights."""
     return mi.load_dict({"type": name, **({} if name == "manylights" or "direct" in name else SMALL)})
 
 

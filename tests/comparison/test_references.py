@@ -1,4 +1,4 @@
-"""References: batches and their standard errors, kept and continued; the one that is shipped."""
+"""References: batches and standard errors, caching and continuation, the shipped reference."""
 
 import mitsuba as mi
 import numpy as np
@@ -32,7 +32,7 @@ def test_batches_of_different_sizes_count_by_their_samples():
         batches = batches.with_batch(samples[first : first + size].mean(axis=0), size)
         first += size
     np.testing.assert_allclose(batches.mean, samples.mean(axis=0), rtol=1e-12)
-    # On average the variance of the mean is that of a sample over their number, whatever the batches.
+    # The expected variance of the mean is the variance of a sample over the number of samples, for any batches.
     assert np.square(batches.standard_error).mean() == pytest.approx(1 / sum(sizes), rel=0.03)
 
 

@@ -1,4 +1,4 @@
-"""`manylights.render`: what ends a render, and what it returns."""
+"""`manylights.render`: conditions that end a render, and results."""
 
 import itertools
 import signal

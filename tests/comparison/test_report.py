@@ -80,8 +80,8 @@ def test_a_reference_that_hides_an_error_is_reported(tmp_path, capsys, monkeypat
 
 
 def test_references_that_are_no_use_lose_nothing_else(tmp_path, capsys):
-    """A black reference, and one that is not finite: the runs are reported, and so are the other scenes. A depth that
-    some program wrote as text is one."""
+    """A black and a non-finite reference: the report covers the runs and the remaining scenes. A depth that another
+    program wrote as text counts as a depth."""
     for name, value in (("black", 0.0), ("bright", np.inf), ("cornell", 1.0)):
         (tmp_path / f"{name}.xml").write_text(Path(CORNELL).read_text())
         image, error, described = np.full((16, 16, 3), value), np.full((16, 16, 3), 0.1), {"max_depth": "6"}

@@ -92,7 +92,7 @@ def test_killed_comparison_goes_on_where_it_stopped(tmp_path, monkeypatch):
     assert compare.main([*command(tmp_path), "--resume", "--max-depth", "2", "--seeds", "1"]) == 0
     assert len(made) == 2  # other parameters, other runs
     assert compare.main([*command(tmp_path), "--resume", "--seeds", "1"]) == 0
-    assert len(made) == 4  # whose images had taken the place of these
+    assert len(made) == 4  # the previous run overwrote these images
 
 
 def test_two_comparisons_do_not_share_a_folder(tmp_path, capsys):
@@ -105,7 +105,7 @@ def test_two_comparisons_do_not_share_a_folder(tmp_path, capsys):
         process.communicate()
 
 
-# Files that grow beyond a limit fail as on a full disk, after as many bytes
+# Writes beyond a file size limit fail as on a full disk
 LIMITED = """
 import resource, runpy, sys
 limit = int(sys.argv.pop(1))

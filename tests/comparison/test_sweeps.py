@@ -1,4 +1,4 @@
-"""Settings that --sweep varies, the order of runs, the time left, and runs that are kept."""
+"""Settings of --sweep, order of runs, time left, and cached runs."""
 
 import argparse
 

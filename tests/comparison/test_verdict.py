@@ -1,4 +1,4 @@
-"""What a comparison comes to: ratios to the first integrator, their means, and sentences."""
+"""The verdict of a comparison: ratios to the first integrator, means, and sentences."""
 
 import pytest
 

@@ -1,5 +1,5 @@
-"""Code of the documentation, run as it is printed: the first image of docs/start.md; the method of docs/adding.md,
-which has the mean of the sum of all lights."""
+"""Code of the documentation runs as printed: the first image of docs/start.md, and the method of docs/adding.md, whose
+mean is the sum of all lights."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""The packages of vpl/: imports run one way, so that what is below can be read by itself; and their maps."""
+"""The packages of vpl/: imports run one way, so each package can be read alone; and the maps of packages."""
 
 import ast
 from pathlib import Path
@@ -31,7 +31,7 @@ def imported(file: Path):
 
 
 def test_every_package_has_its_place():
-    """A new package has to say what it may import."""
+    """A new package must declare its imports."""
     packages = {folder.parent.name for folder in (ROOT / "vpl").glob("*/__init__.py")}
     assert packages == set(BELOW)
 
@@ -51,7 +51,7 @@ def test_imports_run_one_way(package):
 
 @pytest.mark.parametrize("package", BELOW)
 def test_a_map_names_every_module(package):
-    """So that one look at the folder says where something is."""
+    """The folders of the sources match the maps in the documents."""
     folder = ROOT / "vpl" / package
     text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text()))
     modules = {file.stem for file in folder.glob("*.py")} - {"__init__"}

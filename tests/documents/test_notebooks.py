@@ -24,7 +24,7 @@ def test_notebook_is_kept_without_outputs(file):
 
 @notebooks
 def test_notebook_runs(file, tmp_path):
-    """In a copy of its folder, beside the scenes: what it writes is not left here."""
+    """Run in a copy of the folder, beside the scenes, so output files stay out of the repository."""
     (tmp_path / "scenes").symlink_to(FOLDER.parent / "scenes")
     (tmp_path / "notebooks").mkdir()
     notebook = nbformat.read(file, as_version=4)

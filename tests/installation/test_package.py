@@ -1,4 +1,4 @@
-"""The installed package: what is in the wheel, commands, types, and how Mitsuba finds the plugins of it."""
+"""The installed package: contents of the wheel, commands, types, and discovery of plugins by Mitsuba."""
 
 import os
 import shutil
@@ -76,11 +76,11 @@ def wheel(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def environment(wheel, tmp_path_factory):
-    """An environment with the wheel, and with the packages of this one that it depends on."""
+    """An environment with the wheel and its dependencies from this environment."""
     folder = tmp_path_factory.mktemp("environment")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
     [packages] = folder.glob("lib/python*/site-packages")
-    # Paths that are added so have their own .pth files ignored, such as that of this project's editable installation
+    # A path added in this way has its own .pth files ignored, e.g. the file of this project's editable installation
     (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
     pip("--python", folder / "bin/python", "install", "--no-deps", "--no-index", wheel)
     return folder
@@ -123,7 +123,7 @@ def test_importing_the_installed_package_registers_the_plugins(environment, begi
 
 
 def test_every_plugin_has_an_entry_point(environment):
-    """One a file, as a reload of a package leaves its modules as they are."""
+    """A file per case, since a reload of a package keeps its modules."""
     [metadata] = environment.glob("lib/python*/site-packages/manylights-*.dist-info")
     points = Distribution.at(metadata).entry_points.select(group="mitsuba")
     assert {point.name: point.value for point in points} == {
@@ -188,7 +188,7 @@ def test_readme_gets_to_an_image_in_a_few_lines(environment, tmp_path):
 
 @pytest.mark.stress
 def test_readme_gets_from_an_empty_environment_to_an_image(tmp_path):
-    """All lines, as they stand, in a copy of the sources; downloads Mitsuba."""
+    """Run all lines unchanged in a copy of the sources; downloads Mitsuba."""
     download = [sys.executable, "-m", "pip", "-q", "download", "--no-deps", "-d", tmp_path, "tqdm"]
     found = subprocess.run(download, capture_output=True, text=True, timeout=PATIENCE)
     if found.returncode:

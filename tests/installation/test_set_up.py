@@ -12,7 +12,7 @@ import pytest
 from tests.support.paths import ROOT
 from tests.support.processes import PATIENCE
 
-# Notes what it is asked, and has what the files beside the project say.
+# Log the request, and answer as files beside the project prescribe.
 PYTHON = r"""#!/bin/sh
 printf '%s\n' "python $*" | head -n 1 >>"$STATE/log"
 case $* in
@@ -84,7 +84,7 @@ class Project:
             capture_output=True,
             text=True,
             timeout=PATIENCE,
-            start_new_session=True,  # so that the stand-in for pip can kill all of it
+            start_new_session=True,  # the stand-in for pip kills the whole process group
         )
         assert result.returncode == status, result.stderr
         return result
@@ -234,7 +234,7 @@ def test_old_llvm_is_replaced_without_root(project):
     libraries = project.folder / ".venv/system/usr/lib/x86_64-linux-gnu"
     assert search_path == f"{libraries}:/mine"
 
-    # Without such a choice the unpacked one is used, and dependencies that would shadow the C library are not.
+    # Otherwise the unpacked library is used, without dependencies that would shadow the C library.
     del project.environment["DRJIT_LIBLLVM_PATH"]
     result = project.run("--", "sh", "-c", 'echo "$DRJIT_LIBLLVM_PATH"; echo "$LD_LIBRARY_PATH"')
     assert result.stdout.splitlines() == [f"{libraries}/libLLVM.so.19.1", str(libraries)]

@@ -1,4 +1,5 @@
-"""Adaptive direct light as Mitsuba's users meet it: against ``direct`` and ``path``, and what the manual promises."""
+"""Adaptive direct light through Mitsuba's interface: against ``direct`` and ``path``, and the promises of the
+manual."""
 
 import math
 from functools import cache
@@ -350,7 +351,7 @@ def test_aovs_have_their_names_and_ranges(mixed):
         assert 0 < np.median(noise[lit]) < 0.3 and noise.max() < 2
         assert rays.sum() * 4 == pytest.approx(integrator.statistics["shadow_rays"], rel=1e-5)
         assert 0 < integrator.statistics["shadow_rays"] and rays[~lit].max() == 0
-        # BSDF samples that found light are counted among those that the emitter samples are
+        # BSDF samples that found light count as emitter samples
         assert visible.max() <= 1 and visible.mean() > 0.05
         assert passes.sum() * 4 == pytest.approx(integrator.statistics["passes"], rel=1e-5)
         if plugin == "adaptivedirect" and more["lights"] == "clusters":

@@ -23,7 +23,7 @@ def texture(value):
 
 
 def lit(lights=None, **objects):
-    """A closed box with a good emitter, so that an image that is black or too dark shows what one bad value spoilt."""
+    """A closed box with a valid emitter: a black or too dark image reveals damage by the bad value."""
     return closed_box({"good": area_light(), **(lights or {})}, 16, **objects)
 
 
@@ -104,7 +104,7 @@ def test_a_bad_value_spoils_nothing_else(name, source, value):
 @pytest.mark.parametrize(("source", "value"), _cases(LIGHTS | MATTER, BAD))
 @pytest.mark.parametrize("name", PLUGINS)
 def test_no_bad_value_spoils_any_plugin(name, source, value):
-    # As `path`, `manylights` shows negative light of surfaces that reflect so
+    # `manylights` and `path` show negative light of surfaces with negative reflectance
     lowest = -0.2 if name == "manylights" and source in MATTER and value == "negative" else 0
     assert_renders_well((LIGHTS | MATTER)[source](BAD[value]), name, lowest=lowest)
 
@@ -118,12 +118,12 @@ def environment_only(value, kind):
 
 
 def error_of(scene, name, **more):
-    """Message of a render that is refused, with that of its cause."""
+    """Return the message of a refused render and of its cause."""
     with pytest.raises(RuntimeError) as error:
         render(scene, mi.load_dict(plugin(name, **more)), 2)
     said = f"{error.value} {error.value.__cause__}"
     del error, scene
-    gc.collect()  # what the error's frames hold, or shapes that cannot be sampled would outlive their scene
+    gc.collect()  # frames of the error would keep shapes alive that cannot be sampled
     return said
 
 

@@ -92,7 +92,7 @@ def test_every_plugin_with_every_material_alone(name, number, material):
 @pytest.mark.parametrize("direct", ["vpl", "adaptive", "none"])
 @pytest.mark.parametrize("emitter", EMITTERS)
 def test_every_way_of_direct_light_under_every_emitter(direct, emitter):
-    """As virtual lights, and by adaptive sampling, with all materials in sight."""
+    """Direct light as virtual lights, and by adaptive sampling, with all materials in view."""
     scene = mi.load_dict(stage(EMITTERS[emitter](), all_materials(), 16))
     if direct == "vpl" and emitter in ("texturedspot", "projector"):
         with pytest.raises(RuntimeError) as error:
@@ -128,14 +128,14 @@ def test_every_sensor_with_every_plugin(sensor, name):
 
 @pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])
 def test_a_meter_on_a_surface(name):
-    """The floor measures the irradiance that a small emitter sends to it."""
+    """The floor measures the irradiance of a small emitter."""
     description = stage(EMITTERS["sphere"](), {}, 16)
     meter = {"type": "irradiancemeter", "film": film(1, 1), "sampler": {"type": "independent"}}
     del description["sensor"]
     description["floor"] |= {"sensor": meter}
     scene = mi.load_dict(description)
-    reference = cache(lambda seed: render(scene, "prb", 1 << 16, 1000 + seed, max_depth=2))
-    assert_mean_of_reference(scene, name, 4096, reference, tiles=1)
+    # With the same seed, the same rays of the meter meet the emitter
+    assert_mean_of_reference(scene, name, 4096, lambda seed: render(scene, "prb", 4096, seed, max_depth=2), tiles=1)
 
 
 @pytest.mark.parametrize("options", FILMS)
@@ -157,7 +157,7 @@ def test_every_film_with_every_plugin(options, name):
 
 
 def never_sampled(emitter, count=1):
-    """As many of an emitter of the catalogue as asked for, which ``path`` never samples."""
+    """The given number of an emitter of the catalogue, with sampling weight 0 for ``path``."""
     (lamp,) = EMITTERS[emitter]().values()
     return {f"lamp{k}": lamp | {"sampling_weight": 0.0} for k in range(count)}
 
@@ -169,8 +169,8 @@ def never_sampled(emitter, count=1):
     ids=["directionalarea", "directional, projector", "points and spots"],
 )  # fmt: skip
 def test_emitters_that_path_never_finds_light_nothing(emitters):
-    """A directional area emitter has no direction that a surface could sample; others have a weight of 0, beside one
-    lamp that has none and is out of sight."""
+    """A directional area emitter emits in a direction that no surface samples; the remaining emitters have a sampling
+    weight of 0, beside a hidden lamp."""
     hidden = {"hidden": {"type": "point", "position": [0, -5, 0], "intensity": rgb(1.0)}}
     scene = mi.load_dict(stage(emitters() | hidden, {"panel": wall([0, 0, 0], [0, 1, 0], 0, 0.5)}, 16))
     for name in ("path", "manylights", "lightcuts", "adaptivedirect"):

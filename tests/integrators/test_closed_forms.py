@@ -16,13 +16,13 @@ DIRECT = ("adaptivedirect", "unoccludeddirect")
 
 
 def all_plugins(*left_out):
-    """Names of plugins; most of them for the stress run."""
+    """Parameters for names of plugins; most are for the stress run."""
     names = [name for name in PLUGINS if name not in left_out]
     return [pytest.param(name, marks=() if name in QUICK else pytest.mark.stress) for name in names]
 
 
 def few_lights(name, count):
-    """The properties of a plugin by which it has so many lights, none of them clamped."""
+    """Properties of a plugin for the given number of lights, without clamping."""
     return {} if name == "manylights" else {"clamping": 0.0, "vpl_count": count}
 
 
@@ -32,7 +32,7 @@ def assert_mean(name, scene, expected, spp=16, tolerance=2e-3, **more):
     means = np.array([render(scene, integrator, spp, seed).mean() for seed in range(SEEDS)])
     width = stats.t.ppf(0.9995, SEEDS - 1) * means.std(ddof=1) / SEEDS**0.5
     assert abs(means.mean() - expected) < width + tolerance * expected, (means.mean(), expected, width)
-    # A test that would pass whatever the mean is no test
+    # The tolerance must be small against the mean
     assert width < 0.05 * expected
 
 

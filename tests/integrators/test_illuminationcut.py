@@ -1,4 +1,4 @@
-"""The integrator ``illuminationcut``: against ``vpl`` with the same lights, and in everything that it adds to it."""
+"""The integrator ``illuminationcut``: against ``vpl`` with equal lights, and its own features."""
 
 import math
 from dataclasses import replace
@@ -220,7 +220,7 @@ def test_odd_scenes_render_as_by_all_lights(name, visibility):
 
 
 def broken_normals():
-    """A square whose vertex normals are all zero, as careless exporters write them: shading normals are not numbers."""
+    """A square with vertex normals of length zero, a common export error: shading normals are NaN."""
     mesh = mi.Mesh("square", 4, 2, has_vertex_normals=True)
     parameters = mi.traverse(mesh)
     corners = np.array([[-1, -1, -1.5], [1, -1, -1.5], [1, 1, -1.5], [-1, 1, -1.5]], np.float32) * 0.5

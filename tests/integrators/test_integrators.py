@@ -1,4 +1,4 @@
-"""The integrators as Mitsuba's users meet them: against ``path``, in all the ways that Mitsuba calls plugins."""
+"""The integrators through Mitsuba's interface: against ``path``, in each way of calling plugins."""
 
 import math
 
@@ -232,7 +232,7 @@ def test_a_medium_is_refused_by_name(capfd):
         render(mi.load_dict(scene), "lightcuts")
     said = 'shape 0 ("fog", Sphere) bounds a participating medium'
     assert said in str(error.value.__cause__)
-    # `mi.render` raises another error, which does not say it
+    # `mi.render` raises a different error, without the cause
     assert said in "".join(capfd.readouterr())
 
 

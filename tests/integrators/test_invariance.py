@@ -1,5 +1,4 @@
-"""Images that must not change: with the scene's scale, place and orientation, the units of its light, or the order in
-which its shapes and lights are listed."""
+"""Invariance of images: scale, position and orientation of the scene, units of light, order of shapes and lights."""
 
 import mitsuba as mi
 import numpy as np
@@ -14,7 +13,7 @@ QUICK = ("lightcuts", "adaptivedirect")
 
 
 def emitters():
-    """One of each kind that has a place."""
+    """One emitter of each kind with a position."""
     ball = {"type": "sphere", "center": [0.4, -0.3, 0.2], "radius": 0.15, "bsdf": {"type": "roughplastic"}}
     bulbs = {
         f"bulb{k}": {"type": "point", "position": [0.3 * k - 0.6, 0.3, 0.1], "intensity": rgb(0.1 + 0.1 * k)}

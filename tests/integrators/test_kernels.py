@@ -20,9 +20,9 @@ SETTINGS = {"manylights": {}, "adaptivedirect": {}, "unoccludeddirect": {}}
 
 @pytest.fixture
 def compiled():
-    """A function that says how many kernels were launched since it was last called that never were before."""
+    """Return a function that counts the new kernels since its last call."""
     seen = set()
-    # Kernels hold the code of all scenes that are alive, of which none is to be let go in between
+    # Kernels hold the code of all live scenes, and no scene may be freed in between
     gc.collect()
 
     def count():
@@ -48,7 +48,7 @@ def test_sizes_and_samples_are_in_no_kernel(name, compiled, lights_cost_nothing)
         assert name != "manylights" or plugin.statistics["light_paths"] > 0
         return compiled()
 
-    # What is a single number in one image may be several in the next, which makes a few other kernels
+    # A scalar of one image may be an array in the next, which compiles a few more kernels
     assert sum(new(camera, seed=seed) for camera in (1, 2) for seed in range(3)) > 2 * MITSUBAS
     assert new(seed=3) == 0
     if name != "matrixrecovery":  # which solves larger problems otherwise
@@ -62,7 +62,7 @@ def test_sizes_and_samples_are_in_no_kernel_of_many_emitters(compiled, lights_co
     lamps = {f"lamp{i}": area_light() | {"to_world": turned(0.1 * i - 4)} for i in range(80)}
     views = {f"view_{size}": closed_box({}, size)["sensor"] for size in (32, 40, 48)}
     scene = mi.load_dict(closed_box(lamps) | views)
-    # No light is indirect, so that lights stand for emitters, whatever the pilot finds
+    # Without indirect light, virtual lights represent emitters regardless of the pilot
     plugin = mi.load_dict({"type": "manylights", "max_depth": 2})
 
     def new(camera=1, spp=16, seed=0):
@@ -97,7 +97,7 @@ def test_paths_from_the_camera_and_from_lights_are_followed_by_one_kernel(hide_e
 
 
 def test_places_in_the_registry_are_in_no_kernel(compiled):
-    """Shapes are loaded in parallel, so that they have other ones in every process."""
+    """Mitsuba loads shapes in parallel, so registry indices differ between processes."""
     shapes = mi.load_dict(closed_box({"lamp": area_light()})).shapes_dr()
     indices = dr.reinterpret_array(mi.UInt32, shapes).numpy()
     compiled()

@@ -1,4 +1,4 @@
-"""Knobs: what is accepted, what is said of the rest, and how plugins inherit them."""
+"""Knobs: accepted values, error messages, and inheritance by plugins."""
 
 import math
 

@@ -64,7 +64,7 @@ def test_cuts_hold_every_light_that_can_arrive_once_and_keep_their_bounds(batch)
 
 
 def test_what_a_cut_came_out_shorter_than_counted_is_part_of_none():
-    """Rows of nodes that were counted and not written are 0, as those of the first cut are; one is missing in three."""
+    """Counted rows of nodes without values are 0, like the rows of the first cut; every third is missing."""
     rows, offset, length = ([0, 0, 0, 1, 0, 2, 2, 0], [0, 3, 5, 7], [2, 1, 2, 0])
     columns = (upload(mi.UInt32, np.array(x)) for x in (offset, length, rows))
     chunk = CutChunk(None, None, None, *columns, nodes=None, visits=None)
@@ -115,7 +115,7 @@ def test_lambertian_points_are_found_and_shade_as_their_bsdf():
     plain = jobs[0].batch
     assert isinstance(plain.surfaces, LambertianSurface)
     assert isinstance(jobs[1].batch.surfaces, ScatteringSurface)
-    # All glossy things are in the other batch: there are as many as the camera sees of them
+    # All glossy surfaces are in the second batch: the number that the camera sees
     total = sum(job.batch.count for job in jobs)
     assert 0.02 * total < jobs[1].batch.count < 0.6 * total
 

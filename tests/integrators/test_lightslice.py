@@ -96,7 +96,7 @@ def test_bad_slices_are_refused_by_name():
 
 
 def random_escape(rng, leaves):
-    """A random binary tree in preorder: where each of its nodes escapes to."""
+    """A random binary tree in preorder, as escape indices."""
 
     def below(first, count):
         if count == 1:
@@ -139,7 +139,7 @@ def test_pruned_forests_hold_every_column_once_and_split_what_costs_most(seed, t
         split = [kept[key] for key in zip(pruned.group[pruned.inner], pruned.node[pruned.inner], strict=True)]
         left = np.setdiff1d(whole, forest.columns)
         assert len(split) == 0 or len(left) == 0 or cost[split].min() >= cost[left].max()
-        # All that there is room for, but for nodes that cost the same as those that there is none for
+        # The largest number that fits, except for nodes of equal cost
         costliest = np.sort(cost[forest.inner])[::-1]
         worthwhile = costliest[costliest > 0][: most - len(trees)]
         first_left = costliest[most - len(trees)] if most - len(trees) < len(costliest) else 0
@@ -178,7 +178,7 @@ def column_of_each_light(forest, every):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_value_that_is_not_finite_counts_as_none(monkeypatch, bad):
-    """And spoils neither its row nor the others."""
+    """The value spoils no row."""
     job = prepared(glossy_room(), vpl_count=100)[1][0]
     good = sampled(job, 6)[1]
     evaluate, calls = light_matrix.evaluate_pairs, []
@@ -346,7 +346,7 @@ def dark_corners():
 def test_the_mean_over_seeds_is_that_of_all_lights(make):
     """With the same seeds both methods see the same lights: what is left is the noise of the choice.
 
-    Few slices and columns, and few rows that tell: much of what arrives was not seen by any of them.
+    With few slices, columns and representative rows, no row has seen much of the arriving light.
     """
     scene = make()
     scene = mi.load_dict(scene) if isinstance(scene, dict) else scene
@@ -360,7 +360,7 @@ def test_the_mean_over_seeds_is_that_of_all_lights(make):
 
 
 def test_no_light_is_drawn_for_another_kind_and_all_lights_stand_for_all_of_their_kind():
-    """Whatever the cut: on average, scale times intensity of a kind's lights is the intensity of all of them."""
+    """For any cut, the expected sum of scale times intensity over a kind is the intensity of all its lights."""
     job = prepared(glossy_room(), vpl_count=60, direct="vpl", direct_count=32)[1][0]
     clusters, rows, _ = sampled(job, 2, shared=30)
     near, sets = NearRows.nearest(np.random.default_rng(0).random((2, 6)), 2), 1 << 12
@@ -460,7 +460,7 @@ def test_rows_that_see_nothing_leave_the_choice_to_bounds():
 
 
 def test_points_that_coincide_are_one_slice():
-    """Points without any extent: one slice, whatever is asked for."""
+    """Points without extent form one slice, for any requested number."""
     position, normal = np.zeros((50, 3), np.float32), np.tile(np.float32([0, 0, 1]), (50, 1))
     tree = PointClusters(batch_of(position, normal), lambda p, n: build_slices(p, n, 8)).tree
     assert tree.size == 1 and tree.count.tolist() == [50]

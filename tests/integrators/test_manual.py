@@ -59,7 +59,7 @@ class Code(Directive):
 
 
 def parsed(page):
-    """(The document that a page is, what is wrong with it)."""
+    """Return (parsed document, errors)."""
     directives.register_directive("pluginparameters", Nested)
     directives.register_directive("tabs", Nested)
     directives.register_directive("code-tab", Code)
@@ -144,7 +144,7 @@ def test_texts_that_nobody_wrote_are_refused_and_no_docstring_is_none():
     assert manual_page(type("Plugin", (), {"__doc__": None})).__doc__ is None
 
 
-# What importing the plugins does with docstrings as they are compiled, for Pythons that have no Mitsuba
+# Docstring operations at import of the plugins, on compiled docstrings, for Pythons without Mitsuba
 _FILL = """
 import ast, sys, types
 from pathlib import Path

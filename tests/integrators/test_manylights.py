@@ -111,7 +111,7 @@ def test_a_half_transparent_mask_around_all():
 
 @pytest.mark.parametrize("hide_emitters", [False, True])
 def test_a_mask_with_nothing_behind_it(hide_emitters):
-    """Of its light, `path` loses that of samples that pass it; alpha is the same."""
+    """`path` loses the light of samples that pass the mask; alpha is equal."""
     mask = {"type": "mask", "opacity": 0.3, "nested": {"type": "diffuse"}}
     lamp = EMITTERS["constant"]() if hide_emitters else {"lamp": {"type": "point", "position": [0, 0, 3]}}
     description = {"type": "scene", "sensor": sensor(16), **lamp, "mask": wall([0, 0, 0], [0, 1, 0], 0, 8, bsdf=mask)}

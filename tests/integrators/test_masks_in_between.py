@@ -1,4 +1,4 @@
-"""Masks between lights and what they light: every one that light passes is an edge of its path, as in ``prb``."""
+"""Masks between lights and surfaces: each mask is an edge of the light's path, as in ``prb``."""
 
 import mitsuba as mi
 import pytest
@@ -40,7 +40,7 @@ def test_light_through_four_masks(max_depth):
 
 @pytest.mark.parametrize("lamp", ["point", "spot", "directional"])
 def test_light_from_one_point_or_direction_does_not_pass(lamp):
-    """Next-event estimation alone finds such an emitter, and masks block it."""
+    """Only next-event estimation finds the emitter, and masks block its rays."""
     aimed = mi.ScalarTransform4f().look_at([0, 0, -0.9], [0.8, -1, 0.4], [0, 1, 0])
     emitter = {
         "point": {"type": "point", "position": [0, 0, -0.8], "intensity": rgb(1.0)},

@@ -241,7 +241,7 @@ def test_most_entries_are_predicted_and_the_image_is_that_of_all_lights(shadows)
 
 
 def test_the_error_falls_with_alpha(shadows):
-    """Of clusters: the larger they are, the more of them are so large that they are traced."""
+    """Larger clusters lead to more traced clusters."""
     expected, settings = render(shadows, "vpl", 1, **SMALL), SMALL | {"steps": f"{PREDICTED},separation,correction"}
     errors = [dark_error(rendered(shadows, 1, **settings, alpha=alpha)[0], expected) for alpha in (0.05, 0.005, 0.0005)]
     assert errors[2] < 0.7 * errors[0] and errors[1] < errors[0]
@@ -261,7 +261,7 @@ def test_the_bias_of_prediction_is_small_and_falls_with_sampling(shadows):
 
 
 def test_small_lamps_do_not_lose_their_light():
-    """Each of the 900 lamps of the hall lights what is next to it, where few of the rows that are traced are."""
+    """The 900 lamps of the hall are local, and few traced rows are near a lamp."""
     file = SceneFile(str(ROOT / "scenes" / "hall.xml"), {"integrator": "path"})
     file.set_width(48)
     scene, settings, found, expected = file.load(), {"max_depth": 2, "emitter_samples": 1}, 0, 0
@@ -269,7 +269,7 @@ def test_small_lamps_do_not_lose_their_light():
         image, statistics = rendered(scene, 1, seed, **settings, alpha=0.0)
         expected += render(scene, "vpl", 1, seed, **settings).sum()
         found += image.sum()
-        # As nothing is known of lamps none of whose samples are lit, none of them shares a column
+        # A lamp without lit samples shares no column
         assert statistics["cut_size"] > 700 * image[..., 0].size
     assert abs(found / expected - 1) < 0.02
 
@@ -316,7 +316,7 @@ def test_a_slice_that_fails_is_traced_whole_and_counted(shadows, monkeypatch):
     image, found = rendered(shadows, 1, **settings)
     assert found["failed_slices"] > 0 and found["correction_rays"] > 0
     monkeypatch.undo()
-    # All rows of all columns that are not alike
+    # Each row of each column with different entries
     traced, _ = rendered(shadows, 1, **SMALL, sampling=9.0, steps=PREDICTED)
     assert relative_error(image, traced) < 0.01
 

@@ -116,7 +116,7 @@ def test_the_mean_over_seeds_is_that_of_all_lights(make):
     scene = make()
     scene = mi.load_dict(scene) if isinstance(scene, dict) else scene
     given = {"vpl_count": 400, "max_depth": 4, "direct": "vpl", "direct_count": 64}
-    # So coarse a cut that representatives of points as well as lights matter everywhere
+    # A coarse cut, so representatives of points and of lights matter everywhere
     cut = {"error": 0.3, **given}
 
     def pair(seed):
@@ -221,7 +221,7 @@ def test_a_sensor_outside_of_the_scene_is_lit_as_one_of_it():
 
 
 def test_below_a_wrapper_a_sensor_outside_of_the_scene_is_lit_ray_by_ray():
-    """Only rays are known there, not whose they are."""
+    """The plugin receives rays without pixels."""
     scene = closed_box({"lamp": area_light()}, size=16)
     other = mi.load_dict(scene["sensor"])
     scene["sensor"]["film"] = scene["sensor"]["film"] | {"width": 20}

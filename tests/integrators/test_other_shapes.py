@@ -14,7 +14,7 @@ from tests.support.statistics import relative_error
 
 @pytest.fixture(autouse=True)
 def only_scenes_of_one_test():
-    """While a shape is alive that cannot be sampled, no scene in which many shapes are emitters can call them."""
+    """A live shape that cannot be sampled breaks calls of emitters in any scene with many emissive shapes."""
     yield
     gc.collect()
 

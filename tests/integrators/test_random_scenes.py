@@ -58,7 +58,7 @@ def emitters(draw):
 
 @st.composite
 def scenes(draw):
-    """A floor, so that something is seen, some shapes, and one to four emitters; at most one environment."""
+    """A visible floor, up to four shapes, and one to four emitters; at most one environment."""
     floor = mi.ScalarTransform4f().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(2)
     scene = {"type": "scene", "sensor": sensor(8, 2), "floor": {"type": "rectangle", "to_world": floor}}
     for number, shape in enumerate(draw(st.lists(shapes(False), max_size=4))):
@@ -78,7 +78,7 @@ def test_random_scenes_have_no_bad_pixel(scene, name, depth):
     try:
         loaded = mi.load_dict(scene)
     except RuntimeError:
-        return  # Mitsuba refuses some of them, such as a flattened sphere
+        return  # Mitsuba refuses some scenes, e.g. a flattened sphere
     finally:
         mi.set_log_level(mi.LogLevel.Warn)
     try:
@@ -100,7 +100,7 @@ WEIGHTS = st.lists(
 @example(weights=[1e-300, 1e300, 0.0], seed=0)
 @settings(max_examples=examples(100), deadline=None)
 def test_a_choice_never_falls_on_nothing(weights, seed):
-    """Whatever the uniform number, 0 and 1 - eps included; probabilities are what is said and sum to one."""
+    """For any uniform number, including 0 and 1 - eps; the stated probabilities are exact and sum to one."""
     weights = np.array(weights)
     choice = Choice(weights)
     uniform = np.random.default_rng(seed).random(64, np.float32)

@@ -17,7 +17,7 @@ def rgb(value):
 
 
 def chequered(rfilter, material="diffuse"):
-    """A wall that fills the image, with checks of two pixels that lie between its pixels; a lamp and some sky."""
+    """A checkerboard wall across the image, with checks of two pixels shifted by half a pixel; a lamp and some sky."""
     camera, half = sensor(SIZE, 1), 4 * float(np.tan(np.deg2rad(20)))
     camera["film"]["rfilter"] = {"type": rfilter}
     checks = {
@@ -34,7 +34,7 @@ def chequered(rfilter, material="diffuse"):
 
 @pytest.fixture(autouse=True)
 def lights_cost_nothing(monkeypatch):
-    """So that ``manylights`` makes some where light bounces."""
+    """Let ``manylights`` use virtual lights wherever light bounces."""
     monkeypatch.setattr(balance, "_PAYS_BELOW", 1e30)
 
 

@@ -11,7 +11,7 @@ PLACES = np.random.default_rng(1).uniform(-0.9, 0.9, (8, 3)).tolist()
 
 
 def bulbs(count):
-    """As many point emitters as asked for, at eight places, of the same power in all."""
+    """The given number of point emitters at eight positions, of constant total power."""
     power = rgb(4.0 / count)
     return {
         f"bulb{i}": {"type": "point", "position": PLACES[i % len(PLACES)], "intensity": power} for i in range(count)

@@ -1,4 +1,4 @@
-"""Integrators that are cancelled while they render: they do not go on to the end.  Ctrl-C."""
+"""Cancelled renders end early.  Ctrl-C."""
 
 import subprocess
 import sys
@@ -50,7 +50,7 @@ def test_sizes_of_kernels_do_not_change_the_image(monkeypatch, scene, name):
     np.testing.assert_allclose(render(scene, create(name)), expected, rtol=1e-4, atol=1e-6)
 
 
-# In a process of its own, which a handler that was left behind would end
+# A separate process, which a stale handler would end
 INTERRUPTED = """
 import signal
 import mitsuba as mi

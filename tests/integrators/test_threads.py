@@ -1,4 +1,4 @@
-"""Two threads that render at once: with one sensor the later one is told, with one each both images are right."""
+"""Two concurrent renders: a shared sensor is refused to the second thread, separate sensors give correct images."""
 
 import threading
 
@@ -20,7 +20,8 @@ def box():
 
 
 class Waiting:
-    """A thread that calls a function, which in turn calls ``pause``: then the block runs, and after it the rest."""
+    """A thread with a function that calls ``pause``: the block runs during the pause, and the function ends after the
+    block."""
 
     def __init__(self, function):
         self._reached, self._go_on, self.result = threading.Event(), threading.Event(), None

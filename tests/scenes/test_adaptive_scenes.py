@@ -12,8 +12,8 @@ from comparison.images import read_exr
 from comparison.scene_files import SceneFile
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
-# Of each: the generator, its options, how many emitters there are (point, area, environment), how many of them an
-# average pixel may see, and how much of the image may show the sky.
+# For each scene: generator, options, numbers of emitters (point, area, environment), range of the mean visible fraction
+# of emitters, and largest fraction of sky in the image.
 TRAITS = {
     "kitchen_lamps": ("kitchen_lamps", [], (0, 72, 0), (0.05, 0.35), 0),
     "kitchen_windows": ("kitchen_lamps", ["--windows"], (0, 72, 1), (0.05, 0.35), 0),
@@ -26,7 +26,7 @@ SIZE = 64, 48
 
 @pytest.fixture(scope="module")
 def generate():
-    """Return a function that runs the generator of a scene and returns the file that it wrote."""
+    """Return a function that runs a scene's generator and returns the written file."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(SCENES)
 
@@ -61,7 +61,7 @@ def scenes(scalar_variant):
 
 
 def first_hits(scene):
-    """Trace a ray through each pixel; yield the rays and what they hit."""
+    """Trace a ray through each pixel; yield rays and hits."""
     for y in range(SIZE[1]):
         for x in range(SIZE[0]):
             place = mi.Point2f((x + 0.5) / SIZE[0], (y + 0.5) / SIZE[1])
@@ -70,7 +70,7 @@ def first_hits(scene):
 
 
 def light_positions(text):
-    """Return the position of each light of a scene's XML, that of its centre where it has a size, as (n, 3)."""
+    """Return the positions of the lights of a scene's XML, (n, 3); of an extended light, the centre."""
     lines = [line for line in text.splitlines() if re.search('<emitter type="(point|area)">', line)]
     found = [re.search('(?:name="position" value|name="center" value|origin)="([^"]+)"', line)[1] for line in lines]
     return np.array([[float(number) for number in position.split(",")] for position in found])
@@ -118,7 +118,7 @@ def test_seed_changes_lights_only(generate, tmp_path, name):
     def building(text):
         return [re.sub("<emitter.*</emitter>", "", line) for line in text.splitlines()[1:]]
 
-    # Where a lantern hangs among the trees is drawn too, and its cage with it.
+    # Random numbers place lanterns with cages among the trees.
     assert name == "forest_lights" or building(first) == building(second)
     assert len(first.splitlines()) == len(second.splitlines())
 
@@ -151,7 +151,7 @@ def test_average_point_sees_few_lights(scenes, name):
     scene, random, seen = scenes[name], np.random.default_rng(2), []
     for _, hit in first_hits(scene):
         for sample in random.random((5, 2)) if hit.is_valid() else ():
-            # Mitsuba draws its emitters with equal probability. Surfaces are lit on the side from which they are seen.
+            # Mitsuba draws its emitters with equal probability. Visible sides of surfaces are lit.
             light, weight = scene.sample_emitter_direction(hit, mi.Point2f(sample), True)
             seen.append(max(weight) > 0 and hit.to_local(light.d).z * hit.wi.z > 0)
     low, high = TRAITS[name][3]

@@ -53,7 +53,7 @@ def test_shipped_hall_is_what_the_generator_makes(generator, tmp_path):
     assert (tmp_path / "hall.xml").read_text() == (ROOT / "scenes" / "hall.xml").read_text()
 
 
-# Point, spot and area emitters of the scenes that have one number of them
+# Numbers of point, spot and area emitters of scenes without parameters
 OTHERS = {"banquet": [0, 60, 66], "arcade": [0, 0, 0], "corridor": [0, 0, 32], "veils": [0, 0, 6]}
 
 
@@ -70,7 +70,7 @@ def test_shipped_scenes_are_what_their_generators_make(name, tmp_path, monkeypat
 
 
 def test_shipped_room_is_what_its_generator_makes(tmp_path):
-    """Which needs a variant of its own, as the add-on."""
+    """The generator needs a separate variant, like the add-on."""
     script = ROOT / "scenes" / "blender_room.py"
     subprocess.run([sys.executable, script, "--output", tmp_path / "blender_room.xml"], check=True, timeout=PATIENCE)
     made = [file for file in tmp_path.rglob("*") if file.is_file() and file.suffix != ".exr"]
@@ -97,7 +97,7 @@ def test_a_scene_from_blender_renders_unchanged():
 
 
 def of_its_own(file):
-    """The scene of a file with `manylights` in place of its integrator, as the command does it."""
+    """Load a scene with `manylights` in place of its integrator, like the command."""
     file.set_integrator("manylights")
     return file.load()
 

@@ -1,4 +1,4 @@
-"""Small examples of all that Mitsuba offers: materials, emitters, sensors and films for the tests of all of them.
+"""Small examples of Mitsuba's materials, emitters, sensors and films.
 
 Functions that return dictionaries for ``mi.load_dict``; they are called when the variant is set.
 """
@@ -144,7 +144,7 @@ def one_of(material):
 
 
 def all_materials():
-    """One small sphere of every material, in rows that the camera sees."""
+    """Rows of small visible spheres, one per material."""
     objects = {}
     for number, (name, material) in enumerate(MATERIALS.items()):
         row, column = divmod(number, 6)
@@ -169,7 +169,7 @@ def _in_front_of(x):
     return mi.ScalarTransform4f().look_at([x, 0, 4], [x, 0, 0], [0, 1, 0])
 
 
-# Sensors around a film; those that measure one number take one of a single pixel
+# Sensors around a film; meters of a single number take a film of one pixel
 SENSORS = {
     "perspective": lambda film: _on(film, "perspective", fov=45),
     "shutter": lambda film: _on(film, "perspective", fov=45, shutter_open=0.0, shutter_close=1.0),

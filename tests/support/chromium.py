@@ -149,7 +149,7 @@ class Chromium:
 
 
 def choose(page, selector, value):
-    """Choose as a person would, and wait until it is painted."""
+    """Select a value like a user, and wait until the page is painted."""
     before = page.value("document.querySelector('.stage').dataset.painted")
     page.value(
         f"(() => {{ const e = document.querySelector('{selector}'); e.value = '{value}'; "

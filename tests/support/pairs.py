@@ -60,7 +60,7 @@ def vectors(array_type, values):
 
 
 def batch_of(position, normal, peak=None, no_cosine=None):
-    """Lambertian points made of arrays; with ``peak``, (n,), their proxies have lobes of that height as well."""
+    """Lambertian points made of arrays; ``peak``, (n,), adds lobes of this height to the proxies."""
     count, rng = len(position), np.random.default_rng(0)
     albedo = vectors(mi.Color3f, rng.uniform(0.05, 0.3, (count, 3)))
     interaction = dr.zeros(mi.Interaction3f, count)
@@ -80,7 +80,7 @@ def batch_of(position, normal, peak=None, no_cosine=None):
 
 
 def prepared(scene, seed=0, size=32, **more):
-    """The plugin and its jobs for one sample a pixel."""
+    """Return the plugin and its jobs for one sample per pixel."""
     plugin = mi.load_dict({"type": "lightcuts", "vpl_count": 3000, "max_depth": 5, **more})
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, size * size)

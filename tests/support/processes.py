@@ -1,6 +1,6 @@
-"""Processes that tests start, and conditions that tests wait for.
+"""Processes of tests, and waits for conditions.
 
-A machine may be busy with other work, so a wait ends early only if its condition holds or its process has ended.
+On a busy machine any step may be slow: a wait ends only with its condition, its process, or after PATIENCE.
 """
 
 import time

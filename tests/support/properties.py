@@ -26,6 +26,6 @@ def assert_property_is_refused(plugin, name, value):
 
 
 def assert_properties_are_shown(plugin, given):
-    """With their values, in what the plugin prints as."""
+    """The printed plugin shows the values of properties."""
     text = str(mi.load_dict({"type": plugin, **given}))
     assert all(f"{name} = {value}" in text for name, value in given.items())

@@ -20,7 +20,7 @@ def bulb():
 
 
 def smooth_octahedron(flip=False, size=0.4):
-    """A glowing mesh with the normals of a ball: near its outline, faces that are seen shine the other way."""
+    """A glowing mesh with the normals of a ball: near the outline, visible faces shine away from the camera."""
     props = mi.Properties()
     props["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": 4.0}})
     props["flip_normals"] = flip
@@ -38,7 +38,7 @@ def smooth_octahedron(flip=False, size=0.4):
 
 
 def veiled_room(veils=4, lamp=None):
-    """A room that is halved by masks; its back wall shines, if no other lamp is given."""
+    """A room divided by masks; without a lamp, its back wall shines."""
     box = closed_box(lamp or {}, 16)
     if lamp is None:
         box["back"]["emitter"] = {"type": "area", "radiance": rgb(1.0)}

@@ -1,8 +1,8 @@
-"""Statistical tests of images, each of which states the least bias that it finds.
+"""Statistical tests of images with a stated least detectable bias.
 
-A test of equal means is no stronger than the spread of its renders allows. From that spread
-:func:`compare_means` computes the least relative bias of the image mean that the test finds nine times in ten, and
-:func:`assert_same_mean` fails if it exceeds the bound that the test declares.
+A test of equal means is no stronger than the spread of its renders allows. :func:`compare_means` computes the least
+relative bias of the image mean that a test with this spread finds nine times in ten; :func:`assert_same_mean` fails if
+this bias exceeds the declared bound.
 """
 
 from functools import cache
@@ -39,8 +39,8 @@ def detectable_shift(count, significance):
 def compare_means(pairs, tiles=4):
     """Test images for equal means; ``pairs``: (found, expected) of each seed, arrays (height, width, channels).
 
-    Two t tests share the level by the correction of Šidák: one of the image mean, and one of the means of tiles, per
-    channel, and of channels, over all of which the least p value is corrected again.
+    Two t tests share the level [Šidák 1967]: a test of the image mean, and a test of the means of tiles and of
+    channels, with the least p value corrected for their number.
     """
     found, expected = (np.array(images) for images in zip(*pairs, strict=True))
     count, height, width, channels = found.shape
@@ -60,7 +60,7 @@ def compare_means(pairs, tiles=4):
 
 
 def corrected(p_value, count):
-    """Probability that the least of ``count`` independent p values is as small as ``p_value`` [Šidák 1967]."""
+    """Probability that the least of ``count`` independent p values is at most ``p_value`` [Šidák 1967]."""
     return 1 - (1 - p_value) ** count
 
 
@@ -68,8 +68,8 @@ def assert_same_mean(pair, seeds, finds=0.01, tiles=4):
     """Fail if images differ in mean, or if their spread hides a relative bias of the image mean of ``finds``.
 
     ``pair(seed)`` renders (found, expected), arrays (height, width, channels), for each seed of ``range(seeds)``.
-    Where their means differ at the level SCREENING, four times as many other seeds decide at the level SIGNIFICANCE, so
-    that equal means fail once in 2000 tests while a bias shows the more.
+    A difference at the level SCREENING is tested again at the level SIGNIFICANCE with four times as many new seeds:
+    equal means fail once in 2000 tests, and a bias shows more clearly.
     """
     result = compare_means([pair(seed) for seed in range(seeds)], tiles)
     assert result.detectable <= finds, f"a bias below {result.detectable:.2%} would go unseen"

@@ -1,4 +1,4 @@
-"""The helpers of the tests: the statistical test finds the bias that it declares, and no bias where there is none."""
+"""The statistical test finds the declared bias, and accepts equal means."""
 
 import numpy as np
 import pytest

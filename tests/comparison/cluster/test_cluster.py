@@ -1,4 +1,4 @@
-"""Passes on workers: the image is that of one process, bit by bit, whatever becomes of the workers."""
+"""Passes on workers: the image equals the image of one process bit by bit, even if workers are lost."""
 
 import json
 import os
@@ -28,7 +28,7 @@ USUAL = ["-D", "resx=16", "-D", "resy=16", "-i", "path", "-t", "1", "--pass-spp"
 
 
 def run(*arguments):
-    """Run the command in this process; return its exit status."""
+    """Run the command in this process and return its exit status."""
     try:
         return manylights.main([str(argument) for argument in arguments])
     except SystemExit as error:
@@ -100,7 +100,7 @@ def test_an_error_ends_the_render_for_all_where_it_ends_one(two, tmp_path):
 
 
 def test_time_ends_a_render(two, tmp_path):
-    """After one pass or some, as the time allows."""
+    """A short time allows one pass, a longer time several."""
 
     def passes(seconds):
         assert run(CORNELL, *USUAL, "-o", tmp_path / "a.exr", "--workers", two, "--time", seconds) == 0
@@ -142,7 +142,7 @@ def test_images_that_wait_for_another_one_have_bounded_memory(monkeypatch):
 
 
 def kill_a_worker(address):
-    """Kill a worker that renders; another one takes its place after a while."""
+    """Kill a rendering worker; the cluster replaces it after a while."""
     with distributed.Client(address) as client:
         os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
 
@@ -172,7 +172,7 @@ def test_a_worker_that_is_killed_during_a_pass_changes_nothing(two):
 
 
 def test_passes_that_a_worker_takes_with_it_are_rendered_again(two):
-    """It has finished them, and is killed before it hands them over."""
+    """The worker is killed after it finished passes and before it hands them over."""
     np.testing.assert_array_equal(rendered_with_a_worker_killed(two, results_wait), in_one_process())
 
 
@@ -329,7 +329,7 @@ def pass_of(value):
 
 
 def test_a_checkpoint_that_is_saved_while_a_pass_is_added_is_of_those_before(tmp_path, monkeypatch):
-    """After Ctrl-C another thread saves it where the main one does not come to an end."""
+    """After Ctrl-C another thread saves the checkpoint if the main thread does not end."""
     kept, restored = rendering.Passes(0), rendering.Passes(0)
     file = checkpoint.Checkpoint(tmp_path / "a.checkpoint.npz", {})
     file.restore(kept)
@@ -371,7 +371,7 @@ OBJ = "v 0 0 9\nv 1 0 9\nv 0 1 9\nf 1 2 3\n"
 
 
 def scene_with_files(folder, mesh="meshes/a.obj"):
-    """A scene that includes another file, which names a mesh."""
+    """A scene that includes a file, and this file names a mesh."""
     for name in ("scene", "scene/meshes", "parts"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     (folder / "scene/meshes/a.obj").write_text(OBJ)
@@ -403,7 +403,7 @@ def test_a_worker_gets_the_files_that_it_lacks(tmp_path):
 
 
 def test_two_hyphens_in_a_comment_do_not_keep_a_scene_from_travelling(tmp_path):
-    """As in the hall, which says by what command it was made."""
+    """The comment in the file of the hall holds the command of its generator."""
     scene = scene_with_files(tmp_path / "client")
     before = [file.relative for file in scene_travel.bundle(SceneFile(scene)).files]
     scene.write_text(f"<!-- Made by: hall.py --lights 2\n -->\n{scene.read_text()}")

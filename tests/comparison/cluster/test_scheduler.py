@@ -1,4 +1,4 @@
-"""Schedulers in processes of their own: one that is killed and started anew, and one that is reached by TLS."""
+"""Schedulers in separate processes: restarted after a kill, and reached by TLS."""
 
 import os
 import re
@@ -43,7 +43,7 @@ def port():
 
 @contextmanager
 def started(*command, environment=None):
-    """A process that lives as long as the block, with all that it starts."""
+    """Run a process during the block; kill its process group at the end."""
     own = subprocess.Popen(
         command, cwd=ROOT, start_new_session=True, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
@@ -105,6 +105,6 @@ def test_the_example_of_tls(port, tmp_path):
 
 
 def _command(line, programs):
-    """An example's line as a command of this environment."""
+    """Convert a line of the example to a command of this environment."""
     name, *arguments = line.replace("&", "").split()
     return [str(programs / name), *arguments]

@@ -13,7 +13,7 @@ from vpl.core.morton import interleave, morton_order
 
 
 def array_before_guard_page(count: int) -> np.ndarray:
-    """A float32 array whose last byte is the last one before a page that cannot be read."""
+    """A float32 array that ends at the end of a page, before a page without read permission."""
     page = mmap.PAGESIZE
     memory = mmap.mmap(-1, 2 * page)
     address = ctypes.addressof(ctypes.c_char.from_buffer(memory))
@@ -70,6 +70,6 @@ def test_a_morton_order_follows_the_codes_of_the_cells(dtype):
 
 @pytest.mark.parametrize("extent", [0.0, 1e-45, 1e-39])
 def test_points_next_to_each_other_keep_their_order(extent):
-    """An extent whose inverse is infinite is as good as none."""
+    """An extent with an infinite inverse counts as no extent."""
     points = np.float32([[extent, 0, 0], [0, 0, 0], [extent, 0, 0]])
     assert morton_order(points, bits=10).tolist() == [0, 1, 2]

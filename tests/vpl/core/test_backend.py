@@ -1,4 +1,4 @@
-"""The checks of what lies underneath Mitsuba, against the libraries that this machine has."""
+"""Checks of the libraries below Mitsuba, against the libraries of this machine."""
 
 import glob
 import os
@@ -90,7 +90,7 @@ def test_import_drjit_returns_the_module():
 
 
 def test_missing_libatomic_is_explained(tmp_path):
-    # As drjit 1.5 does it when its binary part cannot be loaded.
+    # Behaviour of drjit 1.5 if its binary part cannot be loaded.
     (tmp_path / "drjit").mkdir()
     (tmp_path / "drjit" / "__init__.py").write_text(
         "try:\n"

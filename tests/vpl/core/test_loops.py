@@ -28,7 +28,7 @@ def test_bodies_of_loops_are_recorded_once_in_a_kernel(plugin, more, module, nam
 
 
 def test_surfaces_along_lines_are_looked_for_once_in_a_kernel():
-    """In one that counts them and one that finds them."""
+    """A kernel counts the surfaces, and a kernel finds them."""
     scene = mi.load_dict(closed_box({"lamp": area_light()}, 8))
     calls = []
 

@@ -49,7 +49,7 @@ def test_other_seeds_give_other_sequences(variant):
 
 
 def test_rays_of_a_pixel_share_a_sequence(variant):
-    """Sixteen rays with one sample each leave as little noise as one ray with sixteen."""
+    """Sixteen rays with a sample each have as little variance as a ray with sixteen samples."""
     floor = wall([0, -1, 0], [1, 0, 0], -90, 2.0)
     scene = mi.load_dict({"type": "scene", "sensor": sensor(16, 1), "floor": floor, "lamp": area_light()})
 

@@ -1,4 +1,4 @@
-"""Code that shapes share: kernels do not grow with the number of rectangles, and what these are stays as it was."""
+"""Shared code of shapes: kernels do not grow with the number of rectangles, and rectangles keep their identity."""
 
 import gc
 
@@ -13,8 +13,8 @@ from vpl.core.shared_code import share_code
 
 @pytest.fixture
 def scene_of():
-    """A function that makes a closed box with so many lamps, each of its own size and at its own place."""
-    # Kernels hold the code of all scenes that are alive
+    """Return a function that builds a closed box with the given number of lamps of different sizes and positions."""
+    # Kernels hold the code of all live scenes
     gc.collect()
 
     def make(count):
@@ -53,7 +53,7 @@ def test_kernels_do_not_grow_with_rectangles(scene_of):
         lengths.append((before, operations(scene)))
         del scene
     (few, few_shared), (many, many_shared) = lengths
-    # Where that is no longer so, Mitsuba has learned it, and this module can go
+    # If this fails, Mitsuba shares code itself, and the module is obsolete
     assert many > few
     assert many_shared == few_shared
 

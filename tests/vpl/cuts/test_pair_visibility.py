@@ -1,4 +1,4 @@
-"""Adaptive visibility of pairs: what probes tell, what is divided, and which rays are left to trace."""
+"""Adaptive visibility of pairs: results of probes, divided pairs, and remaining rays."""
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +19,7 @@ from vpl.transport.evaluation import Transport, sum_all_lights
 
 OPAQUE = {"type": "diffuse"}
 VEIL = {"type": "mask", "opacity": 0.5, "nested": OPAQUE}
-# Over each of four tiles of points: how far the roof reaches, and what it is made of
+# Extent and material of the roof over each of four tiles of points
 ROOFS = {"open": (0, OPAQUE), "closed": (2, OPAQUE), "half": (1, OPAQUE), "veiled": (2, VEIL)}
 SIDE = 16
 
@@ -27,8 +27,8 @@ SIDE = 16
 class Tiles:
     """Four tiles of points in a row, under nothing, a roof, half a roof and a veil; lights above all of them.
 
-    ``tiles``: for every node of the point tree, the tiles that its points lie on; ``dark``: points that no light
-    reaches; both along the tree.
+    ``tiles``: tiles below the points of each node; ``dark``: points without any light; both in the order of the point
+    tree.
     """
 
     def __init__(self, kind, lamps=8, turned=()):
@@ -53,7 +53,7 @@ class Tiles:
         self.tiles = [set(tile[i : i + n]) for i, n in zip(tree.first, tree.count, strict=True)]
         closed = (tile == "closed") | ((tile == "half") & (x < 8.01)) | ((tile == "veiled") & (kind == "point"))
         self.dark = closed | np.isin(tile, turned)
-        # So far up that shadows lie right below the roofs and all lights see the same
+        # Distant lights: shadows lie right below the roofs, and all lights see the same points
         rng = np.random.default_rng(0)
         place, down = [6, 0, 1e4] + rng.uniform(-1, 1, (lamps, 3)) * [1, 1, 0], np.tile([0.0, 0.0, -1.0], (lamps, 1))
         self.lights = lit_by(
@@ -93,7 +93,7 @@ class Tiles:
     ],
 )
 def test_probes_tell_open_closed_and_mixed_pairs_apart(variant, kind):
-    """All of them are probed in one kernel: what one pair sees must not decide for the others."""
+    """A single kernel probes all pairs: probes of a pair must not decide for a different pair."""
     mi.set_variant(variant)
     place = Tiles(kind)
     tree = place.clusters.tree
@@ -176,7 +176,7 @@ def test_pairs_that_no_probe_can_vote_for_are_traced():
 
 
 def test_coincident_points_are_divided_until_their_rays_are_traced():
-    """Dividing points that lie in one place must come to an end, here where a veil keeps all of them undecided."""
+    """The division of coincident points must end; here a veil keeps every pair undecided."""
     rng = np.random.default_rng(0)
     position = np.zeros((500, 3))
     clusters = PointClusters(batch_of(position, np.tile([0.0, 0.0, 1.0], (500, 1))))

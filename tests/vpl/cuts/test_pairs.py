@@ -1,4 +1,4 @@
-"""Pairs of a cluster of points and a cluster of lights: their bounds, what they cover, lists of them."""
+"""Pairs of a point cluster and a light cluster: bounds, coverage, and lists."""
 
 import drjit as dr
 import mitsuba as mi
@@ -56,8 +56,8 @@ def light_of_points(kind, clusters: PointClusters, lights: VirtualLights):
 
 
 def worst_pairs(clusters: PointClusters, lights: VirtualLights, rng):
-    """Light over bound of random pairs of nodes, at the point where it is largest: of all pairs, and of those of more
-    than one point and more than one light."""
+    """Largest ratio of contribution to bound over random pairs of nodes: over all pairs, and over pairs with several
+    points and several lights."""
     lit = lit_by(lights)
     group, tree = lit.groups[0], clusters.tree
     order, begin, end = light_ranges(group)
@@ -76,7 +76,7 @@ def worst_pairs(clusters: PointClusters, lights: VirtualLights, rng):
 
 
 def lights_of(kind, rng, spread):
-    """Random lights that shine away from the camera, where the points are."""
+    """Random lights that shine from the camera towards the points."""
     lights = scene_of(kind, rng, np.array(spread))
     lights.direction *= -1
     return lights
@@ -101,7 +101,7 @@ def test_no_point_of_a_box_gets_more_than_its_bound(batches, kind, number):
 
 @pytest.mark.parametrize("kind", PAIRED)
 def test_bounds_of_boxes_of_any_points_hold(kind):
-    """Points of all materials at once, close to the lights, some of them bounded without their cosine."""
+    """Points of all materials close to the lights, some with bounds without a cosine."""
     rng = np.random.default_rng(3)
     position, normal = rng.uniform(-1, 1, (500, 3)) * [1, 1, 0.2], unit(rng, 500) * 0.5 + [0, 0, 1]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -184,7 +184,7 @@ def some_pairs(job, clusters, group):
 
 
 def split_in_two(found: Pairs):
-    """Every third pair, and the others, to which that of the roots is added: lists of the root must not be lost."""
+    """Every third pair, and the remaining pairs with the pair of roots: lists of the root must not be lost."""
     place, root = np.arange(found.count + 1), dr.opaque(mi.UInt32, 0, 1)
     found = Pairs.join([found, Pairs(root, root)])
     return [found.select(upload(mi.UInt32, place[chosen])) for chosen in (place % 3 > 0, place % 3 == 0)]

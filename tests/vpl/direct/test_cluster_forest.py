@@ -1,4 +1,4 @@
-"""The light cluster trees: structure, spheres, cones and sums, and that they are those of the greedy pairing."""
+"""The light cluster trees: structure, spheres, cones and sums, and equality with the greedy pairing."""
 
 import dataclasses
 import re
@@ -90,7 +90,7 @@ def check_structure(forest, lights):
 
 
 def check_spheres(forest, center, radius):
-    """A node's sphere holds its children's and all its lights', without tolerance, and is no larger than need be."""
+    """A node's sphere holds the spheres of its children and all its lights, without tolerance, and is minimal."""
     wide, reach = forest.center.astype(np.longdouble), forest.radius.astype(np.longdouble)
 
     def distance(first, second):
@@ -357,7 +357,7 @@ def test_larger_trees_are_nearly_as_tight_as_the_greedy_ones():
 
 @pytest.mark.parametrize("growth", [1e12, 1e60, 1e300])
 def test_chains_of_growing_distances_stay_shallow(growth):
-    """Each light's best partner is the one before it: the greedy tree is as deep as there are lights."""
+    """The best partner of each light is its predecessor: the greedy tree is as deep as the number of lights."""
     center = np.zeros((100_000, 3))
     center[:, 1] = growth ** np.linspace(0, 1, len(center))
     forest = build_cluster_forest(*points(center))

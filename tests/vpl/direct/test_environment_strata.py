@@ -1,4 +1,4 @@
-"""The regions of an environment map: how many, where, and the cones around them."""
+"""Regions of an environment map: number, places, and cones."""
 
 import re
 
@@ -111,8 +111,8 @@ def test_regions_of_a_constant_map_are_alike_and_compact():
     labels = stratify(np.ones(shape), count)
     area = np.bincount(labels.reshape(-1), solid_angles(*shape).reshape(-1))
     assert area.max() < 5 * area.min()
-    # k caps that cover the sphere have at least the radius r; farthest first takes at most 2r about its centres, and
-    # the cone about the mean of a region no more than twice that
+    # k caps cover the sphere only with a radius of at least r; farthest first needs at most 2r about its centres, and
+    # the cone about a region's mean at most twice as much
     least = np.arccos(1 - 2 / count)
     _, cosine = cones(labels)
     assert np.arccos(cosine).max() < 2 * least + np.pi / 64
@@ -189,7 +189,7 @@ def test_a_disk_across_the_seam_is_one():
     radiance[15:17, [0, 1, -1, -2]] = 1
     inside = radiance == 1
     share = importance(radiance, inside) / importance(radiance, radiance > 0)
-    # Worth six tenths of a sample, so one; each half of it would be worth three and get none
+    # The region merits 0.6 samples, rounded to 1; each half would merit 0.3 and get none
     labels = stratify(radiance, int(np.round(0.6 / share)))
     assert len(np.unique(labels[inside])) == 1
     assert labels[15, 0] not in labels[~inside]

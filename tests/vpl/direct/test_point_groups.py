@@ -33,7 +33,7 @@ def around(rng, axis, cosine, count):
 
 
 def nodes_of(center, radius, axis, cone_cos, infinite_axis=(), infinite_cos=(), intensity=1.0):
-    """Nodes over sources at finite places and at infinity, as :class:`vpl.direct.sources.Sources` numbers them."""
+    """Nodes over sources at finite positions and at infinity, numbered like :class:`vpl.direct.sources.Sources`."""
     count = len(radius)
     forest = build_cluster_forest(
         np.reshape(center, (count, 3)), radius, np.reshape(axis, (count, 3)), cone_cos, np.full(count, intensity)
@@ -78,7 +78,7 @@ def group_of(low, high=None, axis=UP, cone_cos=1.0):
 
 
 def points_in(rng, groups, group, count):
-    """Points in a group's box, among them its corners."""
+    """Points in a group's box, including its corners."""
     share = rng.random((count, 3))
     share[: count // 2] = rng.integers(0, 2, (count // 2, 3))
     return groups.low[group] + share * (groups.high[group] - groups.low[group])
@@ -92,7 +92,7 @@ def leaves_of(nodes):
 
 
 def lighting_sources(rng, nodes, groups, group, samples=300):
-    """Ranks of sources that light some point with some normal of the group, as random trials show it."""
+    """Ranks of sources that light a point with a normal of the group in random trials."""
     leaf = leaves_of(nodes)
     count = len(leaf)
     p = points_in(rng, groups, group, count * samples).reshape(count, samples, 3)
@@ -101,7 +101,7 @@ def lighting_sources(rng, nodes, groups, group, samples=300):
     direction = around(rng, nodes.axis[leaf], nodes.cone_cos[leaf], samples)
     distance = nodes.radius[leaf, None] * np.where(rng.random((count, samples)) < 0.5, 1, rng.random((count, samples)))
     to_source = nodes.center[leaf, None] + distance[..., None] * random_unit(rng, count, samples) - p
-    # Those that radiate everywhere have a cone of all directions, so some trial faces the point; half of them do
+    # An omnidirectional source has a cone of all directions, so half of the trials face the point
     facing = np.einsum("ijk,ijk->ij", direction, -to_source) > 0
     infinite = nodes.infinite[leaf]
     to_source[infinite], facing[infinite] = direction[infinite], True
@@ -125,7 +125,7 @@ def times_covered(nodes, cut):
 
 
 def fills(nodes, node, p):
-    """Solid angle that a node's sphere fills from points; all directions from inside."""
+    """Solid angle of a node's sphere from points; all directions from inside."""
     distance = np.linalg.norm(p - nodes.center[node], axis=1)
     sine = np.where(distance > nodes.radius[node], nodes.radius[node] / np.maximum(distance, 1e-300), 1)
     return 2 * np.pi * np.where(sine < 1, 1 - np.sqrt(1 - sine**2), 2)
@@ -329,7 +329,7 @@ def test_ties_between_axes_go_to_the_first():
 
 
 def pixels(width, height, samples):
-    """Pixel of every sample, and where it meets a plane one unit to a pixel wide, samples on a regular grid: (n, 2)."""
+    """Pixel and position of every sample, on a plane of one unit per pixel, samples on a regular grid: (n, 2)."""
     side = int(np.sqrt(samples))
     pixel = np.repeat(np.arange(width * height), side * side)
     inner = (np.tile(np.arange(side * side), width * height)[:, None] // (1, side) % side + 0.5) / side
@@ -463,7 +463,7 @@ def test_groups_contain_their_points_and_normals(seed, count, spread):
         inside = position[group == g].astype(float)
         assert np.array_equal(found.low[g], inside.min(0))
         assert np.array_equal(found.high[g], inside.max(0))
-        # As narrow as may be around this axis
+        # The narrowest cone around this axis
         assert found.cone_cos[g] == pytest.approx(max(cosine[group == g].min(), -1), abs=3e-5)
     if spread < 1e-3:
         assert (found.cone_cos > 0.999).all()

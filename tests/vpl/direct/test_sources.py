@@ -1,4 +1,4 @@
-"""Sources of direct light: pieces of emitters, regions of the environment, and all of them behind one interface."""
+"""Sources of direct light: pieces of emitters, regions of the environment, and their common interface."""
 
 import drjit as dr
 import mitsuba as mi
@@ -59,7 +59,7 @@ CASES = pytest.mark.parametrize(
 
 
 def emitting(name, flip=False, textured=False):
-    """A scene with one shape, and points from which it can be seen, (n, 3)."""
+    """A scene with a shape, and points with a view of the shape, (n, 3)."""
     shape = SHAPES[name]() | {"flip_normals": flip, "emitter": area(texture()) if textured else area()}
     scene = mi.load_dict({"type": "scene", "shape": shape})
     rng = np.random.default_rng(7)
@@ -115,12 +115,12 @@ def assert_same_mean(first, second, relative=2e-3):
 
 
 def assert_mostly(condition, share=0.995):
-    """All but the few that rounding moves over an edge."""
+    """All samples except for a few, which rounding moves over an edge."""
     assert np.mean(condition) >= share, np.mean(condition)
 
 
 def draw_pieces(pieces, point, seed=0, count=COUNT):
-    """(Piece, sample, direction, value times the number of pieces) as seen from one point."""
+    """(Piece, sample, direction, value times the number of pieces) from a point of view."""
     sampler = independent_sampler(seed, count)
     reference = interactions([point], count)
     piece = uniform_index(sampler, pieces.count)
@@ -433,7 +433,7 @@ def test_regions_share_out_all_light(name):
     drawn = drawn.reshape(regions.count, per_region, 3)
     mean, error = drawn.mean(1), drawn.std(1) / np.sqrt(per_region)
     assert (np.abs(mean - light) < 5 * error + 5e-3 * light + 1e-12).all()
-    # Within a region the weights hardly differ: that is what the table is for
+    # Within a region the weights hardly differ, thanks to the table
     assert (drawn.std(1) < 0.5 * mean).all()
     expected, expected_error = mean_and_error(mitsubas_light(env))
     assert np.allclose(light.sum(0), expected, rtol=5e-3, atol=5 * expected_error.max())
@@ -523,7 +523,7 @@ LIGHTS = {
 
 
 def lit_plane(lights):
-    """A diffuse square of side 8 below the lights, and a camera above it that sees its middle [-1, 1]^2 only."""
+    """A diffuse square of side 8 below the lights, and a camera above with its centre [-1, 1]^2 in view."""
     camera = {
         "type": "orthographic",
         "to_world": mi.ScalarTransform4f().look_at([0, 0, 0.5], [0, 0, 0], [0, 1, 0]),
@@ -591,7 +591,7 @@ def test_rays_find_the_source_that_was_sampled(name):
 
 def check_found(scene, sources):
     rank, reference, drawn, lit = draw_sources(scene, sources, count=40_000)
-    # Not those that a ray from the plane does not reach
+    # Except for points out of reach of rays from the plane
     seen = (lit.max(1) > 0) & (np.broadcast_to(download(drawn.pdf), len(lit)) > 0)
     assert seen.sum() > 1000
     ray = mi.Ray3f(reference.p + mi.Vector3f(0, 0, 1e-5), drawn.direction)

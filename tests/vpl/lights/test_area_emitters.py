@@ -1,4 +1,4 @@
-"""Area emitters on shapes that Mitsuba does not sample as it shows them: turned or textured spheres, smooth meshes."""
+"""Area emitters on shapes with a wrong density in Mitsuba: turned or textured spheres, smooth meshes."""
 
 import mitsuba as mi
 import numpy as np
@@ -20,13 +20,13 @@ DIRECT = {
 
 
 def ball(radiance):
-    """A glowing sphere in the middle of the closed box, turned so that its axes are not those of the world."""
+    """A glowing sphere in the middle of the closed box, rotated off the axes of the world."""
     turned = mi.ScalarTransform4f().translate([0, 0.1, 0]).rotate([0, 0, 1], 25).rotate([1, 0, 0], 60).scale(0.35)
     return {"ball": {"type": "sphere", "to_world": turned, "emitter": {"type": "area", "radiance": radiance}}}
 
 
 def half_bright():
-    """A texture of large patches, one half much brighter than the other."""
+    """A texture of large patches with a bright half."""
     pixels = np.random.default_rng(3).uniform(0, 4, (4, 8, 3)).astype(np.float32)
     pixels[1, :4] = 20
     return {"type": "bitmap", "raw": True, "filter_type": "nearest", "bitmap": mi.Bitmap(pixels)}

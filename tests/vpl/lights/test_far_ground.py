@@ -1,4 +1,4 @@
-"""A room on a ground plane that is far larger: lights, and the distance at which they are clamped, suit the room."""
+"""A room on a much larger ground plane: lights and their clamping distance suit the room."""
 
 import mitsuba as mi
 import numpy as np
@@ -27,7 +27,7 @@ def room_on_a_plane(light, size):
     """A room that is open on one side, on a square plane of half-size ``size``."""
     box = closed_box(LIGHTS[light](), 16)
     del box["left"]
-    # No rectangle: Mitsuba 3.9.1 leaves these out of the scene's box, beyond which its shadow rays do not reach
+    # Mitsuba 3.9.1 omits rectangles from the scene's box, which limits its shadow rays: use a cube
     flat = mi.ScalarTransform4f().translate([0, -1.02, 0]).scale([size, 0.01, size])
     box["ground"] = {"type": "cube", "to_world": flat, "bsdf": {"type": "diffuse"}}
     return mi.load_dict(box)
@@ -64,7 +64,7 @@ def test_in_all_plugins_with_lights(name):
 
 @pytest.mark.parametrize("count", [500, 20_000])
 def test_lights_are_clamped_by_their_distance_from_each_other(count):
-    """Which is the same whatever lies around, and that of a square grid of as many lights."""
+    """The spacing ignores distant surroundings, and equals the spacing of a square grid of equal density."""
     rng = np.random.default_rng(0)
     lights = rng.uniform([-1, 0, -1], [1, 0, 1], (count, 3))
     places = rng.uniform([-0.8, 0, -0.8], [0.8, 0, 0.8], (1000, 3))
@@ -88,7 +88,7 @@ def focus_on_a_small_part():
 
 
 def test_rays_around_a_focus_stand_for_their_area():
-    """Their weights add up to the area of whatever they pass, near or far."""
+    """The weights add up to the area of the crossed region, near or far."""
     focus, sphere = focus_on_a_small_part()
     np.testing.assert_allclose(focus.center, [30, 40, 0], atol=0.1)
     assert 1 < focus.radius < 3
@@ -110,7 +110,7 @@ def test_no_focus_where_nothing_or_nearly_all_is_seen(places):
 
 @pytest.mark.parametrize("wide", [False, True])
 def test_a_warning_names_how_few_lights_matter(wide, monkeypatch):
-    """Under a lamp that is as wide as the plane, and not under one in the room."""
+    """The warning appears under a lamp of the size of the plane, not under a lamp in the room."""
     logged = []
     monkeypatch.setattr(mi, "Log", lambda level, text: logged.append(text))
     lamp = {"lamp": {"type": "point", "position": [0, 0.5, 0], "intensity": rgb(1.0)}}

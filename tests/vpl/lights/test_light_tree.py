@@ -113,7 +113,8 @@ def check_tree(tree, position, direction, flux):
             unit = direction[lights].astype(np.float64)
             unit /= np.linalg.norm(unit, axis=1, keepdims=True)
             cosine = (unit @ record[node, CONE_AXIS].astype(np.float64)).min()
-            # No tolerance on this side: the cone is rounded outwards. On the other, it is as wide as its lights need.
+            # No tolerance on this side: the cone is rounded outwards. Conversely, the cone is as wide as its lights
+            # need.
             assert record[node, CONE_COS] <= cosine
             assert record[node, CONE_COS] >= max(cosine - 1e-6, -1)
     inner = np.flatnonzero(escape != np.arange(len(escape)) + 1)
@@ -259,7 +260,7 @@ def test_where_positions_coincide_directions_decide():
 
 
 def test_opposite_walls_are_joined_last():
-    """Two coincident sheets that face away from each other, where angles matter most."""
+    """Two coincident sheets with opposite orientation, so angles matter most."""
     rng = np.random.default_rng(4)
     position = np.c_[rng.random((400, 2)), np.zeros(400)].astype(np.float32)
     direction = np.zeros((400, 3), np.float32)
@@ -291,7 +292,7 @@ def test_a_light_a_trillion_times_brighter_represents_all_its_ancestors():
 
 @pytest.mark.parametrize("growth", [1e12, 1e60])
 def test_chains_of_growing_intensities_stay_shallow(growth):
-    """Each light's cheapest partner is the one before it, so that mutual pairs alone would merge one pair a round."""
+    """The cheapest partner of each light is its predecessor, so mutual pairs alone would merge a pair per round."""
     count = 2**17 + 1  # makes the distances of the normalised positions exactly equal
     position = np.zeros((count, 3), np.float32)
     position[:, 0] = np.arange(count)

@@ -9,7 +9,7 @@ from tests.support.scenes import closed_box, image, rgb, sensor, wall
 from tests.support.statistics import assert_same_mean
 
 WHITE = {"type": "diffuse", "reflectance": rgb(0.8)}
-# Plugins with virtual lights, with what lets them find nearly the sum of all
+# Plugins with virtual lights, with settings for nearly the sum of all lights
 PLUGINS = {
     "vpl": {},
     "lightcuts": {"error": 0.001, "max_cut": 0},
@@ -43,7 +43,7 @@ CASES = {
 
 
 def sunlit(floor, direction):
-    """A floor in the sun, and a wall that no light reaches but the floor's, and which does not touch it."""
+    """A sunlit floor, and a detached wall with no light except for the floor's."""
     sun = {"sun": {"type": "directional", "direction": direction, "irradiance": rgb(3.0)}}
     return {
         "type": "scene", "sensor": sensor(16, fov=50), "floor": wall([0, -1, 0], [1, 0, 0], -90, bsdf=floor),
@@ -77,7 +77,7 @@ def test_every_plugin_knows_where_its_lights_shine(plugin):
 
 @pytest.mark.parametrize("nested", ["plastic", "roughplastic", "principled"])
 def test_glossy_light_is_spread_and_none_is_lost(nested):
-    """What glossy lobes send on is spread evenly, so that only its sum is right."""
+    """The light of glossy lobes is spread evenly, so only its sum is correct."""
     material = {"type": nested} | ({"roughness": 0.8} if nested == "principled" else {})
     scene = mi.load_dict(sunlit(turned(30, material), [0.2, -1, 0]))
     found = np.mean([

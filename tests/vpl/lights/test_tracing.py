@@ -67,7 +67,7 @@ def test_edges_are_replayed_instead_of_being_recorded_one_by_one(monkeypatch):
     recorded, original = [], tracing.spectrum_to_rgb
     monkeypatch.setattr(tracing, "spectrum_to_rgb", lambda value: recorded.append(1) or original(value))
     found = traced(furnace(0.9)).lights
-    # More than once: where as many paths are left as an array of any scene alive has entries
+    # Repeatedly: if the number of remaining paths equals the size of an array of any live scene
     assert found.depth.max() > 60 and len(recorded) < 20
 
 
@@ -196,7 +196,7 @@ def test_derived_seeds_differ():
 
 
 def test_the_size_of_a_scene_counts_rectangles_that_were_merged():
-    """Mitsuba joins shapes of one material, and forgets how large they are."""
+    """Mitsuba joins shapes of equal material and loses their sizes."""
     walls = {f"wall{k}": wall([0, 0, 2.5 * k], [0, 1, 0], 0, 3.0) for k in range(3)}
     scene = mi.load_dict({"type": "scene", **walls})
     assert len(scene.shapes()) == 1

@@ -1,4 +1,4 @@
-"""The tree over gather points: its structure, and what is reduced, pushed and bounded over it."""
+"""The tree over gather points: structure, reductions, propagation and bounds."""
 
 import re
 from dataclasses import replace
@@ -35,7 +35,7 @@ def holds(tree):
 
 
 def check_codes(codes, position, normal):
-    """Assert that the cells that codes stand for are where the points are, normals first."""
+    """Assert that the cells of codes hold their points, normals first."""
     normal = normal.astype(np.float64)
     for axis in range(3):
         bits = [(codes >> np.uint64(3 * bit + axis)).astype(np.int64) & 1 for bit in range(19)]
@@ -134,7 +134,7 @@ def check_cones(tree, directions, axes, cosine):
     mean = within @ unit / tree.count[:, None]
     length = np.linalg.norm(mean, axis=1)
     assert (np.einsum("ij,ij->i", mean, axes) >= length * (1 - 1e-6))[length > 0.01].all()
-    # On the other side, cones are as wide as their vectors or the cones of their children need.
+    # Conversely, cones are as wide as their vectors or the cones of their children need.
     leaf = tree.child == 0
     nearest = np.where(within, axes @ unit.T, 1).min(axis=1)
     assert (cosine >= nearest - 1e-6)[leaf].all()
@@ -158,7 +158,7 @@ def build_checked(position, normal, leaf_size=8):
 
 @st.composite
 def hostile_points(draw):
-    """Points of any kind: coincident ones, flat ones, far ones, with many, few, or almost equal normals."""
+    """Coincident, flat or distant points, with many, few, or almost equal normals."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     count = draw(st.one_of(st.integers(1, 8), st.integers(9, 60)))
     position, normal = random_points(rng, count)

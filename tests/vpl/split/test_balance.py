@@ -1,4 +1,4 @@
-"""The balance of lights and paths: what pays, for images whose noise is known."""
+"""The balance of lights and paths: decisions for images of known noise."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def test_lights_pay_where_indirect_light_is_the_noise_and_only_there():
 
 
 def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
-    """As behind veils, which stop what lights shine, and let paths pass."""
+    """Veils stop the light of virtual lights and let paths pass."""
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
     assert balanced(0.1 * direct, indirect, 10**8, 64).light_paths > 0
@@ -36,7 +36,7 @@ def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
 @pytest.mark.parametrize("samples", (1, 64, 1024))
 @pytest.mark.parametrize("paths", (10**4, 10**6, 10**9))
 def test_the_more_lights_leave_the_higher_their_price(paths, samples, emitters):
-    """So that lights that are followed only turn out to be worse than assumed."""
+    """The lights prove worse than assumed only after they are followed."""
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
     for scale in (1e-3, 1, 1e3):

@@ -1,4 +1,4 @@
-"""Emitters as virtual lights: what they carry and what is traced is, together, what `path` finds."""
+"""Emitters as virtual lights: lights and traced remainder add up to the image of `path`."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ from vpl.split import decision
 
 
 def spots(number, rng):
-    """Spot emitters in the closed box that shine wherever they happen to."""
+    """Spot emitters with random directions in the closed box."""
     found = {}
     for i in range(number):
         start, end = rng.uniform(-0.9, 0.9, (2, 3))
@@ -40,7 +40,7 @@ def balls(number, rng):
 
 
 def smooth_tile(folder):
-    """A mesh that shines, whose vertices have normals that are not its own."""
+    """A glowing mesh with vertex normals off its surface normals."""
     mesh = mi.Mesh("tile", 4, 2, has_vertex_normals=True)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = [-0.3, 0.5, -0.3, 0.3, 0.5, -0.3, 0.3, 0.5, 0.3, -0.3, 0.5, 0.3]
@@ -80,7 +80,7 @@ def assert_lights_stand_for_emitters(integrator, scene, spp):
 
 @pytest.mark.usefixtures("lights_cost_nothing")
 def test_lights_that_promise_less_are_not_followed(monkeypatch):
-    """Nothing else is decided than with all of them followed."""
+    """The decision equals the decision after all lights are followed."""
     rng = np.random.default_rng(5)
     scene = mi.load_dict(closed_box(panels(40, rng) | balls(40, rng), 64))
     found = []
@@ -120,7 +120,8 @@ def test_emitters_that_are_hidden_and_paths_that_end_soon_change_no_mean(integra
 
 
 def test_no_lights_stand_for_emitters_with_normals_of_vertices(tmp_path, always):
-    """Of these Mitsuba's own densities are not those of the surface: what it makes of them is found by `path`'s way."""
+    """Mitsuba's densities of such emitters differ from the densities of the surface: the remainder finds their light
+    like `path`."""
     rng = np.random.default_rng(7)
     scene = mi.load_dict(closed_box(bulbs(64, rng) | smooth_tile(tmp_path), 16))
     emission = emission_of(scene, rng, False)
@@ -145,8 +146,8 @@ def test_black_and_flat_emitters_among_many_are_no_trouble(lit, always):
 
 
 def test_turned_covered_hollow_and_uneven_emitters_change_no_mean(always):
-    """Panels that face up, a mask, a ball that shines inwards around another one, bumps, a sun, and one bright emitter
-    among dim ones."""
+    """Panels that face up, a mask, a ball that shines inwards around a second ball, bumps, a sun, and a bright emitter
+    among dim emitters."""
     rng = np.random.default_rng(8)
     up = {name: one | {"flip_normals": True} for name, one in panels(30, rng).items()}
     bump = {

@@ -1,4 +1,4 @@
-"""Lights of `manylights` that are kept for other images of a scene: unbiased there, and made anew where it changed."""
+"""Lights of `manylights` that are kept for further images of a scene: unbiased, and new after a change of the scene."""
 
 import mitsuba as mi
 import numpy as np
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("lights_cost_nothing")
 
 @pytest.fixture
 def made(monkeypatch):
-    """How many lines lights were drawn by, each time that lights were made."""
+    """Number of lines of each drawing of lights."""
     from integrators import manylights as plugin  # needs a variant
 
     original, counts = plugin.surface_lights, []
@@ -102,7 +102,7 @@ def test_without_the_property_nothing_is_kept(made):
     expected = lit(scene, integrator)
     lit(scene, integrator)
     assert len(made) == 2 and integrator._kept.count == 0
-    # The first image that keeps them is the same
+    # The first image with kept lights is the same
     np.testing.assert_allclose(lit(scene, keeping()), expected, rtol=1e-4, atol=1e-5)
 
 
@@ -126,7 +126,7 @@ def test_passes_of_an_image_have_lights_of_their_own_and_the_next_image_has_them
 
 
 def changes():
-    """Of a scene: name of a parameter -> what it becomes."""
+    """Name of a scene's parameter -> function to its new value."""
     return {
         "lamp.emitter.radiance.value": lambda value: value * 2,
         "mesh.bsdf.reflectance.value": lambda value: value * 0.5,

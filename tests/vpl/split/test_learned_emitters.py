@@ -1,4 +1,4 @@
-"""What `manylights` learns, and what must not mislead it: odd emitters, sensors of one ray, and bad values."""
+"""Learning of `manylights`, robust to odd emitters, sensors of one ray, and bad values."""
 
 import drjit as dr
 import mitsuba as mi
@@ -29,8 +29,8 @@ def bulbs(**second):
 
 
 def learned(scene, known=lambda normal: normal[:, 0] < 2, seed=0):
-    """The choice of emitters learned from vertices all over the closed box, and these vertices; ``known``: by their
-    normals, those from which it is learned, all of them if nothing is said."""
+    """Return the emitter sampler learned from vertices all over the closed box, and the vertices; ``known`` selects the
+    vertices to learn from by their normals, by default all."""
     rng, count = np.random.default_rng(seed), 4000
     normal = unit_vectors(rng, count)
     position = rng.uniform(-0.9, 0.9, (count, 3)).astype(np.float32)
@@ -84,7 +84,8 @@ def test_rows_of_probabilities_are_positive_for_every_emitter_and_sum_to_one(emi
 
 @pytest.mark.parametrize("learns", [False, True])
 def test_no_direction_at_the_edge_of_a_small_sun_weighs_far_too_much(learns):
-    """Half a degree wide, by Mitsuba's default: densities of directions there are not those that they were drawn by."""
+    """The default sun of Mitsuba is half a degree wide: near its edge, densities differ from the densities of
+    sampling."""
     emission, position, normal = learned(mi.load_dict({"type": "scene", **EMITTERS["sunsky"]()}))
     if not learns:
         emission.choice.forget()
@@ -161,7 +162,7 @@ def test_what_neighbours_have_seen_is_drawn_more_often_than_what_nobody_has():
 
 
 def test_changes_of_emitters_are_seen():
-    """As many times as bright, from the other side: the image is that of a scene that was made so."""
+    """After a change to a brighter and flipped environment, the image equals the image of a new scene."""
     box = closed_box(EMITTERS["envmap"]() | bulbs(), 8)
     del box["left"]
     scene, images = mi.load_dict(box), []
@@ -188,7 +189,7 @@ def test_a_point_emitter_that_is_never_sampled_is_black_as_in_path():
 
 
 def test_all_samples_of_a_sensor_of_one_ray_are_used():
-    """A radiancemeter's rays are all the same, so that their directions are an array of one entry."""
+    """All rays of a radiancemeter are equal, so their directions are an array of one entry."""
     camera = SENSORS["radiancemeter"](film(1, 1))
     camera["to_world"] = mi.ScalarTransform4f().look_at([0, 0, 0.9], [0.1, 0.2, -1], [0, 1, 0])
     scene = mi.load_dict(closed_box(bulbs(), 16) | {"sensor": camera})
@@ -197,7 +198,7 @@ def test_all_samples_of_a_sensor_of_one_ray_are_used():
 
 
 def test_the_weights_of_gather_vertices_are_finite():
-    """An infinite one among the sums over all vertices would leave nothing of the others."""
+    """An infinite weight among the sums over all vertices would erase the rest."""
     texels = np.full((8, 8, 3), 0.9)
     texels[0, 3] = np.inf
     mirror = {"type": "conductor", "specular_reflectance": image(texels) | {"filter_type": "nearest"}}
@@ -220,7 +221,7 @@ def test_the_weights_of_gather_vertices_are_finite():
 
 
 def test_later_vertices_are_lit_where_no_first_one_is(monkeypatch, lights_cost_nothing):
-    """As in an image of one pixel, of which few samples are lit, and meet nothing."""
+    """In an image of one pixel, the few lit samples may meet nothing."""
     plugin, scene = mi.load_dict({"type": "manylights", "max_depth": 5}), mi.load_dict(closed_box(bulbs(), 8))
     lit = LitVertices.of
 
@@ -243,7 +244,7 @@ def test_a_sky_without_surfaces():
 def test_no_kernel_is_compiled_anew_for_another_seed(lights_cost_nothing):
     """What depends on the pilot must not be a constant in them: c of the split, numbers of vertices and of lights."""
     box = closed_box(bulbs(), 16)
-    # Some rays leave it, and something is left at second vertices, so that light is gathered at later ones, too
+    # Some rays leave the box, and second vertices leave a remainder, so later vertices gather light too
     del box["left"]
     box["back"]["bsdf"] = {"type": "roughplastic"}
     scene = mi.load_dict(box)

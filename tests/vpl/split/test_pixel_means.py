@@ -8,7 +8,7 @@ from vpl.split.pixel_means import _SPREAD, means_of_others, pixel_means
 
 
 def both_means(values, at, width, count):
-    """Means around all pixels, and around all values."""
+    """Means around all pixels and all values."""
     others, priors = means_of_others(values, at, width, count)
     return pixel_means(values, at, width, count, priors), others
 
@@ -61,7 +61,7 @@ def test_without_noise_edges_are_where_values_show_them():
     at = np.arange(64 * 64).repeat(2)
     around, others = both_means(image[at], at, 64, 64 * 64)
     np.testing.assert_allclose(around, image)
-    # Without itself and its neighbour, a value is told by those around it
+    # The surroundings predict a value without the value and its neighbour
     assert np.mean(np.abs(others / image[at] - 1) < 0.01) > 0.9
 
 
@@ -80,7 +80,7 @@ def test_a_value_and_its_neighbour_have_no_say_in_what_is_around_them():
     rng, at = np.random.default_rng(2), np.arange(16 * 16).repeat(2)
     values = rng.exponential(1.0, len(at))
     before = means_of_others(values, at, 16, 256)[0]
-    # Values of one pixel that change places; noise, and with it all else, stays as it is
+    # Permuted values of a pixel leave the noise and all results unchanged
     values[[100, 101]] = values[[101, 100]]
     np.testing.assert_array_equal(means_of_others(values, at, 16, 256)[0][[100, 101]], before[[100, 101]])
     # One that is far too bright is not thought to be in a bright place

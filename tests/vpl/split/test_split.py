@@ -1,4 +1,4 @@
-"""The parts of the split: floors, numbers, cells, clusters, bounds; each against what it has to be."""
+"""The parts of the split: minorants, numbers, cells, clusters, bounds; each against its definition."""
 
 import itertools
 from types import SimpleNamespace
@@ -139,7 +139,7 @@ def test_no_lattice_of_as_many_points_is_much_better():
 
 
 def test_products_of_numbers_are_no_noisier_than_those_of_random_ones():
-    """Orders in which halves of the points stay together would double it."""
+    """Orders that keep halves of the points together would double the variance."""
     samples, pixels = 64, 8192
     numbers = SpreadNumbers(dr.arange(mi.UInt32, pixels * samples), samples, 5)
     first, second = (numbers.at(mi.UInt32(vertex)) for vertex in (0, 1))
@@ -177,7 +177,7 @@ def cells_on_sphere_and_plane(seed, tilt):
 
 
 def hits_of_sphere(lines, radius=0.8):
-    """(position, normal of the side that was met) of all hits."""
+    """(position, normal of the hit side) of all hits."""
     o, d = lines.origin.astype(np.float64), lines.direction.astype(np.float64)
     b = (o * d).sum(1)
     disc = b**2 - (o**2).sum(1) + radius**2
@@ -325,7 +325,7 @@ def test_the_pilot_has_pairs_all_over_the_image(count):
 @pytest.mark.parametrize(("samples", "most"), [(1, 1), (7, 5), (16, 16), (64, 41), (64, 100)])
 def test_so_many_vertices_of_a_pixel_are_lit_evenly_among_its_samples(samples, most):
     pixels, kept = 3, min(most, samples)
-    # All but one have weight, which is negative somewhere
+    # A single entry has no weight, and some weights are negative
     weight = np.ones(pixels * samples)
     weight[1], weight[-1] = -1, 0
     light = mi.UnpolarizedSpectrum(upload(mi.Float, weight))
@@ -381,7 +381,7 @@ def test_later_vertices_are_drawn_by_weight_and_stand_for_all_of_them():
         np.add.at(mean, ray, factor / seeds)
     drawn = np.abs(weights[1]).mean(1) > 0
     assert (mean[~drawn] == 0).all()
-    # Systematic sampling: a count is right on average, with a variance below that of one draw by its share
+    # Systematic sampling: a count is right on average, with a variance below the variance of one draw
     total = np.abs(weights).mean(2).sum(0).reshape(pixels, samples).sum(1).repeat(samples) / most
     share = np.abs(weights[1]).mean(1) / total
     spread = (np.maximum(share, 1e-9) / seeds) ** 0.5

@@ -18,7 +18,7 @@ COUNT = 300
 
 
 def drawn(emission, si, seed):
-    """What is drawn at interactions: (site, sample, weight where nothing is between)."""
+    """Return emitter samples at interactions: (site, sample, unoccluded weight)."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, dr.width(si.p))
     site = emission.choice.site(si.p, si.n)
@@ -47,7 +47,7 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(sky, learns):
 
 @pytest.mark.parametrize("learns", [False, True])
 def test_all_point_emitters_are_expected_to_arrive_whole(learns):
-    """Nothing is in their way, so that the mean over samples at a vertex is the sum over emitters."""
+    """Nothing occludes the emitters, so the mean over samples at a vertex is the sum over emitters."""
     rng = np.random.default_rng(2)
     scene = mi.load_dict(closed_box(bulbs(COUNT, rng), camera_light={"type": "directional", "irradiance": rgb(0.0)}))
     emission, (position, normal) = emission_of(scene, rng, learns), vertices(rng, 8)
@@ -113,7 +113,7 @@ def test_what_is_behind_a_wall_is_drawn_less_where_it_was_learned():
 
 
 def test_the_mean_over_seeds_is_that_of_path():
-    """With a wall in the middle, so that what is seen differs from site to site."""
+    """With a wall in the middle, so visibility differs between sites."""
     rng = np.random.default_rng(5)
     middle = wall([0, 0, 0], [0, 1, 0], 30, 0.6) | {"bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
     scene = mi.load_dict(closed_box(panels(60, rng) | bulbs(60, rng) | EMITTERS["envmap"](), 16, middle=middle))

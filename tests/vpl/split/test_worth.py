@@ -1,4 +1,4 @@
-"""Russian roulette by what paths are worth: when it pays, what it knows, and that the image stays that of `path`."""
+"""Russian roulette by expected contribution: when it pays, learned values, and an image equal to `path`."""
 
 import mitsuba as mi
 import numpy as np
@@ -18,13 +18,13 @@ def test_paths_end_where_they_bring_little_and_cost_much():
     brought, edges = np.full(10_000, 0.01), np.full(10_000, 5)
     multiple = importance(brought, brought, edges, 10_000, whole=1.0)
     assert multiple * 0.01 < 0.2
-    # Where all of the noise is theirs, and nobody can tell which of them will bring it
+    # Rare paths carry all of the noise, and cannot be told in advance
     rare = np.where(np.arange(10_000) % 100 == 0, 10.0, 0.0)
     assert importance(np.ones(10_000), rare, edges, 10_000, whole=1.0) == np.inf
 
 
 def test_those_that_bring_more_are_followed():
-    """Half of the paths bring all: the others may end."""
+    """Half of the paths carry all radiance: the rest may end."""
     bright = np.arange(10_000) % 2 == 0
     worth = np.where(bright, 1.0, 0.01)
     multiple = importance(worth, worth, np.full(10_000, 8), 10_000, whole=1.0)
@@ -40,7 +40,7 @@ def test_what_a_vertex_sent_back_does_not_tell_of_itself():
     radiance[7] = 100.0
     worth, expected = Worth.of(position, normal, radiance)
     assert expected[7] < 0.5 * expected[8] and expected[8] == expected.max()
-    # The device has what all of them tell
+    # The table on the device includes all vertices
     site = worth.sites.at(
         *(upload_vectors(kind, x[7:8]) for kind, x in ((mi.Point3f, position), (mi.Normal3f, normal)))
     )
@@ -49,7 +49,7 @@ def test_what_a_vertex_sent_back_does_not_tell_of_itself():
 
 @pytest.mark.parametrize("lights", [True, False])
 def test_the_image_is_that_of_path(monkeypatch, lights_cost_nothing, lights):
-    """Most paths end at their second vertices here, as all are thought to be worth little."""
+    """Most paths end at their second vertices here, since the expected contribution is set low."""
     monkeypatch.setattr("vpl.split.decision.importance", lambda *_: 0.3)
     scene = mi.load_dict(closed_box(lamp_behind_the_camera(), size=16))
 
