@@ -12,8 +12,8 @@ cold    first render in a fresh process with an empty kernel cache.
 Images are rendered with 64 camera rays a pixel (256 by ``direct`` and ``path``) from a multijitter sampler, and
 compared, where they see no emitter, with the mean of four renders by ``adaptivedirect`` at 1.5%, whose own noise is
 taken off: path-traced references of these scenes are noisier than what they would judge (10% a pixel after 2048 samples
-in the kitchen). That its mean is that of ``direct`` is tested (tests/test_adaptivedirect.py). Variance falls as
-1 / time, so a method's time for another error is its own time, scaled; ``all`` is stopped after 15 seconds.
+in the kitchen). That its mean is that of ``direct`` is tested (tests/integrators/test_adaptivedirect.py). Variance
+falls as 1 / time, so a method's time for another error is its own time, scaled; ``all`` is stopped after 15 seconds.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The image of Mitsuba's ``path`` with less variance: virtual lights carry diffuse indirect light, paths trace the rest."""
+"""The image of Mitsuba's ``path`` with less variance: virtual lights carry diffuse light, paths trace the rest."""
 
 from __future__ import annotations
 

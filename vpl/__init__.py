@@ -4,7 +4,7 @@ Data flows one way: a scene's emitters send out light paths, which leave virtual
 camera rays end at gather points, over which trees are built too; a method decides which lights stand for which at which
 points; pairs of a point and a light are shaded, their shadow rays traced, and what arrives is summed.
 
-Packages, each of which imports only from those above it (tests/test_layers.py):
+Packages, each of which imports only from those above it (tests/documents/test_layers.py):
 
 =============  =================================================================================================
 ``core``       arrays between NumPy and Dr.Jit, random numbers, Morton codes, parameters of scene objects, the backend

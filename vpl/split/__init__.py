@@ -1,4 +1,4 @@
-"""Split of the image of ``path`` into a part that virtual lights carry and a part that is traced: plugin ``manylights``.
+"""Split of the image of ``path``: virtual lights carry a part, paths trace the rest.  Plugin ``manylights``.
 
 ::
 
@@ -17,7 +17,7 @@ The terms of the estimator:
 
 - ``view``: camera rays, settings of their paths, streams of random numbers
 - ``roulette``: Russian roulette, and how its probabilities are chosen
-- ``gather_vertices``: vertices where virtual lights are added, the choice of those that are lit, and both normalisations
+- ``gather_vertices``: vertices where virtual lights are added, which of them are lit, and both normalisations
 - ``pixel_clusters``: one light cut for the vertices of a pixel that face the same way
 - ``lattice``: stratified random numbers for the samples of a pixel
 - ``emitters``: emitter samplers for next-event estimation

@@ -17,13 +17,14 @@ from ..core.sampling import derived_seed
 from ..lights.emitters import Emitters
 from ..lights.light_set import ScatteredGroup, area_lights
 from ..lights.virtual_lights import VirtualLights
+from .cost_model import CostModel
 
 # Least cosine between vertex normals and the geometric normal: a deviation of a quarter of a degree, rounding included
 _SAME_NORMAL = 0.99999
 # Fraction of the points that are uniform over the emitters: around a dim emitter without points, c would be too small
 _UNIFORM_SHARE = 0.5
-# Points on area emitters per camera ray, their smallest and largest number, and the least mean number per emitter
-_POINTS_SHARE, _POINTS, _LEAST_POINTS = 0.03, (10_000, 200_000), 4
+# Least mean number of points on an area emitter that has power
+_LEAST_POINTS = 4
 
 
 @dataclass
@@ -53,9 +54,10 @@ class EmitterLights:
             return power
         return (1 - _UNIFORM_SHARE) * power / power.sum() + _UNIFORM_SHARE / some * (power > 0)
 
-    def points(self, paths: int) -> int:
+    def points(self, paths: int, model: CostModel) -> int:
         """Number of points on area emitters, for a number of camera paths."""
-        return max(int(np.clip(_POINTS_SHARE * paths, *_POINTS)), _LEAST_POINTS * np.count_nonzero(self.carried))
+        wanted = np.clip(model.emitter_points_share * paths, model.fewest_emitter_points, model.most_emitter_points)
+        return max(int(wanted), _LEAST_POINTS * np.count_nonzero(self.carried))
 
     def spacing(self, count: int) -> float:
         """Typical distance between ``count`` points on area emitters, world units: the root of the area per point."""

@@ -186,7 +186,7 @@ def make_lights(view: View, decision: Decision, kept: KeptLights | None, clock: 
         return ViewLights(surfaces), statistics
     clock.begin(Stage.TREE)
     lights = view.emitters.lights
-    groups = lights.groups(lights.points(view.count), derived_seed(view.seed, Stream.EMITTER_LIGHTS))
+    groups = lights.groups(lights.points(view.count, view.model), derived_seed(view.seed, Stream.EMITTER_LIGHTS))
     emitters = view.emitter_lights(groups)
     counts = statistics.get("lights", {}) | {"emitters": emitters.count}
     return ViewLights(surfaces, emitters), statistics | {"lights": counts}

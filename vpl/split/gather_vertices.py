@@ -1,8 +1,8 @@
 """Gather vertices: the vertices of camera paths where irradiance from virtual lights is added, and the choice of them.
 
-A path has a *first* gather vertex and may have *later* ones.  Not every vertex is lit: of a pixel with n samples, k first
-vertices are lit, and as many later ones as their weight deserves.  :class:`LitVertices` divides the weights by the
-fractions that are lit, so the sum over lit vertices has the expectation of the sum over all vertices.
+A path has a *first* gather vertex and may have *later* ones.  Not every vertex is lit: of a pixel with n samples, k
+first vertices are lit, and as many later ones as their weight deserves.  :class:`LitVertices` divides the weights by
+the fractions that are lit, so the sum over lit vertices has the expectation of the sum over all vertices.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Stratified random numbers for vertices that scatter: a lattice over the samples of a pixel at each vertex.
 
 Rank-1 lattices with a random shift of the unit square, so that every single number is uniform [Cranley and Patterson
-1976; Sloan and Joe 1994, "Lattice Methods for Multiple Integration"].  Each dimension, vertex and pixel takes the points
-in a random order of its own: with a common order, products of two dimensions would have up to twice the variance of
-independent numbers.
+1976; Sloan and Joe 1994, "Lattice Methods for Multiple Integration"].  Each dimension, vertex and pixel takes the
+points in a random order of its own: with a common order, products of two dimensions would have up to twice the variance
+of independent numbers.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Random lines through the space where camera paths arrive, which meet surfaces there with a known density (NumPy).
 
-Virtual lights are wanted where the second vertices of camera paths lie.  These *arrivals* are sorted into an octree, and
-a box surrounds the arrivals in each leaf.  A box is drawn, and then a line through the box so that all lines through it
-are equally likely: from a uniform point on its surface, inwards by the cosine.  By the formulas of Cauchy and Crofton, a
-line through a convex body of surface area S is expected to hit each side of a surface of area A inside the body A / S
-times, whatever the shape and orientation of the surface.  So points on all kinds of shapes are drawn with a known
-density by ray tracing alone, and few of them far from the arrivals.
+Virtual lights are wanted where the second vertices of camera paths lie.  These *arrivals* are sorted into an octree,
+and a box surrounds the arrivals in each leaf.  A box is drawn, and then a line through the box so that all lines
+through it are equally likely: from a uniform point on its surface, inwards by the cosine.  By the formulas of Cauchy
+and Crofton, a line through a convex body of surface area S is expected to hit each side of a surface of area A inside
+the body A / S times, whatever the shape and orientation of the surface.  So points on all kinds of shapes are drawn
+with a known density by ray tracing alone, and few of them far from the arrivals.
 
 Camera paths arrive at one side of most surfaces.  With M the mean normal of the arrivals in a box, a line is reversed
 with probability |M| if it runs along M.  Of all lines that hit a side with normal n, those that run against M are a
@@ -66,8 +66,8 @@ class Boxes:
 class ArrivalOctree:
     """Octree over arrivals: positions (n, 3), unit normals (n, 3), weights (n,) with a positive sum.
 
-    ``scene_low``, ``scene_size``: a cube that holds all surfaces, world units.  The octree has a random position, so that
-    its planes do not coincide with walls.
+    ``scene_low``, ``scene_size``: a cube that holds all surfaces, world units.  The octree has a random position, so
+    that its planes do not coincide with walls.
     """
 
     def __init__(self, position, normal, weight, scene_low, scene_size: float, generator):

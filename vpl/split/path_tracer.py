@@ -69,9 +69,9 @@ class Path(Edge):
 class Hit:
     """Surfaces that paths hit.
 
-    ``si``; ``bsdf`` with its ``flags``; ``side``, ``minorant``: see :mod:`vpl.split.minorant`; ``hidden``: whether it is
-    an emitter that the camera must not see; ``goes_on``: whether the path may continue; ``smooth``: whether it continues
-    at a BSDF with a density.
+    ``si``; ``bsdf`` with its ``flags``; ``side``, ``minorant``: see :mod:`vpl.split.minorant`; ``hidden``: whether it
+    is an emitter that the camera must not see; ``goes_on``: whether the path may continue; ``smooth``: whether it
+    continues at a BSDF with a density.
     """
 
     si: mi.SurfaceInteraction3f
@@ -243,7 +243,7 @@ def emitter_share(squared_c, nearness, cosine):
 
 
 def _carry(path: Path, hit: Hit, settings: PathSettings, radiance, gathered: Gathered):
-    """Turn ``path.carried`` from β F1 into w β F1 F2 at x2, 0 elsewhere; record second vertices.  Returns where x2 is."""
+    """Turn ``path.carried`` from β F1 into w β F1 F2 at x2, 0 elsewhere; record second vertices; return where x2 is."""
     si = hit.si
     cosine = dr.abs(dr.dot(si.n, path.ray.d))
     w = carried_share(settings.squared_c, path.cosine * cosine / dr.square(si.t))

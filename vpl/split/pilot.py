@@ -137,7 +137,8 @@ def judged_by(brightness: np.ndarray, model: CostModel) -> np.ndarray:
 # ---------------------- Means around pixels ----------------------
 #
 # The image is divided into four blocks, each block into four again, down to single pixels. The mean of a block combines
-# its own values with that of the larger block, which counts as a number of values: more of them, the noisier values are.
+# its own values with that of the larger block, which counts as a number of values: more of them, the noisier values
+# are.
 
 
 def means_of_others(

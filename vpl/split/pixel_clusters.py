@@ -1,9 +1,9 @@
 """Light from virtual lights at gather vertices: one light cut for the vertices of a pixel that face the same way.
 
 These vertices form a cluster.  Bounds on its box and its cone of normals choose one light cut for the whole cluster, as
-in Multidimensional Lightcuts [MDLC].  For each pair of the cluster and a node of the cut, a vertex is drawn by weight and
-a light of the node by intensity, anew for every pair.  So neighbouring pixels share no representative lights, and the
-error is uncorrelated noise, which averages out over samples and which a denoiser recognises.
+in Multidimensional Lightcuts [MDLC].  For each pair of the cluster and a node of the cut, a vertex is drawn by weight
+and a light of the node by intensity, anew for every pair.  So neighbouring pixels share no representative lights, and
+the error is uncorrelated noise, which averages out over samples and which a denoiser recognises.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class PixelClusters:
         return self.receivers.count
 
     def draw(self, cluster, sample):
-        """Draw a vertex of each cluster by weight: (camera ray, Lambertian surface of albedo 1, weight over probability)."""
+        """Draw a vertex of each cluster by weight: (camera ray, white Lambertian surface, weight over probability)."""
         first = dr.gather(mi.UInt32, self.first, cluster)
         last = first + dr.gather(mi.UInt32, self.size, cluster)
         row = find_interval(self.cumulative, first, last, sample)

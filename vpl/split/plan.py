@@ -21,8 +21,8 @@ class Plan:
     """Decision for an image.
 
     ``light_paths``: number of virtual lights on surfaces that are drawn, 0 for none; ``emitters``: whether virtual
-    lights stand for emitters; ``error``: bound of the cuts, as a fraction of the pixel; ``vertices`` of a pixel that are
-    lit; ``variance``: relative variance of a camera path that remains; ``reason`` in words.
+    lights stand for emitters; ``error``: bound of the cuts, as a fraction of the pixel; ``vertices`` of a pixel that
+    are lit; ``variance``: relative variance of a camera path that remains; ``reason`` in words.
     """
 
     light_paths: int
@@ -42,9 +42,9 @@ class Plan:
 class Option:
     """Kinds of virtual lights: on ``surfaces``, for ``emitters``, or both.
 
-    Values (n,) of a pilot's paths: ``traced``: radiance without lights on surfaces; ``indirect``: part of it that lights
-    on surfaces may carry; ``residual``: measured radiance besides the light that lights on surfaces carry, None where it
-    was not measured.
+    Values (n,) of a pilot's paths: ``traced``: radiance without lights on surfaces; ``indirect``: part of it that
+    lights on surfaces may carry; ``residual``: measured radiance besides the light that lights on surfaces carry, None
+    where it was not measured.
     """
 
     surfaces: bool

@@ -6,8 +6,8 @@ Three rules end paths.  A path that goes on is divided by its probability, so no
    fraction that is left (:func:`residual_survival`).
 2. **Expected contribution.**  A path goes on with the probability m E, where E is its expected contribution relative to
    the brightness of its pixel.  The multiple m has the least variance × cost (:func:`best_multiple`).  [Vorba and
-   Křivánek 2016, "Adjoint-driven Russian roulette"; Rath et al. 2022, "EARS: efficiency-aware Russian roulette", eq. 14:
-   the best probability is proportional to the root of variance over cost.]
+   Křivánek 2016, "Adjoint-driven Russian roulette"; Rath et al.  2022, "EARS: efficiency-aware Russian roulette", eq.
+   14: the best probability is proportional to the root of variance over cost.]
 3. **Throughput.**  The rule of Mitsuba's ``path`` from ``rr_depth`` on (:func:`throughput_survival`).
 """
 
@@ -45,7 +45,9 @@ class OutgoingRadiance:
     @classmethod
     def unknown(cls) -> OutgoingRadiance:
         """Nothing is known: rule 2 ends no path."""
-        return cls(SpatialCells.none(), upload(mi.Float, np.ones(2)), dr.opaque(mi.Bool, False), dr.opaque(mi.Float, 1.0))
+        return cls(
+            SpatialCells.none(), upload(mi.Float, np.ones(2)), dr.opaque(mi.Bool, False), dr.opaque(mi.Float, 1.0)
+        )
 
     @classmethod
     def learned(
@@ -94,9 +96,9 @@ def best_multiple(
 ) -> float:
     """The multiple m of rule 2 with the least variance × cost at second vertices; infinite where none pays.
 
-    ``expected`` (n,): expected contributions with m = 1 of the paths that reach a second vertex; ``brought`` (n,): their
-    actual contributions, both relative to the image; ``edges`` (n,): edges beyond the second vertex; ``paths``: number
-    of all paths; ``variance``: relative variance of a path without rule 2.
+    ``expected`` (n,): expected contributions with m = 1 of the paths that reach a second vertex; ``brought`` (n,):
+    their actual contributions, both relative to the image; ``edges`` (n,): edges beyond the second vertex; ``paths``:
+    number of all paths; ``variance``: relative variance of a path without rule 2.
     """
     best, least = np.inf, model.roulette_gain * variance * (model.first_edges + edges.sum() / paths)
     for multiple in _MULTIPLES:

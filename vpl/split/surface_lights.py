@@ -214,9 +214,11 @@ class KeptLights:
     Their density is positive on every surface, so they light other cameras without bias, with fewer lights where the
     first camera did not look.  A scene counts as the same while everything that Mitsuba prints and lists as a parameter
     of its objects, without sensors and integrator, is the same: see :func:`vpl.core.parameters.fingerprint`.
+    ``most``: largest number of lights that are kept.
     """
 
     def __init__(self):
+        self.most = _MOST_KEPT
         self._scene: str | None = None
         self._known: dict[tuple, SurfaceLights] = {}
 
@@ -233,6 +235,6 @@ class KeptLights:
         if key in self._known:
             return self._known[key]
         made = make()
-        if self.count + made.lights.count <= _MOST_KEPT:
+        if self.count + made.lights.count <= self.most:
             self._known[key] = made
         return made

@@ -197,7 +197,7 @@ class View:
     def emitter_lights(self, groups: list[LightGroup]) -> LightSet:
         """The light set that stands for emitters; ``groups`` may be empty where only its c is needed."""
         lights = self.emitters.lights
-        return self.light_set(groups, lights.spacing(lights.points(self.count)))
+        return self.light_set(groups, lights.spacing(lights.points(self.count, self.model)))
 
     def settings(self, lights: ViewLights, least: int = Gathering.NOWHERE) -> PathSettings:
         """Settings of paths of which ``lights`` carry a part; without lights, vertices are gathered by ``least``."""

@@ -3,8 +3,8 @@
 In the order to read in:
 
 - ``carried_share``: the share w of the light between two surfaces that virtual lights carry
-- ``contribution``: the formula for the contribution of a light to a point, BSDF × cosine × geometry × intensity, and the
-  shadow ray between them
+- ``contribution``: the formula for the contribution of a light to a point, BSDF × cosine × geometry × intensity, and
+  the shadow ray between them
 - ``bounds``: upper bounds of the contribution of a cluster of lights to a point or a cluster of points
   [LC section 4.1; IC section 4]
 - ``evaluation``: shades and traces pairs of a point and a light (``evaluate_pairs``), lists of lights in step

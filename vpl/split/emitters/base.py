@@ -152,8 +152,8 @@ def irradiance_from_emitters(scene, emitters: EmitterSampler, places: Places, ce
     """Irradiance straight from emitters by next-event estimation with ``samples`` samples for each of the ``places``.
 
     Returns, evaluated: the irradiance, an unpolarized spectrum, weighted for multiple importance sampling with
-    cosine-distributed directions; and the mean over channels of the unoccluded irradiance, without that weight.  Virtual
-    lights and learning samplers share this kernel, because compiling it takes a good part of a first render.
+    cosine-distributed directions; and the mean over channels of the unoccluded irradiance, without that weight.
+    Virtual lights and learning samplers share this kernel, because compiling it takes a good part of a first render.
     """
     si, sampler, number = places.interaction(), independent_sampler(seed, places.count), mi.UInt32(0)
     wanted = dr.opaque(mi.UInt32, samples)

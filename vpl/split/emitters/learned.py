@@ -1,9 +1,9 @@
 """Emitters chosen by spatial cell, from the light of each that a pilot's vertices receive.
 
-Vertices in a cell trace a few rays to every source of light; neighbouring cells count as well.  A fraction of the samples
-keeps the usual probabilities, which are all that cells without vertices have.  Sources are the emitters one by one, and
-regions of the environment (:mod:`vpl.direct.environment_regions`), so that a room that sees the sky through a window
-samples the window.
+Vertices in a cell trace a few rays to every source of light; neighbouring cells count as well.  A fraction of the
+samples keeps the usual probabilities, which are all that cells without vertices have.  Sources are the emitters one by
+one, and regions of the environment (:mod:`vpl.direct.environment_regions`), so that a room that sees the sky through a
+window samples the window.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def learning_rays(paths: int) -> int:
 class CellChoice:
     """Probabilities of sources by spatial cell; before :meth:`learn`, the same everywhere.
 
-    ``usual`` (n,) float64: probabilities where nothing is known, which sum to 1; ``share``: fraction of the samples that
-    use them in every cell; ``ignored``: indices of sources that are not learned.
+    ``usual`` (n,) float64: probabilities where nothing is known, which sum to 1; ``share``: fraction of the samples
+    that use them in every cell; ``ignored``: indices of sources that are not learned.
     """
 
     def __init__(self, usual: np.ndarray, share: float, ignored: np.ndarray):
@@ -227,8 +227,8 @@ class LearnedEmitters(CellEmitters):
         emitter = dr.gather(mi.EmitterPtr, self._emitters, dr.minimum(source, self._count - 1))
         ds, weight = emitter.sample_direction(si, place, of_emitter)
         weight = finite_or_zero(mi.unpolarized_spectrum(weight)) & of_emitter
-        # A ray without an end for infinite emitters: Mitsuba 3.9.1 places them outside of the scene's bounding box, which
-        # leaves out rectangles
+        # A ray without an end for infinite emitters: Mitsuba 3.9.1 places them outside of the scene's bounding box,
+        # which leaves out rectangles
         far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
         ray = dr.select(far, si.spawn_ray(ds.d), si.spawn_ray_to(ds.p))
         direction, density, delta = ds.d, ds.pdf, ds.delta & of_emitter
@@ -270,7 +270,8 @@ class LearnedEmitters(CellEmitters):
 
     def _environment_density(self, cell, direction, own, active):
         """Density of a direction to the environment; ``own``: density with which the environment itself draws it."""
-        # A branch, as in `_draw`: cell 0 draws no region, also while emitters are learned, when it is the first emitter's
+        # A branch, as in `_draw`: cell 0 draws no region, also while emitters are learned, when it is the first
+        # emitter's
         by_region = dr.if_stmt(
             (cell, direction, mi.Float(0)),
             active & (cell > 0),

@@ -32,13 +32,11 @@ _UNIFORM_SHARE = 0.1
 _LEAST_SHARE = 0.1
 # Floats of a node's record in device memory: two vectors of four
 _RECORD = 8
-# Least distance of a vertex to a node, in standard deviations of the emitters' positions. Below 1, because a vertex near
-# the mean is likely to be near some emitters, which would be drawn too rarely
+# Least distance of a vertex to a node, in standard deviations of the emitters' positions. Below 1, because a vertex
+# near the mean is likely to be near some emitters, which would be drawn too rarely
 _LEAST_DISTANCE = 0.6
 # Least intensity of an emitter relative to the brightest: keeps the probability of every emitter positive
 _LEAST_INTENSITY = 1e-12
-
-
 
 
 class EmitterTree:
