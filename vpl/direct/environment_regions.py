@@ -8,8 +8,6 @@ jittered.  The radiance of the direction itself is used, so nothing is lost betw
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -31,23 +29,20 @@ _DEFAULT_WIDTH, _LARGEST_WIDTH = 1024, 2048
 _EVEN_SHARE = 0.02
 
 
-@dataclass
-class _Last:
-    """The regions that were made last, and what of."""
-
-    key: tuple | None = None
-    regions: EnvironmentRegions | None = None
-
-
-_last = _Last()
+# Key and regions of the previous call: one tuple, so that no thread reads the key of one call with the regions of another
+_previous: tuple[tuple, EnvironmentRegions] | None = None
 
 
 def regions_of(environment, count: int, most_columns: int = _LARGEST_WIDTH) -> EnvironmentRegions:
-    """Regions of an environment: those of the last call where nothing has changed since."""
-    key = mi.variant(), count, most_columns, fingerprint([environment])
-    if _last.key != key:
-        _last.key, _last.regions = key, EnvironmentRegions(environment, count, most_columns)
-    return _last.regions
+    """Regions of an environment; those of the previous call if the environment and the arguments are unchanged."""
+    global _previous
+    key = count, most_columns, fingerprint([environment])
+    found = _previous
+    # Regions evaluate the environment that they were made of, so an equal one does not do: it may be edited later
+    if found is None or found[0] != key or found[1].environment is not environment:
+        found = key, EnvironmentRegions(environment, count, most_columns)
+        _previous = found
+    return found[1]
 
 
 class EnvironmentRegions:
@@ -55,7 +50,7 @@ class EnvironmentRegions:
     radiance (mean over channels) integrated over solid angle; all float64.  ``most_columns``: of the table."""
 
     def __init__(self, environment, count: int, most_columns: int = _LARGEST_WIDTH):
-        self._environment = environment
+        self.environment = environment
         width = min(_table_width(environment), most_columns)
         radiance = _read(environment, width)
         height = len(radiance)
@@ -110,7 +105,7 @@ class EnvironmentRegions:
         """Radiance that arrives from a direction."""
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
         si.wi = -direction
-        return finite_or_zero(mi.unpolarized_spectrum(self._environment.eval(si, active)))
+        return finite_or_zero(mi.unpolarized_spectrum(self.environment.eval(si, active)))
 
     def find(self, direction, active):
         """(Region, density of :meth:`sample`) of a direction."""
