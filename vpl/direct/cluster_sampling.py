@@ -1,4 +1,4 @@
-"""Kernels of direct lighting: which cluster, which source, which point on it, and what arrives [IAS]."""
+"""Kernels of direct lighting: draw a cluster, a source, a point on the source, and trace a shadow ray [IAS]."""
 
 from __future__ import annotations
 
@@ -16,26 +16,25 @@ from .site_table import SEEN, Lanes, Scenery, SiteTable
 
 @dataclass
 class Drawn:
-    """Findings of a pass, per lane: ``radiance``; ``variance`` of its mean over channels; ``rays``; ``seen``: samples
-    that found light."""
+    """Estimates of a pass, per lane; ``variance``: of the channel mean; ``seen``: samples that found light."""
 
-    radiance: object
-    variance: object
-    rays: object
-    seen: object
+    radiance: mi.UnpolarizedSpectrum
+    variance: mi.Float
+    rays: mi.UInt32
+    seen: mi.UInt32
 
 
 @dataclass
 class _Site:
-    """The site of each lane: columns of :class:`SiteTable`, and ``samples``, ``bsdf_samples`` as Float."""
+    """The site of each lane: columns of :class:`SiteTable`, and the numbers of samples."""
 
-    size: object
-    cut: object
-    entry: object
-    member_first: object
-    members: object
-    samples: object
-    bsdf_samples: object
+    size: mi.UInt32
+    cut: mi.UInt32
+    entry: mi.UInt32
+    member_first: mi.UInt32
+    members: mi.UInt32
+    samples: mi.Float
+    bsdf_samples: mi.Float
 
     @classmethod
     def of(cls, table: SiteTable, lanes: Lanes) -> _Site:
@@ -47,7 +46,7 @@ class _Site:
 @recorded_once
 @dr.syntax
 def draw_samples(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
-    """Sample the clusters of every lane's site, stratified by their probabilities, and add to its statistics."""
+    """Draw stratified samples of the clusters of every lane's site, and add to the site's statistics."""
     table, statistics, sources = scenery.table, scenery.statistics, scenery.sources
     count = dr.width(lanes.site)
     random = independent_sampler(seed, count)
@@ -57,7 +56,7 @@ def draw_samples(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
     total, last, differences = dr.zeros(mi.UnpolarizedSpectrum, count), mi.Float(0), mi.Float(0)
     rays, seen = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
     i, k = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
-    # In double precision: what is left of a number after many clusters still has to choose among their sources
+    # Double precision, because the remainder of the number, after many clusters, also draws the source
     precise = dr.float64_array_t(mi.Float)
     below = dr.zeros(precise, count)
     p = dr.gather(mi.Float, scenery.probability, site.entry)
@@ -70,15 +69,15 @@ def draw_samples(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
             p = dr.gather(mi.Float, scenery.probability, site.entry + k)
         inside = dr.clip(mi.Float((target - below) / precise(p)), 0, dr.one_minus_epsilon(mi.Float))
         value, weight, arrives, visible = _emitter_sample(scenery, site, k, p, inside, points.at(i))
-        # ---- Statistics: lanes never share an entry, so nothing has to be locked. The weight is left out, or a cluster
-        # that BSDF samples find more often would be sampled ever less
+        # ---- Statistics: lanes never share an entry, so no atomics are needed.  The MIS weight is left out: it would
+        # lower the probability of a cluster that BSDF samples find, pass after pass
         gain = channel_mean(value) * p / dr.gather(mi.Float, scenery.importance, site.entry + k)
         dr.scatter_add(statistics.gain, gain, own + k, mode=dr.ReduceMode.NoConflicts)
         one = dr.select(visible, mi.UInt32(SEEN + 1), mi.UInt32(1))
         dr.scatter_add(statistics.counts, one, own + k, mode=dr.ReduceMode.NoConflicts)
         value *= weight
         level = channel_mean(value)
-        # Neighbouring strata differ little: what stratification has removed already is not counted as variance
+        # Differences of neighbouring strata leave out the variance that stratification removes
         differences += dr.select(i > 0, dr.square(level - last), 0)
         last = level
         total += value
@@ -100,7 +99,7 @@ def draw_samples(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
 @recorded_once
 @dr.syntax
 def sum_sources(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
-    """One sample of every cluster of every lane's site.  ``lanes.samples`` must be 1; no variance is found."""
+    """Take one sample of every cluster of every lane's site.  ``lanes.samples`` must be 1; the variance is 0."""
     count = dr.width(lanes.site)
     random = independent_sampler(seed, count)
     site = _Site.of(scenery.table, lanes)
@@ -124,11 +123,11 @@ def sum_sources(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
 
 
 def _emitter_sample(scenery: Scenery, site: _Site, k, p, inside, point):
-    """A point on the k-th cluster of each site, drawn with probability ``p``.
+    """Sample a point on the k-th cluster of each site, which was drawn with probability ``p``.
 
-    ``inside``: uniform number that picks the source; ``point``: three more.
-    Returns (radiance over density, its weight among emitter and BSDF samples, whether anything would arrive if nothing
-    was between, whether it does).
+    ``inside``: uniform number that draws the source; ``point``: three uniform numbers.
+    Returns (radiance over density, MIS weight, whether the unoccluded contribution is positive, whether the point is
+    visible, too).
     """
     node = scenery.sources.node(dr.gather(mi.UInt32, scenery.table.node, site.cut + k))
     rank, share = scenery.sources.member(node, inside)
@@ -141,13 +140,13 @@ def _emitter_sample(scenery: Scenery, site: _Site, k, p, inside, point):
     value = finite_or_zero(reflected * drawn.value / (p * share))
     arrives = dr.any(value > 0)
     visible = arrives & ~scenery.scene.ray_test(surface.interaction.spawn_ray_to(drawn.p), arrives)
-    # A direction that does not exist (a point on the source itself) has no weight either
+    # The weight is not finite if the point lies on the source, without a direction
     return dr.select(visible, value, 0), dr.select(visible, weight, 0), arrives, visible
 
 
 @dr.syntax
 def _bsdf_samples(scenery: Scenery, site: _Site, bsdf_samples, random):
-    """The other half of multiple importance sampling: (radiance, variance of its mean, samples that found light)."""
+    """Take the BSDF samples: (MIS-weighted radiance, variance of the channel mean, samples that found light)."""
     count = dr.width(bsdf_samples)
     total, last, differences = dr.zeros(mi.UnpolarizedSpectrum, count), mi.Float(0), mi.Float(0)
     seen, j = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
@@ -164,7 +163,7 @@ def _bsdf_samples(scenery: Scenery, site: _Site, bsdf_samples, random):
 
 
 def _bsdf_sample(scenery: Scenery, site: _Site, random):
-    """Light that a direction drawn from the BSDF finds, over its density, weighted against emitter samples."""
+    """MIS-weighted radiance over density along a direction drawn from the BSDF."""
     surface = scenery.batch.surfaces_at(_member(scenery.table, site, random.next_1d()))
     direction, weight, bsdf_pdf = surface.sample(random.next_1d(), random.next_2d(), mi.Bool(True))
     going = dr.any(weight > 0)
@@ -184,7 +183,7 @@ def _bsdf_sample(scenery: Scenery, site: _Site, random):
 
 @dr.syntax
 def _probability_of(scenery: Scenery, site: _Site, rank, active):
-    """Probability with which a site's emitter samples choose the source of a rank; 0 for what its cut left out."""
+    """Probability that an emitter sample of a site draws the source of a rank; 0 for sources outside the cut."""
     low, high = dr.zeros(mi.UInt32, dr.width(rank)), mi.UInt32(site.size)
     active = active & (rank < scenery.sources.count)
     while dr.hint(active & (high > low + 1), exclude=[scenery, site, rank, active]):
