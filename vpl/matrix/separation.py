@@ -16,6 +16,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from threading import Lock
 
 import drjit as dr
 import mitsuba as mi
@@ -30,6 +31,8 @@ _STEP = 1.0
 _DIVERGED = 2.0
 # Columns of a sketch in excess of the largest rank [HMT]
 _OVERSAMPLING = 8
+# Held while BLAS is limited to one thread: the limit belongs to the process, and its end restores the previous one
+_BLAS_LIMIT = Lock()
 
 
 @dataclass(frozen=True)
@@ -65,10 +68,10 @@ def _one_core_each():
     """Function that calls ``work`` for each of some numbers, in parallel, with BLAS limited to one thread.
 
     Matrices are too small for several threads each: BLAS threads that wait for each other cost ten times as much on a
-    busy machine.
+    busy machine.  A second thread waits until the first leaves the block.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(cores) as pool:
+    with _BLAS_LIMIT, threadpool_limits(1, "blas"), ThreadPoolExecutor(cores) as pool:
         yield lambda work, numbers: list(pool.map(work, numbers))
 
 
