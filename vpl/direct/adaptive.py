@@ -47,7 +47,8 @@ FIELDS = ("noise", "passes", "shadow_rays", "visible")
 class DirectOptions:
     """Properties of ``adaptivedirect`` and ``unoccludeddirect``, under the same names.
 
-    ``lights``: "clusters", "all" or "auto"; or "unoccluded", the reference method.
+    ``lights``: "clusters", "all" or "auto"; or "unoccluded", the reference method.  ``cluster_angle``: steradians [IAS
+    section 5.7]; ``time``: seconds, 0 for no limit.
     """
 
     error: float = 0.03

@@ -2,6 +2,9 @@
 
 The first pass samples in proportion to unoccluded contributions.  Later passes rely increasingly on the samples of the
 site and of its group.
+
+Departure from the paper: its uniform function gives every cluster the same probability.  Here the function without
+feedback is proportional to unoccluded contributions, apart from a constant fraction.
 """
 
 from __future__ import annotations
@@ -128,6 +131,7 @@ def update_probabilities(scenery: Scenery, of_groups, mixture: Mixture, sites):
         k += 1
     dr.eval(sums)
     shares = mi.Vector3f(mixture.uniform, mixture.block, mixture.pixel)
+    # Normalised functions [IAS eq. 5], blended [IAS eq. 6]
     scale = dr.select(sums > 0, shares / sums, 0)
     scale /= dr.sum(scale * sums)
     even = _EVEN_SHARE * scale.x * sums.x / mi.Float(size)
@@ -153,6 +157,7 @@ def _guides(importance, statistics, of_groups, prior, entries, entry, node):
     pixel_seen = (seen + prior * block_seen) / (samples + prior)
 
     def guide(gain, seen):
+        """C / sqrt(u) [IAS eq. 4]."""
         return dr.select(seen > 0, level * gain * dr.rsqrt(seen), 0)
 
     return mi.Vector3f(level, guide(block_gain, block_seen), guide(pixel_gain, pixel_seen))

@@ -77,7 +77,8 @@ def draw_samples(scenery: Scenery, lanes: Lanes, seed: int) -> Drawn:
         dr.scatter_add(statistics.counts, one, own + k, mode=dr.ReduceMode.NoConflicts)
         value *= weight
         level = channel_mean(value)
-        # Differences of neighbouring strata leave out the variance that stratification removes
+        # Differences of neighbouring strata leave out the variance that stratification removes; the sample variance of
+        # [IAS section 4.2] includes it
         differences += dr.select(i > 0, dr.square(level - last), 0)
         last = level
         total += value

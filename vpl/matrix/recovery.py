@@ -1,4 +1,4 @@
-"""Recovery of the visibility of reduced matrices from few traced entries [MSR 5, 6].
+"""Recovery of the visibility of reduced matrices from few traced entries [MSR sections 5, 6].
 
 1. Prediction: the remaining entries are predicted, column by column.
 2. Separation of the matrix into a low-rank part and sparse errors.
@@ -30,7 +30,7 @@ from .matrix_block import MatrixBlock
 from .separation import Separation, SeparationLimits, separate
 from .visibility_prediction import PREDICTORS, Predictors
 
-# Optional steps [MSR 7.1]: available predictors, then the steps after prediction
+# Optional steps [MSR section 7.1]: available predictors, then the steps after prediction
 STEPS = (*PREDICTORS, "separation", "correction", "largest")
 # Density of errors above which an entry is traced; 0.2 in the paper, but errors of visibility are denser
 DENSITY = 0.65
@@ -39,7 +39,7 @@ LIMITS = SeparationLimits()
 LARGE_SHARE = 0.03
 # Least light assumed for a row, relative to its unoccluded light
 _LEAST_LIGHT = 0.1
-# Gaussian kernel of the density of errors: 7 × 7 entries, standard deviation in entries [MSR 6.2]
+# Gaussian kernel of the density of errors: 7 × 7 entries, standard deviation in entries [MSR section 6.2]
 _TAPS, _SIGMA = 7, 1.5
 # Least error that counts, relative to the unoccluded entry
 _LEAST_ERROR = 0.01

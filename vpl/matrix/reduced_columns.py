@@ -1,8 +1,8 @@
-"""Columns of the reduced matrices: clusters of lights for every slice, split by contribution [MSR 4.2].
+"""Columns of the reduced matrices: clusters of lights for every slice, split by contribution [MSR section 4.2].
 
-A slice starts with the light cut of its bounding box, by upper bounds [MSR 4.2.1].  A cluster is split if its estimated
-largest contribution (equation 7) exceeds a fraction of the sum over clusters (equation 8), until no cluster does
-(algorithm 1).  No column then dominates its matrix.  The estimate traces few rows of each column.
+A slice starts with the light cut of its bounding box, by upper bounds [MSR section 4.2.1].  A cluster is split if its
+estimated largest contribution (equation 7) exceeds a fraction of the sum over clusters (equation 8), until no cluster
+does (algorithm 1).  No column then dominates its matrix.  The estimate traces few rows of each column.
 
 Departures from the paper:
 

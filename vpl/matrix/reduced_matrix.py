@@ -1,7 +1,7 @@
-"""Reduced light matrices, with a row per pixel of a slice and a column per cluster of lights [MSR 3].
+"""Reduced light matrices, with a row per pixel of a slice and a column per cluster of lights [MSR section 3].
 
 An entry is E V: the unoccluded contribution E of a cluster's representative light to a row, times its visibility V.  E
-is evaluated at a fixed point of the row, V is traced at a random point [MSR 7.2].
+is evaluated at a fixed point of the row, V is traced at a random point [MSR section 7.2].
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Separation of a batch of matrices into a low-rank part and sparse errors [MSR 6].
+"""Separation of a batch of matrices into a low-rank part and sparse errors [MSR section 6].
 
 Minimises the sum of |Z| in D = XY + Z [MSR equation 11] by alternating directions of an augmented Lagrangian [SWZ]: X
 and Y by least squares, Z by shrinkage, multipliers by the residual.  Z is 0 for traced entries.  Any other entry is

@@ -1,4 +1,4 @@
-"""Prediction of the visibility of rows from traced rows, column by column [MSR 5].
+"""Prediction of the visibility of rows from traced rows, column by column [MSR section 5].
 
 A column has three predictors: by the nearest rows, by a linear boundary between light and shadow, and by Bayes' rule
 from nearby columns and the same row.  A column is sampled until a predictor has a small enough error on new samples
@@ -23,7 +23,7 @@ from .visibility_samples import NO_ROW, VisibilitySamples
 
 NEAREST, LINEAR, BAYES = range(3)
 PREDICTORS = {"nearest": NEAREST, "linear": LINEAR, "bayes": BAYES}
-# Columns to either side along the light tree for the Bayes predictor: five in total [MSR 5.1]
+# Columns to either side along the light tree for the Bayes predictor: five in total [MSR section 5.1]
 _BESIDE = 2
 # Imaginary prior samples of each class of visibility
 _PRIOR = 0.1
@@ -78,7 +78,7 @@ class Predictors:
 
     @dr.syntax
     def _of_nearest(self, column, row, draw):
-        """V of one of the three nearest samples, drawn uniformly; 1 without samples."""
+        """V of one of the three nearest samples, drawn uniformly [MSR section 5.1]; 1 without samples."""
         begin = column * dr.opaque(mi.UInt32, self.samples.most)
         count, k = dr.gather(mi.UInt32, self.samples.number, column), mi.UInt32(0)
         x, y = self._place(column, row)
@@ -128,7 +128,7 @@ class Predictors:
 
     @dr.syntax
     def _by_bayes(self, column, row):
-        """Probability of light by Bayes' rule, from the samples of nearby columns, in total and in the given row."""
+        """Probability of light by Bayes' rule [MSR section 5.1], from samples of nearby columns and of the same row."""
         j, end = dr.gather(mi.UInt32, self._first, column), dr.gather(mi.UInt32, self._last, column)
         width = dr.width(column)
         light, shadow, row_light, row_shadow = (dr.full(mi.Float, _PRIOR, width) for _ in range(4))
