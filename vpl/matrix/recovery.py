@@ -131,7 +131,7 @@ def _light_of_rows(unoccluded, visibility, shape: tuple[int, int, int]):
 
 
 def _mixed_columns(predictors: Predictors, first: int, count: int) -> np.ndarray:
-    """Columns, out of ``count``, with samples both in light and in shadow; only these are worth separating."""
+    """Columns, out of ``count``, with samples both in light and in shadow; no other column needs separation."""
     sums = (download(values)[first : first + count] for values in (predictors.in_light, predictors.in_shadow))
     return np.flatnonzero(np.minimum(*sums) > _LEAST_ERROR)
 

@@ -69,8 +69,8 @@ class Predictors:
         """
         if kind == NEAREST:
             return self._of_nearest(column, row, draw)
-        likely = self._by_line(column, row) if kind == LINEAR else self._by_bayes(column, row)
-        return dr.select(draw < likely, mi.Float(1), 0)
+        lit = self._by_line(column, row) if kind == LINEAR else self._by_bayes(column, row)
+        return dr.select(draw < lit, mi.Float(1), 0)
 
     def _place(self, column, row):
         first, _ = self.samples.entries.rows.range(dr.gather(mi.UInt32, self._piece, column))
@@ -82,21 +82,22 @@ class Predictors:
         begin = column * dr.opaque(mi.UInt32, self.samples.most)
         count, k = dr.gather(mi.UInt32, self.samples.number, column), mi.UInt32(0)
         x, y = self._place(column, row)
-        first, second, third = (dr.full(mi.Float, np.inf, dr.width(column)) for _ in range(3))
-        one, two, three = (dr.full(mi.Float, 1, dr.width(column)) for _ in range(3))
+        # Squared distances and V of the nearest samples so far
+        distance1, distance2, distance3 = (dr.full(mi.Float, np.inf, dr.width(column)) for _ in range(3))
+        value1, value2, value3 = (dr.full(mi.Float, 1, dr.width(column)) for _ in range(3))
         while dr.hint(k < count, exclude=[self, begin, x, y]):
             value = dr.gather(mi.Float, self.samples.value, begin + k)
             u, v = (dr.gather(mi.Float, side, begin + k) for side in (self.samples.x, self.samples.y))
             distance = dr.square(u - x) + dr.square(v - y)
-            beats_first, beats_second, beats_third = distance < first, distance < second, distance < third
-            three = dr.select(beats_second, two, dr.select(beats_third, value, three))
-            third = dr.select(beats_second, second, dr.select(beats_third, distance, third))
-            two = dr.select(beats_first, one, dr.select(beats_second, value, two))
-            second = dr.select(beats_first, first, dr.select(beats_second, distance, second))
-            one, first = dr.select(beats_first, value, one), dr.minimum(first, distance)
+            first, second, third = distance < distance1, distance < distance2, distance < distance3
+            value3 = dr.select(second, value2, dr.select(third, value, value3))
+            distance3 = dr.select(second, distance2, dr.select(third, distance, distance3))
+            value2 = dr.select(first, value1, dr.select(second, value, value2))
+            distance2 = dr.select(first, distance1, dr.select(second, distance, distance2))
+            value1, distance1 = dr.select(first, value, value1), dr.minimum(distance1, distance)
             k += 1
-        share = draw * mi.Float(dr.minimum(count, 3))
-        return dr.select(share < 1, one, dr.select(share < 2, two, three))
+        rank = draw * mi.Float(dr.minimum(count, 3))
+        return dr.select(rank < 1, value1, dr.select(rank < 2, value2, value3))
 
     @dr.syntax
     def _fit(self, column):
@@ -164,6 +165,7 @@ def predict_columns(
         # Earlier rounds break ties
         best[active] = (wrong + 1e-3 * errors[active]).argmin(1)
         predictors.learn(active)
+        # Without an error a column is done, even for ``error`` 0 or without samples
         active = active[wrong.min(1) >= np.maximum(error * tested, 1e-9)]
     return predictors, np.asarray(kinds)[best]
 
