@@ -26,7 +26,7 @@ from ..points.surfaces import Batch, LambertianSurface, make_batches
 from .all_sources import SourceRounds
 from .cluster_cuts import GroupCuts, cut_clusters, has_wide_source
 from .passes import SiteEstimates, SitePasses
-from .site_table import Scenery, SiteTable
+from .site_table import PassContext, SiteTable
 from .sites import Sites, bound_groups, divide_points
 from .sources import Sources
 from .unoccluded_passes import UnoccludedPasses
@@ -48,7 +48,7 @@ class DirectOptions:
     """Properties of ``adaptivedirect`` and ``unoccludeddirect``, under the same names.
 
     ``lights``: "clusters", "all" or "auto"; or "unoccluded", the reference method.  ``cluster_angle``: steradians [IAS
-    section 5.7]; ``time``: seconds, 0 for no limit.
+    section 5.7]; ``max_passes``, ``max_samples`` of a pixel: [IAS section 5.9]; ``time``: seconds, 0 for no limit.
     """
 
     error: float = 0.03
@@ -176,10 +176,10 @@ class _BatchLight:
         return float(np.average(passes.result()[0].mean(1), weights=part.points))
 
     def _task(self, part: Sites, cuts: GroupCuts, groups):
-        """(Scenery, fraction of the pixel's rays, BSDF samples per emitter sample) of the sites of some groups."""
+        """(PassContext, fraction of the pixel's rays, BSDF samples per emitter sample) of the sites of some groups."""
         table = SiteTable.of(part, cuts)
         return (
-            Scenery(*self._common, table, self._beyond),
+            PassContext(*self._common, table, self._beyond),
             part.points / self.grid.samples,
             self._bsdf[groups][part.group],
         )
@@ -227,13 +227,13 @@ class _BatchLight:
         """Light some groups: (their sites, result of :meth:`SiteEstimates.result`)."""
         single = summed or self._single
         part, cuts = self.sites.select(groups), self._cut(groups, 0.0) if single else self._cuts.select(groups)
-        scenery, share, bsdf = self._task(part, cuts, groups)
+        context, share, bsdf = self._task(part, cuts, groups)
         if summed:
             # "auto" sums only over sources without extent, which BSDF samples cannot hit
-            method = SourceRounds(scenery, part, share, bsdf * (self.options.lights == "all"), level, self.options)
+            method = SourceRounds(context, part, share, bsdf * (self.options.lights == "all"), level, self.options)
             method.run(seed, halted)
         else:
-            method = (UnoccludedPasses if self._single else SitePasses)(scenery, share, bsdf, level, self.options)
+            method = (UnoccludedPasses if self._single else SitePasses)(context, share, bsdf, level, self.options)
             method.run(self._two_sided, seed, halted)
         return part, method.result()
 

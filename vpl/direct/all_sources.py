@@ -13,7 +13,7 @@ import numpy as np
 from ..core.arrays import download, upload
 from ..core.sampling import derived_seed
 from .cluster_sampling import Drawn, sum_sources
-from .site_table import Lanes, Scenery
+from .site_table import Lanes, PassContext
 from .sites import Sites
 
 _LEAST_ROUNDS = 2  # rounds of each half before the difference of the halves can end the sum
@@ -25,20 +25,20 @@ class SourceRounds:
     ``share``, ``bsdf_share``, ``level``: see :class:`vpl.direct.passes.SiteEstimates`.
     """
 
-    def __init__(self, scenery: Scenery, sites: Sites, share, bsdf_share, level: float, options):
-        self.scenery, self.sites, self.share, self.bsdf_share = scenery, sites, share, bsdf_share
+    def __init__(self, context: PassContext, sites: Sites, share, bsdf_share, level: float, options):
+        self.context, self.sites, self.share, self.bsdf_share = context, sites, share, bsdf_share
         self.level, self.options = level, options
-        count = scenery.table.count
+        count = context.table.count
         self.total, self.rounds = np.zeros((2, count, 3)), np.zeros((2, count), np.int64)
         self.rays, self.seen, self.samples = np.zeros(count), np.zeros(count), np.zeros(count)
 
     def run(self, seed: int, halted) -> None:
         """Sum until all groups converge.  ``halted``: called with the number of every round before it; True stops."""
-        table = self.scenery.table
+        table = self.context.table
         if table.entries == 0:
             return
         size = download(table.size).astype(np.int64)
-        extended = self.scenery.sources.nodes.extended[download(table.node)].any() or self.bsdf_share.any()
+        extended = self.context.sources.nodes.extended[download(table.node)].any() or self.bsdf_share.any()
         noisy = (size > 0) & (extended | (self.sites.points > 1))
         active = np.flatnonzero(size)
         for number in range(2 * self.options.max_samples):
@@ -60,7 +60,7 @@ class SourceRounds:
     def _round(self, active, half: int, size, seed: int) -> Drawn:
         bsdf = np.ceil(size[active] * self.bsdf_share[active])
         columns = (active, np.full(len(active), half), np.ones(len(active)), bsdf)
-        return sum_sources(self.scenery, Lanes(*(upload(mi.UInt32, column) for column in columns)), seed)
+        return sum_sources(self.context, Lanes(*(upload(mi.UInt32, column) for column in columns)), seed)
 
     def _unfinished(self) -> np.ndarray:
         """Mask of the groups with an estimated mean squared error above the allowed one, (g,) bool."""

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import channel_mean, finite_or_zero
-from .site_table import SEEN, Scenery, SiteTable, Statistics
+from .site_table import SEEN, PassContext, SiteTable, Statistics
 
 # Least importance of a cluster, relative to the mean over the site's clusters: covers errors of the estimate
 _LEAST_SHARE = 0.01
@@ -55,15 +55,15 @@ def cluster_importance(surface, normal, two_sided, node):
 
 
 @dr.syntax
-def update_importance(scenery: Scenery, two_sided, sites):
+def update_importance(context: PassContext, two_sided, sites):
     """Set the importance of the entries of some sites, positive.  ``two_sided``: Bool per point of the batch."""
-    table, importance, sources = scenery.table, scenery.importance, scenery.sources
+    table, importance, sources = context.table, context.importance, context.sources
     size, cut, entry, first, members = (
         dr.gather(mi.UInt32, column, sites)
         for column in (table.size, table.cut, table.entry, table.member_first, table.members)
     )
     middle = dr.gather(mi.UInt32, table.member_row, first + members // 2)
-    surface, normal = scenery.batch.surfaces_at(middle), dr.gather(mi.Normal3f, scenery.batch.normal, middle)
+    surface, normal = context.batch.surfaces_at(middle), dr.gather(mi.Normal3f, context.batch.normal, middle)
     both = dr.gather(mi.Bool, two_sided, middle)
     total, k = dr.zeros(mi.Float, dr.width(sites)), dr.zeros(mi.UInt32, dr.width(sites))
     while dr.hint(k < size, exclude=[sources, table, surface, normal, both, importance, cut, entry, size]):
@@ -114,15 +114,15 @@ def _statistics_of(statistics: Statistics, entry, entries):
 
 
 @dr.syntax
-def update_probabilities(scenery: Scenery, of_groups, mixture: Mixture, sites):
+def update_probabilities(context: PassContext, of_groups, mixture: Mixture, sites):
     """Set the probabilities of the entries of some sites [IAS eq. 4 to 6].
 
     C / sqrt(u) of [IAS] eq. 4 is importance × gain / sqrt(fraction of samples that saw the source).  The block gets
     ``mixture.prior`` imaginary samples that found the expected light.  The pixel gets the same number of imaginary
     samples with the averages of the block.
     """
-    table, importance, statistics = scenery.table, scenery.importance, scenery.statistics
-    probability = scenery.probability
+    table, importance, statistics = context.table, context.importance, context.statistics
+    probability = context.probability
     entries = dr.opaque(mi.UInt32, table.entries)
     size, cut, entry = (dr.gather(mi.UInt32, column, sites) for column in (table.size, table.cut, table.entry))
     sums, k = dr.zeros(mi.Vector3f, dr.width(sites)), dr.zeros(mi.UInt32, dr.width(sites))

@@ -17,7 +17,7 @@ from ..core.arrays import download, ranges, upload
 from ..core.sampling import derived_seed
 from .cluster_probabilities import Mixture, sum_over_groups, update_importance, update_probabilities
 from .cluster_sampling import draw_samples
-from .site_table import Lanes, Scenery, Statistics
+from .site_table import Lanes, PassContext, Statistics
 
 _LEAST_HALF = 4  # least samples of a half in a pass, for an estimate of the variance
 _INCREMENT = 25  # least samples of a pixel in a pass near convergence [IAS section 5.8]
@@ -32,18 +32,18 @@ _UNIFORM_SHARE, _BLOCK_DECAY = 0.1, 0.7
 class SiteEstimates:
     """Estimates of both halves of each site, their costs, and the samples that they need to converge.
 
-    ``scenery``: context with a table of s sites; ``share`` (s,): fraction of the pixel's camera rays that belong to the
+    ``context``: with a table of s sites; ``share`` (s,): fraction of the pixel's camera rays that belong to the
     site; ``bsdf_share`` (s,): BSDF samples per emitter sample; ``level``: mean radiance of the image, the unit of
     ``options.dark_floor``.
     """
 
-    # Emitter samples of a pixel in a pass: per cluster, minimum, maximum [IAS section 5.8]
+    # Emitter samples of a pixel in a pass: per cluster, and minimum [IAS section 5.8]; a maximum, so that passes adapt
     samples_per_cluster, least_samples, most_samples = 1.5, 50, 400
 
-    def __init__(self, scenery: Scenery, share, bsdf_share, level: float, options):
-        self.scenery, self.share, self.bsdf_share = scenery, share, bsdf_share
+    def __init__(self, context: PassContext, share, bsdf_share, level: float, options):
+        self.context, self.share, self.bsdf_share = context, share, bsdf_share
         self.level, self.options = level, options
-        table = scenery.table
+        table = context.table
         self.size = download(table.size).astype(np.int64)
         count = table.count
         # Per half and site: sums of weighted estimates, of weights, and of squared weights times variances
@@ -63,7 +63,7 @@ class SiteEstimates:
         samples = wanted[half, site]
         bsdf = np.maximum(np.ceil(wanted * self.bsdf_share), _LEAST_BSDF_SAMPLES)
         bsdf = np.where(self.bsdf_share > 0, bsdf, 0)[half, site]
-        drawn = draw_samples(self.scenery, Lanes(*(upload(mi.UInt32, x) for x in (site, half, samples, bsdf))), seed)
+        drawn = draw_samples(self.context, Lanes(*(upload(mi.UInt32, x) for x in (site, half, samples, bsdf))), seed)
         variance = download(drawn.variance).astype(np.float64)
         weight = self._weights(samples, variance, weight)
         self.total[half, site] += weight[:, None] * download(drawn.radiance)
@@ -141,10 +141,10 @@ class SitePasses:
     # Number of imaginary samples that found everything visible
     prior = 1.0
 
-    def __init__(self, scenery: Scenery, share, bsdf_share, level: float, options):
-        self.estimates = SiteEstimates(scenery, share, bsdf_share, level, options)
-        self.scenery, self.options, self.max_passes = scenery, options, options.max_passes
-        self._cut = download(scenery.table.cut).astype(np.int64)
+    def __init__(self, context: PassContext, share, bsdf_share, level: float, options):
+        self.estimates = SiteEstimates(context, share, bsdf_share, level, options)
+        self.context, self.options, self.max_passes = context, options, options.max_passes
+        self._cut = download(context.table.cut).astype(np.int64)
 
     def run(self, two_sided, seed: int, halted: Callable[[int], bool]) -> None:
         """Sample until the sites converge.
@@ -152,22 +152,22 @@ class SitePasses:
         ``two_sided``: Bool per point of the batch; ``halted``: called with the number of every pass before it; True
         stops.
         """
-        scenery, table, estimates = self.scenery, self.scenery.table, self.estimates
+        context, table, estimates = self.context, self.context.table, self.estimates
         if table.entries == 0:
             return
-        scenery.importance = dr.ones(mi.Float, table.entries)
-        dr.eval(scenery.importance)
+        context.importance = dr.ones(mi.Float, table.entries)
+        dr.eval(context.importance)
         self._evaluate_importance(two_sided)
-        scenery.statistics = Statistics.empty(table.entries)
-        scenery.probability = dr.empty(mi.Float, table.entries)
+        context.statistics = Statistics.empty(table.entries)
+        context.probability = dr.empty(mi.Float, table.entries)
         of_groups = tuple(dr.zeros(mi.Float, dr.width(table.node)) for _ in range(3))
         wanted = estimates.full_pass()
         for number in range(self.max_passes):
             active = np.flatnonzero(wanted.any(0))
             if len(active) == 0 or halted(number):
                 break
-            sum_over_groups(table, scenery.statistics, of_groups, upload(mi.UInt32, self._places(active)))
-            update_probabilities(scenery, of_groups, self._mixture(number), upload(mi.UInt32, active))
+            sum_over_groups(table, context.statistics, of_groups, upload(mi.UInt32, self._places(active)))
+            update_probabilities(context, of_groups, self._mixture(number), upload(mi.UInt32, active))
             # Square root rule: near optimal for later passes that are better by an unknown amount [Owen and Zhou 2020,
             # "The square root rule for adaptive importance sampling"]
             estimates.draw(wanted, number, np.sqrt(number + 1.0), derived_seed(seed, number))
@@ -175,7 +175,7 @@ class SitePasses:
 
     def _evaluate_importance(self, two_sided) -> None:
         """Set the importance of clusters to their unoccluded contributions."""
-        update_importance(self.scenery, two_sided, dr.arange(mi.UInt32, self.scenery.table.count))
+        update_importance(self.context, two_sided, dr.arange(mi.UInt32, self.context.table.count))
 
     def _places(self, active: np.ndarray) -> np.ndarray:
         """Indices in ``table.node`` of the cuts of some sites' groups."""

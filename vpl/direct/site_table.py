@@ -19,7 +19,9 @@ from .cluster_cuts import GroupCuts
 from .sites import Sites
 from .sources import Sources
 
-SEEN = 1 << 16  # counters hold samples in the lower 16 bits, samples that saw the source in the upper 16 bits
+# Counters hold samples in the lower 16 bits, samples that saw the source in the upper 16 bits.  A half of a site takes
+# at most 50,000 samples, half of the largest ``max_samples``
+SEEN = 1 << 16
 
 
 @dataclass
@@ -81,7 +83,7 @@ class Statistics:
 
 
 @dataclass
-class Scenery:
+class PassContext:
     """Context shared by the lanes of a pass.
 
     ``importance``, ``probability``: one value per entry; without ``probability`` every cluster is sampled.

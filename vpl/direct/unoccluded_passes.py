@@ -27,23 +27,23 @@ class UnoccludedPasses:
     Arguments as in :class:`vpl.direct.passes.SiteEstimates`.
     """
 
-    def __init__(self, scenery, share, bsdf_share, level, options):
-        self.estimates = SiteEstimates(scenery, share, bsdf_share, level, options)
+    def __init__(self, context, share, bsdf_share, level, options):
+        self.estimates = SiteEstimates(context, share, bsdf_share, level, options)
         self.estimates.least_samples = self.estimates.most_samples = options.samples_per_ray
-        self.scenery, self.options = scenery, options
-        self.several = download(scenery.table.members) > 1
+        self.context, self.options = context, options
+        self.several = download(context.table.members) > 1
         # Sums over the passes of each half and site: of channel means, of their squares, and of passes
         self.levels, self.squares, self.done = (np.zeros((2, len(share))) for _ in range(3))
 
     def run(self, two_sided, seed: int, halted) -> None:
         """Sample until the sites converge.  Arguments as in :meth:`vpl.direct.passes.SitePasses.run`."""
-        whole = self.scenery.table
+        whole = self.context.table
         if whole.entries == 0:
             return
         first, members = (download(column).astype(np.int64) for column in (whole.member_first, whole.members))
-        self.scenery.importance = dr.zeros(mi.Float, whole.entries)
-        self.scenery.probability = dr.empty(mi.Float, whole.entries)
-        self.scenery.statistics = Statistics.empty(whole.entries)
+        self.context.importance = dr.zeros(mi.Float, whole.entries)
+        self.context.probability = dr.empty(mi.Float, whole.entries)
+        self.context.statistics = Statistics.empty(whole.entries)
         nothing = tuple(dr.zeros(mi.Float, dr.width(whole.node)) for _ in range(3))
         mixture = Mixture(*(dr.opaque(mi.Float, share) for share in (1.0, 0.0, 0.0, 1.0)))
         wanted = self.estimates.full_pass()
@@ -64,11 +64,11 @@ class UnoccludedPasses:
     def _select_points(self, whole, place, changed, two_sided, nothing, mixture) -> None:
         """Select one point of every site, and update the densities of the sites ``changed``."""
         one = dr.full(mi.UInt32, 1, whole.count)
-        self.scenery.table = replace(whole, member_first=upload(mi.UInt32, place), members=one)
+        self.context.table = replace(whole, member_first=upload(mi.UInt32, place), members=one)
         if len(changed):
             sites = upload(mi.UInt32, changed)
-            update_importance(self.scenery, two_sided, sites)
-            update_probabilities(self.scenery, nothing, mixture, sites)
+            update_importance(self.context, two_sided, sites)
+            update_probabilities(self.context, nothing, mixture, sites)
 
     def _draw_half(self, wanted: np.ndarray, half: int, number: int, seed: int) -> None:
         """Draw a pass of one half, and record its mean for the variance between points."""
