@@ -42,8 +42,8 @@ INTRODUCTION = """\
 
 Every scene of [scenes/](../scenes/README.md) by `path` and by `manylights` at equal time ({seconds:g} seconds), and \
 the reference. On the site, drag across a picture to compare two images. Images are {width} pixels wide, not \
-denoised. Below each image are its samples per pixel and its error: the mean absolute difference from the reference over the \
-mean of the reference. The smaller error is bold.
+denoised. Below each image are its samples per pixel and its error: the mean absolute difference from the \
+reference over the mean of the reference. The smaller error is bold.
 
 {doubts}One image shows noise, not speed: [results](results.md) has times at equal error. \
 `./run -- python docs/gallery.py` renders all images again.

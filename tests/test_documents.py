@@ -66,8 +66,8 @@ def test_a_changed_number_of_a_result_file_is_found_and_written(tmp_path):
     found = json.loads(file.read_text())
     found["rows"]["hall"]["speedup"] = 0.25
     file.write_text(json.dumps(found))
-    differing = [line.partition(" ")[0] for line in check_tables(root).stdout.splitlines()]
-    assert differing == ["README.md", "docs/results.md"]
+    differing = {line.partition(" ")[0] for line in check_tables(root).stdout.splitlines()}
+    assert differing >= {"README.md", "docs/results.md"} and "docs/start.md" not in differing
     subprocess.run([sys.executable, str(root / "docs" / "tables.py")], check=True, capture_output=True)
     assert check_tables(root).returncode == 0
     assert "| **0.25** |" in (root / "docs" / "results.md").read_text()
