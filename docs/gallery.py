@@ -32,7 +32,7 @@ WIDTH, BATCH, QUALITY = 256, 64, 85
 PASS = 32
 # `max_depth` of scenes with direct light alone, and the error of a pass of such a reference
 DIRECT, FINE = 2, 0.02
-# Excess of one time over another that the page reports
+# Smallest excess of a time over the other time in a warning
 UNEQUAL = 0.1
 BUSY = "The machine ran other programs, too: do not compare numbers of samples. "
 INTRODUCTION = """\

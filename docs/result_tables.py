@@ -1,4 +1,4 @@
-"""Tables of the documents: which columns they have, and from which result files. docs/tables.py fills them."""
+"""Tables of the documents: columns and result files. docs/tables.py fills the tables."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,8 @@ class Column:
     """Column of a table.
 
     ``cell``: format of the quantities of a row. ``ratio``: path of a quantity that is bold below 1, with a geometric
-    mean below the table. ``bound``: path of a quantity that is true where the cell is only a bound, marked by ``sign``.
+    mean below the table. ``bound``: path of a quantity that marks the cell as a bound; ``sign`` is then written before
+    the cell.
     """
 
     title: str
@@ -22,8 +23,8 @@ class Column:
 class Table:
     """Table of one row a scene.
 
-    ``files``: result files by the name under which columns find their rows; those of the name "" are found without.
-    Where a name has several files, later ones add rows. ``order``: path of a quantity by which rows are sorted,
+    ``files``: result files by the prefix of their quantities in columns, "" for no prefix. Of several files with the
+    same prefix, later files add rows. ``order``: path of the quantity that sorts rows,
     largest first. ``first``: title of the column of row names. ``is_brief``: without the commands of the files.
     """
 
@@ -35,7 +36,7 @@ class Table:
 
 
 def numbers(method, *quantities):
-    """Cell of some quantities of a method, each with its format: `"seconds:.2f"`."""
+    """Cell template of quantities of a method with formats, for example `"seconds:.2f"`."""
     return ", ".join(f"{{{method}[{name}]:{spec}}}" for name, _, spec in (one.partition(":") for one in quantities))
 
 

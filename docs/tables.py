@@ -73,7 +73,7 @@ def sources(table):
 
 
 def rows_of(table):
-    """{row: its quantities} of all files of a table, in its order."""
+    """Rows of a table from all files, as {row: quantities}, in the order of the table."""
     rows = {}
     for name, files in table.files.items():
         for file in files:
@@ -85,12 +85,12 @@ def rows_of(table):
 
 
 def ratio_text(value):
-    """A ratio with two digits, bold where it is a loss."""
+    """A ratio with two digits, bold below 1."""
     return f"**{value:r}**" if value < 1 else f"{value:r}"
 
 
 def cell(column, row):
-    """Text of a cell; empty where the row lacks a quantity."""
+    """Text of a cell, empty if the row lacks a quantity."""
     if column.ratio:
         value = quantity(row, column.ratio)
         text = "" if value is None else ratio_text(value)
@@ -134,7 +134,7 @@ def value_text(words):
 
 
 def filled(text):
-    """A document with every table and figure between markers as the result files have it."""
+    """Replace every table and figure between markers in the text of a document."""
 
     def replaced(match):
         start, kind, name, _, end = match.groups()

@@ -15,7 +15,7 @@ PLUGINS = {file for file in (ROOT / "integrators").glob("*.py") if "\nmi.registe
 
 
 def anchors(page: Path) -> set[str]:
-    """Anchors of a page's headings, as GitHub makes them."""
+    """Anchors of the headings of a page by GitHub's rules."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
