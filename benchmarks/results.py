@@ -15,6 +15,7 @@ from comparison import machine
 
 ROOT = Path(__file__).resolve().parents[1]
 DIGITS = 6
+CHANGED_SOURCES = ("status", "--porcelain", "-uno", "--", ".", ":!docs", ":!*.md")
 # Quantities that a row may hold, with their units
 UNITS = {
     "absolute": "mean absolute error of pixels, fraction of the mean of the image",
@@ -114,12 +115,12 @@ def command() -> str:
 
 
 def commit() -> str:
-    """Short hash of the commit of this project, with ``+changes`` if tracked files differ from it."""
+    """Short hash of the commit of this project, with ``+changes`` if tracked files other than documents differ."""
 
     def git(*arguments):
         return subprocess.run(["git", *arguments], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
 
-    return git("rev-parse", "--short", "HEAD") + ("+changes" if git("status", "--porcelain", "-uno") else "")
+    return git("rev-parse", "--short", "HEAD") + ("+changes" if git(*CHANGED_SOURCES) else "")
 
 
 def described_machine() -> dict:

@@ -68,7 +68,8 @@ def sources(table):
         return f"Commits {commits}; {'; '.join(dict.fromkeys(map(machine, names)))}."
     found = [(name, result(name)) for name in names]
     return "\n".join(
-        f"- `{one['command']}`: commit `{one['commit']}`, {one['date']}, {machine(name)}." for name, one in found
+        f"- `{name}.json`: `{one['command']}`; commit `{one['commit']}`, {one['date']}, {machine(name)}."
+        for name, one in found
     )
 
 
