@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
-from benchmarks import scenes  # noqa: E402
+from benchmarks import results, scenes  # noqa: E402
 from vpl.core.arrays import download, upload  # noqa: E402
 from vpl.transport.evaluation import sum_all_lights  # noqa: E402
 
@@ -169,8 +169,9 @@ def _median(runs: list[Found]) -> Found:
     return sorted(runs, key=lambda one: one.seconds)[len(runs) // 2]
 
 
-def curves(names, options) -> None:
+def curves(names, options) -> dict:
     """Part "curve"."""
+    rows = {}
     print(
         f"\n## error against the sum of all lights (width {options.width}, {VPLS} VPLs, max_depth {DEPTH}, no max_cut)"
     )
@@ -185,28 +186,39 @@ def curves(names, options) -> None:
                     plugin = problem.plugin(method, **{quality.name: value}, **more)
                     problem.shade(plugin)
                     found = problem.shade(plugin)
+                    rows[f"{name}, {samples} samples, {method}, {quality.show(value)}"] = _numbers(found)
                     shown.append(
                         f"{quality.show(value)}: {found.rmse:.4f}, {100 * found.absolute:.2f}%, {found.rays:.0f}, "
                         f"{found.seconds:.2f}"
                     )
                 print(f"{name} | {samples} | {method} | {' | '.join(shown)}", flush=True)
+    return rows
 
 
-def equal_errors(names, width: int, samples: int, points: int, methods) -> None:
+def _numbers(found: Found) -> dict:
+    """Quantities of a run, for a result file."""
+    names = ("seconds", "rmse", "absolute", "rays", "cut")
+    return {name: float(getattr(found, name)) for name in names}
+
+
+def equal_errors(names, width: int, samples: int, points: int, methods) -> dict:
     """A table of ``lightcuts`` at 1% and of other methods at its mean absolute error."""
     print(f"\n## {samples} samples a pixel, equal mean absolute error (width {width}, {VPLS} VPLs, warm)")
     print(
         "scene | shared s | method | render s | rays/px | lights, clusters or pairs/px | RMSE | mean absolute | speedup"
     )
     speedups: dict = {method: [] for method in methods}
+    rows: dict = {}
     for name in names:
         problem = Problem(name, samples, width, points)
         target = problem.shade(problem.plugin("lightcuts")).absolute
         chosen = {"lightcuts": 0.01} | {method: problem.quality_for(method, target)[0] for method in methods}
         plugins = {one: problem.plugin(one, **{QUALITY[one].name: value}) for one, value in chosen.items()}
         middle = problem.interleaved(plugins)
+        rows[name] = {"shared_seconds": problem.shared}
         for one, found in middle.items():
             speedup = middle["lightcuts"].seconds / found.seconds
+            rows[name][one] = _numbers(found) | {QUALITY[one].name: chosen[one], "speedup": speedup}
             print(
                 f"{name} | {problem.shared:.2f} | {one}, {QUALITY[one].show(chosen[one])} | {found.seconds:.2f} | "
                 f"{found.rays:.0f} | {found.cut:.0f} | {found.rmse:.4f} | {100 * found.absolute:.2f}% | {speedup:.1f}",
@@ -219,20 +231,22 @@ def equal_errors(names, width: int, samples: int, points: int, methods) -> None:
                 )
     for method, found in speedups.items():
         print(f"geometric mean of the speedups of {method}: {scenes.geometric_mean(found):.2f}")
+    return rows
 
 
-def many_samples(names, options) -> None:
+def many_samples(names, options) -> dict:
     """Part "samples"."""
-    equal_errors(names, options.width, options.samples, options.points, ("mdlightcuts", "lightslice"))
+    return equal_errors(names, options.width, options.samples, options.points, ("mdlightcuts", "lightslice"))
 
 
-def slices(names, options) -> None:
+def slices(names, options) -> dict:
     """Part "slices"."""
-    equal_errors(names, 4 * options.width, 1, options.points, ("lightslice",))
+    return equal_errors(names, 4 * options.width, 1, options.points, ("lightslice",))
 
 
-def growth(names, options) -> None:
+def growth(names, options) -> dict:
     """Part "growth"."""
+    rows: dict = {}
     print(f"\n## mdlightcuts at 1% with more samples a pixel (width {options.width}, {VPLS} VPLs, warm)")
     print("scene | 1 sample: s, rays/px | 4: times as long, rays/px | 16 | 64")
     for name in names:
@@ -243,20 +257,27 @@ def growth(names, options) -> None:
             problem.shade(plugin)
             found = _median([problem.shade(plugin) for _ in range(RUNS)])
             base = base or found.seconds
+            rows[f"{name}, {samples}"] = {
+                "seconds": found.seconds, "slowdown": found.seconds / base, "rays": found.rays,
+            }  # fmt: skip
             time = f"{found.seconds:.2f}" if samples == 1 else f"{found.seconds / base:.1f}"
             shown.append(f"{time}, {found.rays:.0f}")
         print(f"{name} | {' | '.join(shown)}", flush=True)
+    return rows
 
 
-def memory(names, options) -> None:
+def memory(names, options) -> dict:
     """Part "memory": every scene in a process of its own, which tells the most memory that it ever had."""
+    rows = {}
     print("\n## lightslice at 1600×1200, 600 000 VPLs, 800 columns")
     print("scene | peak above the loaded scene, GiB | peak, GiB | render s")
     for name in names:
         context = multiprocessing.get_context("spawn")
         with context.Pool(1) as pool:
             before, after, seconds = pool.apply(_render_large, (name,))
+        rows[name] = {"memory": (after - before) / 2**20, "seconds": seconds}
         print(f"{name} | {(after - before) / 2**20:.2f} | {after / 2**20:.2f} | {seconds:.1f}", flush=True)
+    return rows
 
 
 def _render_large(name: str):
@@ -276,11 +297,16 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=256, help="pixels (default: 256)")
     parser.add_argument("--samples", type=int, default=16, help="samples a pixel of part samples (default: 16)")
     parser.add_argument("--points", type=int, default=8000, help="where all lights are summed (default: 8000)")
+    results.add_json_option(parser)
     options = parser.parse_args()
+    results.check_json_option(parser, options)
     names = scenes.available(options.scenes)
     parts = {"curve": curves, "samples": many_samples, "slices": slices, "growth": growth, "memory": memory}
+    settings = {"max_depth": DEPTH, "vpl_count": VPLS, "width": options.width, "points": options.points, "runs": RUNS}
     for part in options.parts:
-        parts[part](names, options)
+        rows = parts[part](names, options)
+        if options.json:
+            results.write_results(options.json, part, settings, rows)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from benchmarks import results
 from vpl.lights import light_tree
 from vpl.lights.light_tree import BOX_MAX, BOX_MIN, CONE_AXIS, CONE_COS, INTENSITY, build_light_tree
 
@@ -121,7 +122,7 @@ def timed_stages():
 def benchmark_builds(counts):
     print(f"{'lights':>9} {'seconds':>8}  " + " ".join(f"{name[1:]:>14}" for name in STAGES), end="")
     print(f"  {'depth':>5} {'cost':>7} {'halved':>7} {'ratio':>6}")
-    seconds = timed_stages()
+    seconds, rows = timed_stages(), {}
     for count in counts:
         lights = room(count, np.random.default_rng(1))
         build_light_tree(*lights, np.random.default_rng(0))  # touches the memory once
@@ -130,7 +131,9 @@ def benchmark_builds(counts):
         total = time.perf_counter() - begin
         stages = " ".join(f"{seconds[name]:14.3f}" for name in STAGES)
         cost, baseline = total_cost(tree), total_cost(halved(*lights))
+        rows[count] = {"seconds": total, "depth": tree.depth, "cost": cost, "halved": {"cost": baseline}}
         print(f"{count:9d} {total:8.3f}  {stages}  {tree.depth:5d} {cost:7.2f} {baseline:7.2f} {cost / baseline:6.2f}")
+    return rows
 
 
 # --- Cuts ---
@@ -213,12 +216,17 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cuts", action="store_true", help="compare the sizes of cuts instead of timing builds")
     parser.add_argument("counts", nargs="*", type=int, help="numbers of lights")
+    results.add_json_option(parser)
     arguments = parser.parse_args()
+    if arguments.cuts and arguments.json:
+        parser.error("--json writes build times, not --cuts")
     if arguments.cuts:
         for count in arguments.counts or [60_000]:
             benchmark_cuts(count)
     else:
-        benchmark_builds(arguments.counts or [10_000, 50_000, 200_000, 650_000, 1_200_000])
+        rows = benchmark_builds(arguments.counts or [10_000, 50_000, 200_000, 650_000, 1_200_000])
+        if arguments.json:
+            results.write_results(arguments.json, "builds", {}, rows)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ import mitsuba as mi
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 mi.set_variant("llvm_ad_rgb")
 
-from benchmarks import scenes  # noqa: E402
+from benchmarks import results, scenes  # noqa: E402
 from benchmarks.baselines import QUALITY, VPLS, Found, Problem  # noqa: E402
 from benchmarks.separated_light import light_of_entries  # noqa: E402
 from vpl.core.stages import Stage  # noqa: E402
@@ -68,8 +68,9 @@ def _rate(found: Found, pixels: int) -> float:
     return found.rays * pixels / found.counts["entries"]
 
 
-def table(names, options) -> None:
+def table(names, options) -> dict:
     """Part "table"."""
+    rows: dict = {}
     print(f"\n## equal error and equal rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
     print("scene | method | s | rays/px | rate | columns | mean absolute | RMSE | fewer rays | faster | break-even, ns")
     ratios: dict = {}
@@ -77,6 +78,7 @@ def table(names, options) -> None:
         problem = Problem(name, SAMPLES, options.width, options.points)
         found = problem.interleaved(_equal_plugins(problem, ("error", "rays")))
         ours = found[METHOD]
+        rows[name] = _equal_error_row(found, problem)
         for label, one in found.items():
             _show(name, label, one, ours, problem)
             if "equal error" in label:
@@ -86,6 +88,22 @@ def table(names, options) -> None:
     for method, pairs in ratios.items():
         rays, seconds = (scenes.geometric_mean(values) for values in zip(*pairs, strict=True))
         print(f"geometric means over {method}: {rays:.2f} times fewer rays, {seconds:.2f} times faster")
+    return rows
+
+
+def _equal_error_row(found: dict, problem: Problem) -> dict:
+    """Row of a result file: our method, and the others at equal error."""
+    ours, row = found[METHOD], {}
+    for label, one in found.items():
+        if label != METHOD and "equal error" not in label:
+            continue
+        numbers = {name: float(getattr(one, name)) for name in ("seconds", "rays", "absolute", "rmse")}
+        if label == METHOD:
+            numbers |= {"rate": _rate(one, problem.pixels), "columns": one.cut / SAMPLES}
+        else:
+            numbers |= {"fewer_rays": one.rays / ours.rays, "speedup": one.seconds / ours.seconds}
+        row[label.split(",")[0]] = numbers
+    return row
 
 
 def _equal_plugins(problem: Problem, measures) -> dict:
@@ -102,8 +120,9 @@ def _equal_plugins(problem: Problem, measures) -> dict:
     return plugins
 
 
-def costs(_, options) -> None:
+def costs(_, options) -> dict:
     """Part "cost"."""
+    rows: dict = {}
     print(f"\n## more and more expensive rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
     print("veils | method | s | rays/px | mean absolute | RMSE | ns a ray, all in all | fewer rays | faster")
     for veils in VEILS:
@@ -116,6 +135,7 @@ def costs(_, options) -> None:
         problem = Problem("veils", SAMPLES, options.width, options.points, VEILS_DEPTH, scene)
         found = problem.interleaved(_equal_plugins(problem, ("error",)))
         ours = found[METHOD]
+        rows[veils] = _equal_error_row(found, problem)
         for label, one in found.items():
             each = 1e9 * one.seconds / (one.rays * problem.pixels)
             print(
@@ -123,6 +143,7 @@ def costs(_, options) -> None:
                 f"{one.rmse:.4f} | {each:.0f} | {one.rays / ours.rays:.1f} | {one.seconds / ours.seconds:.2f}",
                 flush=True,
             )
+    return rows
 
 
 def _show(name: str, label: str, one: Found, ours: Found, problem: Problem) -> None:
@@ -143,8 +164,9 @@ def _show(name: str, label: str, one: Found, ours: Found, problem: Problem) -> N
         print(f"  stages: {stages}; prediction and separation {100 * share:.0f}%; counted: {one.counts}", flush=True)
 
 
-def steps(names, options) -> None:
+def steps(names, options) -> dict:
     """Part "steps"."""
+    rows: dict = {label: {} for label in STEPS}
     print(f"\n## steps left out ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs)")
     print("scene | steps | rays/px | rate | mean absolute | RMSE")
     for name in names:
@@ -154,10 +176,12 @@ def steps(names, options) -> None:
             with patch.object(recovery, "whole_entries", weight):
                 found = problem.shade(problem.plugin(METHOD, **settings))
             rate = 100 * _rate(found, problem.pixels)
+            rows[label][name] = {"absolute": float(found.absolute), "rays": found.rays, "rmse": float(found.rmse)}
             print(
                 f"{name} | {label} | {found.rays:.1f} | {rate:.1f}% | {100 * found.absolute:.2f}% | {found.rmse:.4f}",
                 flush=True,
             )
+    return rows
 
 
 def pictures(names, options) -> None:
@@ -189,10 +213,17 @@ def main() -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("matrices"), help="folder of part pictures (default: matrices)"
     )
+    results.add_json_option(parser)
     options = parser.parse_args()
+    results.check_json_option(parser, options)
+    if options.json and options.parts == ["pictures"]:
+        parser.error("--json: part pictures has no rows")
     names = scenes.available(options.scenes)
+    settings = {"vpl_count": VPLS, "width": options.width, "samples": SAMPLES, "points": options.points}
     for part in options.parts:
-        parts[part](names, options)
+        rows = parts[part](names, options)
+        if options.json:
+            results.write_results(options.json, part, settings, rows)
 
 
 if __name__ == "__main__":

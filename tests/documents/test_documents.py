@@ -1,6 +1,9 @@
 """README and docs/: links lead somewhere, README stays a page, and the architecture names every module."""
 
+import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,11 +11,12 @@ import pytest
 from tests.support.paths import ROOT
 
 PAGES = [ROOT / "README.md", ROOT / "scenes" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+RESULTS = sorted((ROOT / "docs" / "results").glob("*.json"))
 PLUGINS = {file for file in (ROOT / "integrators").glob("*.py") if "\nmi.register_integrator(" in file.read_text()}
 
 
 def anchors(page: Path) -> set[str]:
-    """Anchors of a page's headings, in GitHub's form."""
+    """Anchors of the headings of a page by GitHub's rules."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
@@ -33,10 +37,67 @@ def test_links_lead_somewhere(page):
 
 
 def test_readme_is_one_page():
-    assert len((ROOT / "README.md").read_text().split()) < 1500
+    assert len(re.sub(r"<!--.*?-->", "", (ROOT / "README.md").read_text()).split()) < 1500
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.parent.name == "docs"], ids=lambda page: page.stem)
+def check_tables(root):
+    """Run the check of tables and figures in a copy of the documents."""
+    command = [sys.executable, str(root / "docs" / "tables.py"), "--check"]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def test_tables_and_figures_are_those_of_the_result_files():
+    done = check_tables(ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def copied(folder):
+    """A copy of the documents, result files and the program that fills tables."""
+    (folder / "docs" / "results").mkdir(parents=True)
+    for file in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "docs").glob("*tables.py")]:
+        (folder / file.relative_to(ROOT)).write_bytes(file.read_bytes())
+    for file in RESULTS:
+        (folder / file.relative_to(ROOT)).write_bytes(file.read_bytes())
+    return folder
+
+
+def test_a_changed_number_of_a_result_file_is_found_and_written(tmp_path):
+    root = copied(tmp_path)
+    file = root / "docs" / "results" / "manylights_product.json"
+    found = json.loads(file.read_text())
+    found["rows"]["hall"]["speedup"] = 0.25
+    file.write_text(json.dumps(found))
+    differing = {line.partition(" ")[0] for line in check_tables(root).stdout.splitlines()}
+    assert differing >= {"README.md", "docs/results.md"} and "docs/start.md" not in differing
+    subprocess.run([sys.executable, str(root / "docs" / "tables.py")], check=True, capture_output=True)
+    assert check_tables(root).returncode == 0
+    assert "| **0.25** |" in (root / "docs" / "results.md").read_text()
+
+
+def test_a_figure_of_an_unknown_row_is_an_error(tmp_path):
+    root = copied(tmp_path)
+    (root / "README.md").write_text("<!-- value manylights_product nowhere speedup -->1<!-- end -->")
+    assert "nowhere" in check_tables(root).stderr
+
+
+@pytest.mark.parametrize("file", RESULTS, ids=lambda file: file.stem)
+def test_result_files_tell_where_their_numbers_come_from(file):
+    found = json.loads(file.read_text())
+    assert re.fullmatch(r"\./run -- python benchmarks/\w+\.py( .*)?", found["command"])
+    assert re.fullmatch(r"[0-9a-f]{7,}", found["commit"]), "measured by sources that no commit has"
+    assert found["machine"]["cores"] > 0 and found["rows"]
+    assert set(found["units"]) == quantities(found["rows"])
+
+
+def quantities(rows):
+    """Names of the numbers of nested rows."""
+    names = set()
+    for name, value in rows.items():
+        names |= quantities(value) if isinstance(value, dict) else {name}
+    return names
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.parent == ROOT / "docs"], ids=lambda page: page.stem)
 def test_readme_and_docs_link_to_each_other(page):
     readme = ROOT / "README.md"
     assert page in dict(links(readme))
