@@ -88,7 +88,7 @@ def rows(scene, introduced):
     titles = [f"`{label}`" for label in INTEGRATORS] + [REFERENCE]
     lines = [titles, ["---"] * 3, pictures, cells]
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    doubts = "".join(f"\n{sentence}\n" for sentence in tables.doubts(scene))
+    doubts = "".join(f"\n{sentence}\n" for sentence in tables.scene_warnings(scene))
     return f"## {name}\n\n{introduced[name]}\n\n{table}\n{doubts}"
 
 
@@ -123,7 +123,7 @@ def main():
             convert(WORK / f"{name}.{label}.png", PICTURES / f"{name}.{label}.jpg")
     introduced = described()
     renders = [one for scene in results["scenes"] for one in scene["renders"]]
-    doubts = "".join(f"{sentence} " for sentence in tables.busy(renders, results["machine"]["cores"]))
+    doubts = "".join(f"{sentence} " for sentence in tables.load_warnings(renders, results["machine"]["cores"]))
     introduction = INTRODUCTION.format(seconds=options.seconds, width=WIDTH, doubts=doubts)
     PAGE.write_text("\n".join([introduction, *(rows(scene, introduced) for scene in results["scenes"])]))
     return 0

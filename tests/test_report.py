@@ -235,7 +235,7 @@ def test_page_begins_with_the_verdict(swept):
     places = [page.index(text) for text in (f'<p class="headline">{first}', '<table class="summary">', "<h2>cornell")]
     assert places == sorted(places)
     for scene in results["scenes"]:
-        for warning in tables.doubts(scene):
+        for warning in tables.scene_warnings(scene):
             assert page.index(warning) < places[1]
     assert results["summary"]["base"] == "path" and list(results["summary"]["scenes"]["cornell"]) == [
         "path", "lightcuts", "vpl",
