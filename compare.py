@@ -95,8 +95,8 @@ def parse(arguments):
 def _add_effort(parser):
     effort = parser.add_mutually_exclusive_group()
     effort.add_argument("--time", type=positive(float), metavar="SECONDS",
-                        help="time budget of each image (default: 20, except with --sweep); the last pass is shortened to "
-                             "fit")  # fmt: skip
+                        help="time budget of each image, met by a shorter last pass (default: 20, except with "
+                             "--sweep)")  # fmt: skip
     effort.add_argument("--spp", type=positive(int), metavar="N",
                         help="samples per pixel of each image (default for sweeps of other parameters: "
                              f"{sweeps.DEFAULT_SPP})")  # fmt: skip
@@ -146,7 +146,8 @@ def _add_output(parser):
     add = parser.add_argument
     add("-o", "--out", type=Path, metavar="FOLDER", help="output folder (default: output, or output/demo)")
     add("--resume", action="store_true",
-        help="reuse finished runs in the output folder made with the same parameters, scene, software and machine")  # fmt: skip
+        help="reuse finished runs in the output folder with the same parameters, scene, software and "
+             "machine")  # fmt: skip
     add("--check", type=Path, metavar="BASELINE",
         help="an earlier results.json; fail if a speed-up at equal error has fallen since")  # fmt: skip
     add("--check-share", type=_share, default=0.2, metavar="FRACTION",
@@ -245,7 +246,9 @@ def run(options, command):
     settings = chosen_settings(options)
     check_scenes(options.scenes, options.reference)
     if options.workers and options.reference.kind == "vpl":
-        raise UsageError("--reference vpl shares files between runs and is incompatible with --workers; choose another reference")
+        raise UsageError(
+            "--reference vpl shares files between runs and is incompatible with --workers; choose another reference"
+        )
     names = map(short_name, options.scenes)
     earlier = baseline.read(options.check, options.metric, names) if options.check else None
     command_line.make_folder(options.out)

@@ -42,8 +42,8 @@ _IC = {
 _IC_DEPARTURES = (
     "Paper: 1600 × 1200 pixels, 20 cores, about 650 000 VPLs. The paper's errors are relative to the image of all VPLs "
     "(as with --reference vpl), ours to the reference of this run. lights: tracing VPLs and building light trees "
-    "(paper: trees only); render: all further work. The paper does not state the normalization of its RMSE, so its RMSE "
-    "is omitted. The paper's relative error is a mean over pixels, our rel. L1 is sum |x - r| / sum r."
+    "(paper: trees only); render: all further work. The paper does not state the normalization of its RMSE, so its "
+    "RMSE is omitted. The paper's relative error is a mean over pixels, our rel. L1 is sum |x - r| / sum r."
 )
 
 
