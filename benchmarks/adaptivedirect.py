@@ -2,18 +2,18 @@
 
     ./run -- python benchmarks/adaptivedirect.py [--scenes NAME ...] [--parts table paper lights cold]
 
-table   direct light (``max_depth`` 2) of each scene at the same convergence rule: seconds, shadow rays per pixel and
-        relMSE of ``adaptivedirect`` and ``unoccludeddirect``; and how long that one, ``lights="all"``, ``direct`` and
-        ``path`` would take for the same relMSE.
-paper   the same with the method as the paper prints it (benchmarks/printed_passes.py).
-lights  the hall with 100 to 100 000 lights: seconds to the same error.
-cold    first render in a fresh process with an empty kernel cache.
+table   direct light (``max_depth`` 2) of each scene with equal stopping rules: seconds, shadow rays per pixel and
+        relMSE of ``adaptivedirect`` and ``unoccludeddirect``; time at equal relMSE of the latter, ``lights="all"``,
+        ``direct`` and ``path``.
+paper   the same for the method as printed in the paper (benchmarks/printed_passes.py).
+lights  the hall with 100 to 100 000 lights: seconds to equal error.
+cold    first render in a new process with an empty kernel cache.
 
-Images are rendered with 64 camera rays a pixel (256 by ``direct`` and ``path``) from a multijitter sampler, and
-compared, where they see no emitter, with the mean of four renders by ``adaptivedirect`` at 1.5%, whose own noise is
-taken off: path-traced references of these scenes are noisier than what they would judge (10% a pixel after 2048 samples
-in the kitchen). That its mean is that of ``direct`` is tested (tests/test_adaptivedirect.py). Variance falls as
-1 / time, so a method's time for another error is its own time, scaled; ``all`` is stopped after 15 seconds.
+Images use 64 camera rays per pixel (``direct`` and ``path``: 256) of a multijitter sampler. Errors cover pixels without
+visible emitters, against the mean of four renders by ``adaptivedirect`` at 1.5%, corrected for the noise of this mean.
+Path-traced references are too noisy: 10% per pixel after 2048 samples in the kitchen. tests/test_adaptivedirect.py
+tests that ``adaptivedirect`` has the mean of ``direct``. The variance is proportional to 1 / time, so times scale to
+equal error; ``all`` stops after 15 seconds.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ PRINTED = "adaptivedirect, printed"
 
 
 class Problem:
-    """A scene with its reference, and renders of it with their times and errors."""
+    """Scene with its reference; renders with times and errors."""
 
     def __init__(self, name: str, width: int):
         path, height = str(scenes.scene_file(name)), scenes.height(name, width)
@@ -62,12 +62,12 @@ class Problem:
         if not cached.exists():
             self._make_reference(cached)
         self.reference = references.read(cached)
-        # The edges of emitters, a thousand times brighter than what is around them, would drown all other errors
+        # Exclude emitters: errors at their edges, a thousand times brighter than the surroundings, dominate otherwise
         shown = np.array(mi.render(self.scene, integrator=plugin("path", max_depth=1), spp=256, seed=0))
         self.lit = shown[..., :3].max(-1) == 0
 
     def _make_reference(self, file: Path) -> None:
-        """The mean of independent renders, and its standard error."""
+        """Write the mean of independent renders and its standard error."""
         batches, fine = references.Batches(), plugin("adaptivedirect", error=REFERENCE_ERROR, max_passes=30)
         for seed in range(1000, 1000 + REFERENCE_RENDERS):
             image = np.array(mi.render(self.scene, integrator=fine, spp=RAYS, seed=seed), np.float64)
@@ -76,18 +76,18 @@ class Problem:
         batches.write(file, {"integrator": "adaptivedirect", "error": REFERENCE_ERROR})
 
     def error(self, image) -> float:
-        """relMSE over pixels without emitters, the largest 0.1% left out and the reference's noise taken off."""
+        """relMSE over pixels without emitters, without the largest 0.1%, corrected for the reference's noise."""
         known = self.reference
         parts = (x[self.lit][None] for x in (np.array(image, np.float64)[..., :3], known.image, known.standard_error))
         return compare(*parts)["relmse_trimmed"]
 
     def race(self, ours: str, methods: dict) -> dict:
-        """Render with {label: (plugin, its properties, samples)}: ``ours`` now and then, and at the end.
+        """Render with {label: (plugin, properties, samples)}; runs of ``ours`` are interleaved and come last.
 
-        Returns {label: (median of the seconds, mean relMSE, mean rays per pixel)}.
+        Returns {label: (median seconds, mean relMSE, mean rays per pixel)}.
         """
         for kind, more, samples in methods.values():
-            # The kernels of Mitsuba's integrators contain the number of samples
+            # Kernels of Mitsuba's integrators depend on the number of samples
             few = samples if kind in ("direct", "path") else 2
             usual = plugin(kind, **{k: v for k, v in more.items() if k != "error"})
             with method(kind):
@@ -111,18 +111,18 @@ class Problem:
 
 
 def plugin(name: str, **more):
-    """An integrator for direct light."""
+    """Integrator for direct light."""
     return mi.load_dict({"type": name.split(",")[0], **more})
 
 
 def method(name: str):
-    """Context in which the plugin of that name renders by the method that is meant."""
+    """Context in which the plugin of this name renders by the intended method."""
     return as_printed() if name == PRINTED else nullcontext()
 
 
 def table(names, options) -> None:
     """Part "table"."""
-    print(f"\n## at the same rule, error {100 * options.error:g}%, {RAYS} camera rays, width {options.width}, warm")
+    print(f"\n## equal stopping rule, error {100 * options.error:g}%, {RAYS} camera rays, width {options.width}, warm")
     print(
         "scene | adaptive: s, rays/px, relMSE | unoccluded: s, rays/px, relMSE | faster | fewer rays | at equal relMSE:"
         " unoccluded | all | direct | path"
@@ -155,8 +155,8 @@ def table(names, options) -> None:
 
 
 def departures(names, options) -> None:
-    """Part "paper": what the departures from the paper bring."""
-    print("\n## the method as printed, and with what was changed, at the same rule")
+    """Part "paper": effect of the departures from the paper."""
+    print("\n## the method as printed and as modified, with equal stopping rules")
     print("scene | ours: s, rays/px, relMSE, bias | as printed: s, rays/px, relMSE, bias | ours at equal relMSE: times")
     for name in names:
         problem = Problem(name, options.width)
@@ -182,8 +182,8 @@ def departures(names, options) -> None:
 
 def number_of_lights(options) -> None:
     """Part "lights"."""
-    print(f"\n## the hall with N lights: error {100 * options.error:g}% (compared with renders of 1% and 64 rays)")
-    print("lights | load s | auto: s, rays/px, relMSE | all: s, rays/px, relMSE | time to equal relMSE, all / auto")
+    print(f"\n## hall with N lights: error {100 * options.error:g}% (compared with renders of 1% and 64 rays)")
+    print("lights | load s | auto: s, rays/px, relMSE | all: s, rays/px, relMSE | time at equal relMSE, all / auto")
     for count in (100, 1000, 10_000, 100_000):
         with tempfile.TemporaryDirectory() as folder:
             file = str(Path(folder) / "hall.xml")
@@ -225,7 +225,7 @@ print(scenes.timed(lambda: mi.render(scene, integrator=integrator, spp=1, seed=1
 
 def cold_starts(options) -> None:
     """Part "cold"."""
-    print("\n## first render in a fresh process with an empty kernel cache, and the second (1 sample a pixel)")
+    print("\n## first render in a new process with an empty kernel cache, and second render (1 sample per pixel)")
     print("scene | adaptivedirect: first s, second s | path: first s, second s")
     with tempfile.TemporaryDirectory() as folder:
         files = {}
@@ -255,9 +255,9 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(NAMES), choices=NAMES)
     parser.add_argument("--parts", nargs="+", default=["table", "paper", "lights", "cold"])
     parser.add_argument("--against", nargs="+", default=list(AGAINST), choices=AGAINST, help="columns of part table")
-    parser.add_argument("--error", type=float, default=0.03, help="the rule of parts table and paper (default: 0.03)")
-    parser.add_argument("--width", type=int, default=128, help="pixels (default: 128)")
-    parser.add_argument("--spp", type=int, default=256, help="samples a pixel of direct and path (default: 256)")
+    parser.add_argument("--error", type=float, default=0.03, help="stopping rule of table and paper (default: 0.03)")
+    parser.add_argument("--width", type=int, default=128, help="width in pixels (default: 128)")
+    parser.add_argument("--spp", type=int, default=256, help="samples per pixel of direct and path (default: 256)")
     options = parser.parse_args()
     names = scenes.available(options.scenes)
     if "table" in options.parts:
