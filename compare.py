@@ -216,8 +216,8 @@ def chosen_settings(options):
     # A reference by `vpl` uses the same lights and camera rays, so that errors do not depend on the number of samples
     samples = options.reference.kind != "vpl"
     settings = sweeps.settings(chosen_integrators(options), options.sweep, options.spp, options.time, samples)
-    for of in settings.values():
-        for setting in of:
+    for group in settings.values():
+        for setting in group:
             command_line.check_parameters(setting.title, setting.integrator, setting.parameters)
     return settings
 

@@ -5,7 +5,7 @@ from . import curves, metrics
 COSTS = ("seconds", "rays")
 
 
-def points(renders, metric):
+def points_by_cost(renders, metric):
     """Return a list of (cost, `curves.Point`s) for each of `COSTS` from results of runs (see worker.run). Omits runs
     that failed, have no errors, or do not count the cost."""
     found = {cost: {} for cost in COSTS}
@@ -30,9 +30,9 @@ def cost_of(render, cost):
     return None if render["rays_per_sample"] is None else render["rays_per_sample"] * render["spp"]
 
 
-def make_curves(of, labels):
+def make_curves(points, labels):
     """Return the `curves.Curve`s of points in the order of the labels; a label without points has no curve."""
-    found = [curves.Curve(label, [point for point in of if point.label == label]) for label in labels]
+    found = [curves.Curve(label, [point for point in points if point.label == label]) for label in labels]
     return [curve for curve in found if curve.points]
 
 
@@ -40,11 +40,11 @@ def analyse(renders, labels, metric):
     """Return "points", "equal_errors" and "equal_costs" of a scene. The latter two are empty unless at least two labels
     have points and one of these has several."""
     described, at_errors, at_costs = [], {}, {}
-    for cost, of in points(renders, metric):
-        best = curves.pareto(of)
-        for point in of:
+    for cost, points in points_by_cost(renders, metric):
+        best = curves.pareto(points)
+        for point in points:
             described.append(_describe(cost, point, (point.label, point.name) in best))
-        found = make_curves(of, labels)
+        found = make_curves(points, labels)
         if len(found) > 1 and any(len(curve.points) > 1 for curve in found):
             at_errors[cost], at_costs[cost] = curves.equal_errors(found), curves.equal_costs(found)
     return {"points": described, "equal_errors": at_errors, "equal_costs": at_costs}

@@ -72,8 +72,8 @@ def _fall(first, other, before, share):
 
 def _readings(scene, base, label, cost, error, metric):
     """Return the readings of two labels at an error (see `curves.equal_errors`), None if one has no curve."""
-    of = dict(analysis.points(scene["renders"], metric))[cost]
-    pair = analysis.make_curves(of, [base, label])
+    points = dict(analysis.points_by_cost(scene["renders"], metric))[cost]
+    pair = analysis.make_curves(points, [base, label])
     if [curve.label for curve in pair] != [base, label]:
         return None
     costs = curves.equal_errors(pair, [error])[0]["costs"]

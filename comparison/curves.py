@@ -65,7 +65,7 @@ class Point:
         seeds = [seed for seed in self.cost if seed != without]
         if not seeds:
             return np.nan, np.nan, np.nan
-        return tuple(float(np.mean([of[seed] for seed in seeds])) for of in (self.cost, self.error, self.noise))
+        return tuple(float(np.mean([values[seed] for seed in seeds])) for values in (self.cost, self.error, self.noise))
 
 
 class Curve:

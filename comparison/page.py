@@ -52,12 +52,12 @@ def _scene(scene, pictures, results):
         shown["views"] = json.dumps(data).replace("</", "<\\/")  # "</" would end the enclosing script element
         shown["has_maps"] = any(view["maps"] for view in pictures.views)
         shown["stills"] = pictures.stills
-    for cost, of in analysis.points(scene["renders"], metric):
-        are_curves = len({point.label for point in of}) < len(of)
-        if cost == "seconds" and not are_curves and len(of) > 1:
-            shown["bars"] = plots.error_bars(of, labels, metric)
+    for cost, points in analysis.points_by_cost(scene["renders"], metric):
+        are_curves = len({point.label for point in points}) < len(points)
+        if cost == "seconds" and not are_curves and len(points) > 1:
+            shown["bars"] = plots.error_bars(points, labels, metric)
         if are_curves:
-            shown["plots"].append(plots.error_against(cost, of, pareto(of), labels, metric))
+            shown["plots"].append(plots.error_against(cost, points, pareto(points), labels, metric))
         for title, table in (("equal error", tables.equal_errors), ("equal cost", tables.equal_costs)):
             if rows := table(scene, cost):
                 shown["comparisons"].append((cost, title, rows))
@@ -121,7 +121,7 @@ def _ratio_cell(ratio):
 def _palettes():
     """Return, as JSON, the colours of each kind of map (256 × 3 bytes, a flat list), and the scales."""
     steps = np.linspace(0, 1, 256)
-    found = {name: _bytes(colormaps[of](steps)) for name, of in (("flip", "magma"), ("signed", "RdBu_r"))}
+    found = {name: _bytes(colormaps[scale](steps)) for name, scale in (("flip", "magma"), ("signed", "RdBu_r"))}
     found["distance"] = images.tone_map(np.repeat(steps[:, None], 3, axis=1), 1.0)
     found["relative"] = images.palette(steps)
     scales = {"range": images.ERROR_RANGE, "stored": page_images.RELATIVE_ENDS, "whitest": 1 / DISTANCE_FACTOR}

@@ -52,7 +52,7 @@ def _measured(table, runs):
     labels, found = _labels(runs), {}
     for run in sorted(runs, key=lambda run: labels.index(run["label"])):
         found.setdefault((run["label"], run["setting"]), []).append(run)
-    return {key: _mean_row(table, of) for key, of in found.items()}
+    return {key: _mean_row(table, group) for key, group in found.items()}
 
 
 def _labels(runs):
@@ -119,7 +119,7 @@ def _equal_rows(table, runs):
         return []
     cost = "rays" if table.equal == "rays" else "seconds"
     first = next(run["label"] for run in runs if table.method_of(run) is table.methods[0])
-    points = dict(analysis.points(runs, table.metric))[cost]
+    points = dict(analysis.points_by_cost(runs, table.metric))[cost]
     curves = analysis.make_curves(points, [first, *(label for label in _labels(runs) if label != first)])
     several = len(curves) > 1 and any(len(curve.points) > 1 for curve in curves)
     if not several or curves[0].label != first:
@@ -161,7 +161,10 @@ def _published(table, method):
     figures = {name: method.figures[name] for name in table.quantities if name in method.figures}
     scenes = max(map(len, figures.values()))
     ratios = [
-        _ratios(table, *({name: of[scene] for name, of in one.figures.items()} for one in (method, table.methods[0])))
+        _ratios(
+            table,
+            *({name: numbers[scene] for name, numbers in one.figures.items()} for one in (method, table.methods[0])),
+        )
         for scene in range(scenes)
     ]
     figures |= {name: [one[name] for one in ratios] for name in table.ratios if ratios[0][name] is not None}

@@ -52,9 +52,9 @@ class Pictures:
         """Write each channel of all images as PNG files on a common scale; `file_names` maps titles to file name parts.
         Return channel -> "scale" and "files" (see results.schema.json)."""
         shown = {}
-        for channel, of in self._aovs.items():
-            ends, files = images.logarithmic_ends(of.values()), {}
-            for title, values in of.items():
+        for channel, values_of in self._aovs.items():
+            ends, files = images.logarithmic_ends(values_of.values()), {}
+            for title, values in values_of.items():
                 files[title] = str(self.path(f"{file_names[title]}.{channel}", ".png"))
                 images.write_png(files[title], images.false_colours(values, ends))
             shown[channel] = {"scale": ends, "files": files}

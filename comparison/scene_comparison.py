@@ -84,7 +84,7 @@ class SceneComparison:
                 self._assess(result)
             except Exception as error:
                 result |= failure(error)
-        names = {setting.title: setting.file_name for of in self.settings.values() for setting in of}
+        names = {setting.title: setting.file_name for group in self.settings.values() for setting in group}
         if aovs := self.pictures.write_aovs(names):
             self.result["aovs"] = aovs
         self.result |= analysis.analyse(self.result["renders"], labels, self.options.metric)

@@ -125,7 +125,7 @@ def settings(integrators, sweeps, spp, time, samples=True):
             _setting(label, name, parameters, spp, time, dict(zip(grid, values, strict=True)))
             for values in product(*grid.values())
         ]
-    check_file_names([setting for of in found.values() for setting in of])
+    check_file_names([setting for group in found.values() for setting in group])
     return found
 
 

@@ -33,10 +33,10 @@ def summarise(scenes, metric):
 
 def _row(scene, labels, metric):
     """Return the summary of a scene: label -> entry."""
-    of = dict(analysis.points(scene["renders"], metric))["seconds"]
+    all_points = dict(analysis.points_by_cost(scene["renders"], metric))["seconds"]
     found = {}
     for label in labels:
-        points = [point for point in of if point.label == label]
+        points = [point for point in all_points if point.label == label]
         if not points:
             continue
         best = min(points, key=lambda point: np.mean(list(point.error.values())))
@@ -56,11 +56,11 @@ def _row(scene, labels, metric):
     if labels and labels[0] in found:
         for label in found:
             if label != labels[0]:
-                found[label] |= _ratios(scene, of, labels[0], label, metric)
+                found[label] |= _ratios(scene, all_points, labels[0], label, metric)
     return found
 
 
-def _ratios(scene, of, base, label, metric):
+def _ratios(scene, points, base, label, metric):
     """Return "error" (at equal time) and "time" (at equal error) of a label over the first; None: unknown."""
     at_errors, at_costs = (scene.get(key, {}).get("seconds") for key in ("equal_errors", "equal_costs"))
     if at_errors:
@@ -68,7 +68,7 @@ def _ratios(scene, of, base, label, metric):
             "time": _mean_of_readings([entry["costs"] for entry in at_errors], base, label),
             "error": _mean_of_readings([entry["errors"] for entry in at_costs], base, label),
         }
-    first, other = (next(point for point in of if point.label == name) for name in (base, label))
+    first, other = (next(point for point in points if point.label == name) for name in (base, label))
     seconds = sorted(float(np.mean(list(point.cost.values()))) for point in (first, other))
     is_equal_time = seconds[1] <= (1 + tables.UNEQUAL) * seconds[0]
     error = _ratio_of_points(first, other, lambda cost, error: error) if is_equal_time else None
@@ -157,12 +157,12 @@ def _sentence(label, base, rows):
         ratio = in_words(*ratios.values())
         return f"{label} {WORDS[kind]['one'].format(ratio=ratio, base=base)} in {next(iter(ratios))}."
     mean = _over_scenes(ratios.values())
-    of = {one: [name for name, ratio in ratios.items() if verdict_of(ratio) == one] for one in ("better", "worse")}
-    text = f"{label} {WORDS[kind]['less'].format(base=base)} in {len(of['better'])} of {len(rows)} scenes"
+    names = {one: [name for name, ratio in ratios.items() if verdict_of(ratio) == one] for one in ("better", "worse")}
+    text = f"{label} {WORDS[kind]['less'].format(base=base)} in {len(names['better'])} of {len(rows)} scenes"
     if mean:
         over = f" over {mean['scenes']} scenes" if mean["scenes"] < len(rows) else ""
         text += f" (geometric mean{over}: {in_words(mean)} the {kind})"
-    worse = [f"{name} ({number(ratios[name])})" for name in of["worse"]]
+    worse = [f"{name} ({number(ratios[name])})" for name in names["worse"]]
     return f"{text}. {WORDS[kind]['more']} in {_listed(worse)}." if worse else f"{text}."
 
 
