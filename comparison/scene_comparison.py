@@ -127,8 +127,8 @@ class SceneComparison:
         while True:
             spp, share = self._reference.description["spp"], self._noise_share()
             if share is None or share <= wanted.fraction or spp >= self.options.reference_limit:
-                told = None if share == np.inf else share  # JSON has no infinity
-                self.result |= {"reference_share": told, "reference_fraction": wanted.fraction}
+                finite = None if share == np.inf else share  # JSON has no infinity
+                self.result |= {"reference_share": finite, "reference_fraction": wanted.fraction}
                 return
             growth = np.clip((share / wanted.fraction) ** 2, *GROWTH)
             self._reference = self._path_traced(min(self.options.reference_limit, math.ceil(spp * growth)))

@@ -27,7 +27,7 @@ TABLE = (2.5, 2.35)
 SKY = "kitchen_sky.exr"
 
 WARM, WHITE, COOL = (1.0, 0.66, 0.36), (1.0, 0.87, 0.72), (0.7, 0.85, 1.0)
-DOWN, UP, NEAR = (0, 0, -1), (0, 0, 1), (0, -1, 0)
+DOWN, UP = (0, 0, -1), (0, 0, 1)
 
 MATERIALS = [
     material("lamp", (0.5, 0.5, 0.5)),

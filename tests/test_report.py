@@ -203,7 +203,7 @@ def test_errors_that_the_noise_hides_are_named():
         for cost in analysis.COSTS for label in "abc"
     ]  # fmt: skip
     (warning,) = tables.warnings({"renders": [], "points": points}, cores=2)
-    assert "hides the error of a spp=4, c spp=4:" in warning
+    assert "hides the error of a spp=4, c spp=4; use" in warning
 
 
 def test_a_busy_machine_is_named():
