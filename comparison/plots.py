@@ -38,8 +38,8 @@ def colour(index):
 def error_against(cost, points, best, labels, metric):
     """Plot error against a cost ("seconds" or "rays"), both logarithmic; return SVG text, None without points.
 
-    `points`: `curves.Point`s; `best`: the set of (label, name) on the Pareto front, marked by rings. Bars are confidence
-    intervals of the means. Points below the reference's noise are hollow and not part of a curve.
+    `points`: `curves.Point`s; `best`: the set of (label, name) on the Pareto front, marked by rings. Bars are
+    confidence intervals of the means. Points below the reference's noise are hollow and not part of a curve.
     """
     if not points:
         return None

@@ -2,7 +2,7 @@
 
 Two libraries come from the system, not from the Python wheels:
 
-- libatomic: without it ``import drjit``, and so ``import mitsuba``, fails with a NameError without mention of libatomic.
+- libatomic: if absent, ``import drjit`` and ``import mitsuba`` fail with a NameError that does not mention libatomic.
 - libLLVM, the compiler of all kernels of the ``llvm_*`` variants: Dr.Jit refuses versions up to 14 and reports them as
   missing. It accepts versions 15 and 16, which abort the process at the first kernel with a minimum.
 
