@@ -192,20 +192,20 @@ def chosen_integrators(options):
             raise UsageError(f"--param {key}: not of the form LABEL.KEY=VALUE, where LABEL is {' or '.join(chosen)}")
         chosen[label][1][name] = value
     for aov in options.aovs:
-        _ask_for(aov, chosen)
+        _request_aov(aov, chosen)
     return chosen
 
 
-def _ask_for(aov, chosen):
+def _request_aov(aov, chosen):
     """Add an AOV to the parameters of all integrators that support it; raises UsageError if none does."""
-    able = command_line.integrators_with_aovs()
-    own = [choice for choice in chosen.values() if choice[0] in able]
-    if not own:
-        raise UsageError(f"--aovs: supported only by {', '.join(able)}")
-    refusals = [command_line.aov_refusal(name, aov) for name, _ in own]
+    supporting = command_line.integrators_with_aovs()
+    choices = [choice for choice in chosen.values() if choice[0] in supporting]
+    if not choices:
+        raise UsageError(f"--aovs: supported only by {', '.join(supporting)}")
+    refusals = [command_line.aov_refusal(name, aov) for name, _ in choices]
     if all(refusals):
         raise UsageError(f"--aovs {aov}: {'; '.join(dict.fromkeys(refusals))}")
-    for (_, parameters), refusal in zip(own, refusals, strict=True):
+    for (_, parameters), refusal in zip(choices, refusals, strict=True):
         if not refusal:
             given = _names(str(parameters.get("aovs", "")))
             parameters["aovs"] = ",".join(dict.fromkeys([*given, aov]))

@@ -221,7 +221,7 @@ class SceneComparison:
             flip, result["errors"]["flip"], result["errors"]["flip_settings"] = metrics.flip(image, reference.image)
             error = tables.error([result["errors"]], self.options.metric, ".3g")
         if result["seed"] == self.options.seeds[0]:
-            title = f"{result['label']} {result['setting']}".strip()
+            title = tables.title(result)
             file_name = Path(result["output"]).name[len(self.result["name"]) + 1 : -len(".exr")]
             file_name = file_name.removesuffix(f".seed{result['seed']}")
             self.pictures.show(

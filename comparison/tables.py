@@ -30,28 +30,33 @@ def text(rows):
     return "\n".join(line.rstrip() for line in lines)
 
 
+def title(entry):
+    """Return the title of the setting of a run or point, such as "lightcuts error=0.02"."""
+    return f"{entry['label']} {entry['setting']}".strip()
+
+
 def settings(scene):
-    """Return title, such as "lightcuts error=0.02" -> results of its runs, in the order of labels."""
+    """Return title -> results of its runs, in the order of labels."""
     labels = list(dict.fromkeys(render["label"] for render in scene["renders"]))
     found = {}
     for label in labels:
         of_label = [render for render in scene["renders"] if render["label"] == label]
         # Runs proceed seed by seed; the first seed determines the order of settings
         for render in of_label:
-            found.setdefault(f"{label} {render['setting']}".strip(), []).append(render)
+            found.setdefault(title(render), []).append(render)
     return found
 
 
 def rows(scene):
     """Return the rows of a scene: as many cells as `COLUMNS`, or (title, message) for a failure."""
     intervals, found = _intervals(scene), []
-    for title, renders in settings(scene).items():
+    for name, renders in settings(scene).items():
         good = [render for render in renders if "error" not in render]
         if good:
-            found.append(_row(title, good, intervals.get(title, "")))
+            found.append(_row(name, good, intervals.get(name, "")))
         failures = Counter(render["error"] for render in renders if "error" in render)
         found += [
-            (title, message if len(renders) == 1 else f"{message} ({count} of {len(renders)} seeds)")
+            (name, message if len(renders) == 1 else f"{message} ({count} of {len(renders)} seeds)")
             for message, count in failures.items()
         ]
     return found
@@ -64,16 +69,16 @@ def _intervals(scene):
     for point in scene.get("points", []):
         low, high = point["error"]["low"], point["error"]["high"]
         if low is not None and not point["below_noise"]:
-            found[f"{point['label']} {point['setting']}".strip()] = f"{number(low)} to {number(high)}"
+            found[title(point)] = f"{number(low)} to {number(high)}"
     return found
 
 
-def _row(title, renders, interval):
+def _row(name, renders, interval):
     errors = [render["errors"] for render in renders if "errors" in render]
     bad = sum(one["bad_pixels"] for one in errors)
     cold = [render["cold_seconds"] for render in renders if render["cold_seconds"] is not None]
     return [
-        title + (f" ({bad} pixels not finite)" if bad else ""),
+        name + (f" ({bad} pixels not finite)" if bad else ""),
         str(len(renders)),
         number(_mean(render["seconds"] for render in renders)),
         number(_mean(cold)) if cold else "",
@@ -179,10 +184,10 @@ def _machines(scene):
 def _unequal_times(scene):
     """Return a sentence for each time budget that runs used unequally."""
     budgets = {}
-    for title, renders in settings(scene).items():
+    for name, renders in settings(scene).items():
         seconds = [render["seconds"] for render in renders if "error" not in render and render["budget"]]
         if seconds:
-            budgets.setdefault(renders[0]["budget"], {})[title] = _mean(seconds)
+            budgets.setdefault(renders[0]["budget"], {})[name] = _mean(seconds)
     found = []
     for budget, seconds in budgets.items():
         shortest, longest = (choose(seconds, key=seconds.get) for choose in (min, max))
@@ -196,11 +201,7 @@ def _unequal_times(scene):
 
 def _hidden(scene):
     """Return a list with a sentence about errors hidden by the reference's noise."""
-    hidden = [
-        f"{point['label']} {point['setting']}".strip()
-        for point in scene.get("points", [])
-        if point["below_noise"] and point["cost"] == "seconds"
-    ]
+    hidden = [title(point) for point in scene.get("points", []) if point["below_noise"] and point["cost"] == "seconds"]
     if not hidden:
         return []
     return [f"The reference's noise hides the error of {', '.join(hidden)}; use a reference with more samples."]
