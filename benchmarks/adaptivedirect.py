@@ -2,12 +2,12 @@
 
     ./run -- python benchmarks/adaptivedirect.py [--scenes NAME ...] [--parts table paper lights cold]
 
-table   direct light (``max_depth`` 2) of each scene at the same convergence rule: seconds, shadow rays per pixel and
-        relMSE of ``adaptivedirect`` and ``unoccludeddirect``; and how long that one, ``lights="all"``, ``direct`` and
-        ``path`` would take for the same relMSE.
-paper   the same with the method as the paper prints it (benchmarks/printed_passes.py).
-lights  the hall with 100 to 100 000 lights: seconds to the same error.
-cold    first render in a fresh process with an empty kernel cache.
+table   direct light (``max_depth`` 2) of each scene with equal stopping rules: seconds, shadow rays per pixel and
+        relMSE of ``adaptivedirect`` and ``unoccludeddirect``; time at equal relMSE of the latter, ``lights="all"``,
+        ``direct`` and ``path``.
+paper   the same for the method as printed in the paper (benchmarks/printed_passes.py).
+lights  the hall with 100 to 100 000 lights: seconds to equal error.
+cold    first render in a new process with an empty kernel cache.
 
 Images are rendered with 64 camera rays a pixel (256 by ``direct`` and ``path``) from a multijitter sampler, and
 compared, where they see no emitter, with the mean of four renders by ``adaptivedirect`` at 1.5%, whose own noise is
@@ -49,7 +49,7 @@ PRINTED = "adaptivedirect, printed"
 
 
 class Problem:
-    """A scene with its reference, and renders of it with their times and errors."""
+    """Scene with its reference; renders with times and errors."""
 
     def __init__(self, name: str, width: int):
         path, height = str(scenes.scene_file(name)), scenes.height(name, width)
@@ -62,12 +62,12 @@ class Problem:
         if not cached.exists():
             self._make_reference(cached)
         self.reference = references.read(cached)
-        # The edges of emitters, a thousand times brighter than what is around them, would drown all other errors
+        # Exclude emitters: errors at their edges, a thousand times brighter than the surroundings, dominate otherwise
         shown = np.array(mi.render(self.scene, integrator=plugin("path", max_depth=1), spp=256, seed=0))
         self.lit = shown[..., :3].max(-1) == 0
 
     def _make_reference(self, file: Path) -> None:
-        """The mean of independent renders, and its standard error."""
+        """Write the mean of independent renders and its standard error."""
         batches, fine = references.Batches(), plugin("adaptivedirect", error=REFERENCE_ERROR, max_passes=30)
         for seed in range(1000, 1000 + REFERENCE_RENDERS):
             image = np.array(mi.render(self.scene, integrator=fine, spp=RAYS, seed=seed), np.float64)
@@ -76,18 +76,18 @@ class Problem:
         batches.write(file, {"integrator": "adaptivedirect", "error": REFERENCE_ERROR})
 
     def error(self, image) -> float:
-        """relMSE over pixels without emitters, the largest 0.1% left out and the reference's noise taken off."""
+        """relMSE over pixels without emitters, without the largest 0.1%, corrected for the reference's noise."""
         known = self.reference
         parts = (x[self.lit][None] for x in (np.array(image, np.float64)[..., :3], known.image, known.standard_error))
         return compare(*parts)["relmse_trimmed"]
 
     def race(self, ours: str, methods: dict) -> dict:
-        """Render with {label: (plugin, its properties, samples)}: ``ours`` now and then, and at the end.
+        """Render with {label: (plugin, properties, samples)}; runs of ``ours`` are interleaved and come last.
 
-        Returns {label: (median of the seconds, mean relMSE, mean rays per pixel)}.
+        Returns {label: (median seconds, mean relMSE, mean rays per pixel)}.
         """
         for kind, more, samples in methods.values():
-            # The kernels of Mitsuba's integrators contain the number of samples
+            # Kernels of Mitsuba's integrators depend on the number of samples
             few = samples if kind in ("direct", "path") else 2
             usual = plugin(kind, **{k: v for k, v in more.items() if k != "error"})
             with method(kind):
@@ -111,12 +111,12 @@ class Problem:
 
 
 def plugin(name: str, **more):
-    """An integrator for direct light."""
+    """Integrator for direct light."""
     return mi.load_dict({"type": name.split(",")[0], **more})
 
 
 def method(name: str):
-    """Context in which the plugin of that name renders by the method that is meant."""
+    """Context in which the plugin of this name renders by the intended method."""
     return as_printed() if name == PRINTED else nullcontext()
 
 

@@ -2,16 +2,16 @@
 
     ./run -- python benchmarks/baselines.py [--scenes NAME ...] [--parts curve samples slices growth memory]
 
-curve    the error of all against the sum of all lights as their parameter goes on, with 1 and 9 samples a pixel.
-samples  16 samples a pixel: ``lightcuts`` at 1% on every sample, and the others with the parameter that gives the same
-         mean absolute error of pixels, found by trying; where none does, with what comes nearest.
-slices   the same for ``lightslice`` with 1 sample a pixel, four times as wide: as many gather points.
-growth   ``mdlightcuts`` at one ``error`` with 1, 4, 16 and 64 samples a pixel.
+curve    errors against the sum of all lights for a range of quality parameters, with 1 and 9 samples per pixel.
+samples  16 samples per pixel: ``lightcuts`` at 1% on every sample, and the further methods with the parameter of equal
+         mean absolute pixel error, found by search (the closest one if none matches).
+slices   the same for ``lightslice`` with 1 sample per pixel at four times the width: an equal number of gather points.
+growth   ``mdlightcuts`` at a fixed ``error`` with 1, 4, 16 and 64 samples per pixel.
 memory   peak memory of ``lightslice`` at 1600×1200 with 600,000 VPLs and 800 columns, above that of the loaded scene.
 
-Errors are those of whole pixels, against the sum of all lights at all samples of a random subset of them. Same lights,
-same gather points, warm, 256 wide; times are medians of three interleaved runs of what a method does after lights,
-their trees and gather points are there, which all methods share ("shared"); those of part curve are second runs.
+Errors are pixel errors against the sum of all lights at all samples of a random subset of pixels. Methods share lights
+and gather points; warm, 256 wide. Times are medians of three interleaved runs (curve: second runs) and start after the
+shared work ("shared"): lights, light trees and gather points.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from vpl.core.arrays import download, upload  # noqa: E402
 from vpl.transport.evaluation import sum_all_lights  # noqa: E402
 
 DEPTH, VPLS, RUNS = 6, 200_000, 3
-# How often, and how closely, the parameter that gives a wanted error is tried for
+# Maximum number of search steps for an error, and relative tolerance
 _TRIES, _NEAR = 5, 0.03
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Property that decides how good a method is, with a first guess and its limits; the error goes as about its
+    """Quality parameter of a method with a first guess and limits; the error is roughly proportional to its
     ``power``-th power."""
 
     name: str
@@ -51,11 +51,11 @@ class Quality:
     power: float
 
     def show(self, value: float) -> str:
-        """A value as tables show it."""
+        """Format a value for tables."""
         return f"{self.name} {value:.2g}" if self.name == "error" else f"{self.name} {value}"
 
     def rounded(self, value: float):
-        """A value within the limits, of the property's type."""
+        """Clip a value to the limits and convert it to the property's type."""
         value = min(max(value, self.least), self.most)
         return value if self.name == "error" else round(value)
 
@@ -69,8 +69,8 @@ QUALITY = {
 
 @dataclass
 class Found:
-    """One run: seconds of ``shade``; of pixels, relative to the image's mean: RMSE and mean absolute error; shadow rays
-    and clusters or pairs per pixel; what the method counted."""
+    """Result of a run: seconds of ``shade``; pixel RMSE and mean absolute error relative to the image mean; shadow rays
+    and clusters or pairs per pixel; stages and counters of the method."""
 
     seconds: float
     rmse: float
@@ -82,9 +82,9 @@ class Found:
 
 
 class Problem:
-    """Lights and gather points of a scene, and the exact light of as many of its pixels as have ``points`` samples.
+    """Lights and gather points of a scene, and exact radiance of a subset of pixels with ``points`` samples in total.
 
-    ``scene``: already loaded, or None for that of the name.
+    ``scene``: a loaded scene; by default the scene is loaded by its name.
     """
 
     def __init__(self, name: str, samples: int, width: int, points: int, max_depth: int = DEPTH, scene=None):
@@ -106,7 +106,7 @@ class Problem:
         self.mean = float((self._exact + direct).mean())
 
     def plugin(self, kind: str, **more):
-        """A plugin with the settings that all methods share."""
+        """Plugin with the settings shared by all methods."""
         return mi.load_dict({"type": kind, **self.settings, **more})
 
     def _rows_of(self, job):
@@ -114,14 +114,14 @@ class Problem:
         return job, rows, job.batch.select(upload(mi.UInt32, rows))
 
     def _of_pixels(self, job, rows, radiance) -> np.ndarray:
-        """Sum what some points add to the pixels that are compared, (pixels, 3)."""
+        """Sum the contributions of points to the compared pixels, (pixels, 3)."""
         place = self._place[download(job.ray)[rows] // self.samples]
         total = np.zeros((self._place.max() + 1, 3))
         np.add.at(total, place, radiance.astype(np.float64) * download(job.weight)[rows] / self.samples)
         return total
 
     def shade(self, plugin) -> Found:
-        """Shade all points with a plugin and compare the chosen pixels."""
+        """Shade all points with a plugin and compare the selected pixels."""
         shaded, seconds = scenes.timed(lambda: [plugin.shade(job) for job in self.prepared.jobs])
         values, rays, cut, stages, counts = 0, 0.0, 0.0, {}, {}
         for (job, rows, _), part in zip(self._chosen, shaded, strict=True):
@@ -136,10 +136,10 @@ class Problem:
         return Found(seconds, rmse / self.mean, absolute / self.mean, rays, cut, stages, counts)
 
     def quality_for(self, method: str, wanted: float, measure: str = "absolute", **more):
-        """The value of a method's parameter that came nearest to a mean absolute error, or to so many ``rays``, and the
-        run with it.
+        """Search the parameter of a method for a mean absolute error or a number of ``rays``; return the closest value
+        and its run.
 
-        ``more``: other properties.
+        ``more``: further properties.
         """
         quality = QUALITY[method]
         power = quality.power if measure == "absolute" else -np.sign(quality.power)
@@ -157,7 +157,7 @@ class Problem:
         return min(tried, key=lambda one: one[:2])[1:]
 
     def interleaved(self, plugins: dict) -> dict:
-        """The median run of each plugin; they take turns, warm."""
+        """Median run of each plugin, interleaved and warm."""
         runs: dict = {name: [] for name in plugins}
         for _ in range(RUNS):
             for name, plugin in plugins.items():
@@ -281,7 +281,7 @@ def memory(names, options) -> dict:
 
 
 def _render_large(name: str):
-    """(Peak memory after loading, peak memory after rendering, both in KiB, seconds)."""
+    """(peak memory after loading, peak memory after rendering, both in KiB, seconds)"""
     scene = mi.load_file(str(scenes.scene_file(name)), resx=1600, resy=1200)
     plugin = mi.load_dict({"type": "lightslice", "max_depth": DEPTH, "vpl_count": 600_000, "columns": 800})
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,17 +1,17 @@
-"""IlluminationCut against ``lightcuts``, and against shadow rays alone: the tables of [IC] section 4 for our scenes.
+"""IlluminationCut against ``lightcuts`` and against shadow rays alone: the tables of [IC] section 4 for our scenes.
 
     ./run -- python benchmarks/illuminationcut.py [--scenes NAME ...] [--parts table tight samples lights rays public]
 
-table    [IC] table 1: ``lightcuts`` at 1%, and both forms of ``illuminationcut`` with the ``error`` that gives the same
-         RMSE, found by trying; same VPLs, same clamping, warm, 512 wide, 1 sample a pixel.
-tight    [IC] table 3: the same at the RMSE of ``lightcuts`` at 0.1%, without a limit to cuts.
-samples  [IC] table 6: the same with 9 samples a pixel.
+table    [IC] table 1: ``lightcuts`` at 1%, and both forms of ``illuminationcut`` with the ``error`` of equal RMSE,
+         found by search; same VPLs, same clamping, warm, 512 wide, 1 sample per pixel.
+tight    [IC] table 3: the same at the RMSE of ``lightcuts`` at 0.1%, with unlimited cuts.
+samples  [IC] table 6: the same with 9 samples per pixel.
 lights   [IC] figure 5 and table 5: render time from 50 k to 1.2 M VPLs, and peak memory at 1600×1200.
-rays     shadow rays per second of all of ``shade``, against the same rays traced alone in one batch.
-public   the settings of the public C++ code in the Cornell box, in CPU seconds of all threads.
+rays     shadow rays per second of ``shade``, against the same rays traced alone in a batch.
+public   settings of the public C++ code in the Cornell box, in CPU seconds of all threads.
 
-Errors are against the sum of all lights at a random subset of points.  Times are medians of three interleaved runs;
-"render" is what a method does after lights, their trees and gather points are there, which all methods share.
+Errors are relative to the sum of all lights at a random subset of points. Times are medians of three interleaved runs.
+"render" starts after the shared work: lights, light trees and gather points.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from vpl.transport.evaluation import sum_all_lights  # noqa: E402
 
 NAMES = (*scenes.NAMES, "glossy")
 DEPTH, VPLS, WIDTH, SUBSET, RUNS = 6, 200_000, 512, 4000, 3
-# How often, and how closely, the error that gives a wanted RMSE is tried for
+# Maximum number of search steps for an RMSE, and relative tolerance
 _TRIES, _NEAR = 4, 0.03
 
 
 @dataclass
 class Found:
-    """One render: seconds of ``shade``, and per pixel: normalised RMSE, relative L1, rays, bounds."""
+    """Result of a render: seconds of ``shade``; per pixel: normalised RMSE, relative L1, rays, bounds."""
 
     seconds: float
     rmse: float
@@ -59,7 +59,7 @@ class Found:
 
 
 class Problem:
-    """Lights, gather points and, at a random subset of points, the exact light of a scene."""
+    """Lights and gather points of a scene, and exact radiance at a random subset of points."""
 
     def __init__(self, name: str, samples: int = 1, **settings):
         self.settings = {"max_depth": DEPTH, "vpl_count": VPLS} | settings
@@ -78,7 +78,7 @@ class Problem:
             self.mean += float((exact + direct).mean()) * job.batch.count / self.points
 
     def plugin(self, kind: str, **more):
-        """A plugin with the settings that all methods share."""
+        """Plugin with the settings shared by all methods."""
         return mi.load_dict({"type": kind, **self.settings, **more})
 
     def shade(self, plugin) -> Found:
@@ -99,19 +99,19 @@ class Problem:
         return Found(seconds, rmse, absolute / self.mean, rays / self.points, bounds / self.points, stages)
 
     def error_for(self, rmse: float, error: float, **more) -> float:
-        """The ``error`` at which ``illuminationcut`` has a given RMSE, to some percent; ``error``: a first guess."""
+        """Search the ``error`` of ``illuminationcut`` for an RMSE, to a few percent; ``error``: first guess."""
         for _ in range(_TRIES):
             reached = self.shade(self.plugin("illuminationcut", error=error, **more)).rmse
             if abs(reached / rmse - 1) < _NEAR:
                 break
-            # The RMSE grows as about the 0.6th power of the error
+            # The RMSE is roughly proportional to the 0.6th power of the error
             error *= float(np.clip((rmse / reached) ** (1 / 0.6), 0.2, 5))
         return error
 
 
 def equal_quality(title: str, names, samples: int, lightcuts_error: float, **settings) -> dict:
     """Print the table of ``lightcuts`` and both forms of ``illuminationcut`` at its RMSE."""
-    print(f"\n## {title} (width {WIDTH}, {samples} sample(s) a pixel, {VPLS} VPLs, max_depth {DEPTH}, warm)")
+    print(f"\n## {title} (width {WIDTH}, {samples} sample(s) per pixel, {VPLS} VPLs, max_depth {DEPTH}, warm)")
     print("scene | method | error | preprocessing s | render s | rays/px | RMSE | relative L1 | bounds/px | speedup")
     speedups: dict = {"all": [], "adaptive": []}
     rows: dict = {}
@@ -168,7 +168,7 @@ def ray_rates(names) -> dict:
 
 
 def _seconds_alone(plugin, job, most: int = 1 << 22) -> float:
-    """Seconds per shadow ray, for some million of a job's pairs expanded and traced alone, light by light."""
+    """Seconds per shadow ray of some million expanded pairs of a job, traced alone, grouped by light kind."""
     clusters = PointClusters(job.batch)
     bound = dr.opaque(mi.Float, plugin.error * job.mean)
     seconds = count = 0.0
@@ -180,7 +180,7 @@ def _seconds_alone(plugin, job, most: int = 1 << 22) -> float:
             continue
         pairs = Pairs.join(found)
         points = download(pairs.points)
-        # A random part of the pairs, in the order in which their points lie along the tree
+        # A random subset of the pairs, with points in the order of the point tree
         chosen = np.random.default_rng(0).permutation(len(points))
         chosen = chosen[: np.searchsorted(np.cumsum(clusters.tree.count[points[chosen]], dtype=np.int64), most)]
         chosen = chosen[np.argsort(clusters.tree.first[points[chosen]], kind="stable")]
@@ -223,7 +223,7 @@ def many_lights(names) -> dict:
                 visibility: {"seconds": one} for visibility, one in zip(("all", "adaptive"), seconds, strict=True)
             }
             print(f"{name} | {count} | {tree:.2f} | {seconds[0]:.2f} | {seconds[1]:.2f}", flush=True)
-    print("\n## peak memory above the scene, 1600×1200, 1.2 M VPLs, 1 sample a pixel")
+    print("\n## peak memory above the scene, 1600×1200, 1.2 M VPLs, 1 sample per pixel")
     for name in names:
         command = [sys.executable, __file__, "--memory-of", name]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -234,7 +234,7 @@ def many_lights(names) -> dict:
 
 
 def memory_of(name: str) -> None:
-    """Print the growth of this process's peak memory while it renders a large image with many lights."""
+    """Print the growth of this process's peak memory during the render of a large image with many lights."""
     scene = mi.load_file(str(scenes.scene_file(name)), resx=1600, resy=1200)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for visibility in ("all", "adaptive"):
@@ -256,7 +256,7 @@ def public_settings() -> dict:
         "illuminationcut": ("illuminationcut", {"visibility": "all"}, (27, 0.0057)),
         "illuminationcut, adaptive": ("illuminationcut", {"visibility": "adaptive"}, (20.5, 0.0057)),
     }
-    # Of the distance between so many lights, which is 0.0194, clamping takes the multiple that is 5% of the diagonal
+    # 5% of the diagonal is 8.94 times the mean distance between the lights, 0.0194, which is the unit of clamping
     settings = {"max_depth": 9, "direct": "vpl", "direct_count": 2048, "vpl_count": 47_000, "clamping": 8.94}
     problem = Problem("cornell", 1, **settings)
     measured = {}

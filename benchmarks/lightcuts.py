@@ -2,11 +2,11 @@
 
     ./run -- python benchmarks/lightcuts.py [--scenes NAME ...] [--parts brute rays cold path]
 
-brute  same VPLs, one run: time and error of ``lightcuts`` at 1% against plugin ``vpl``, whose sum is made for a fixed
-       random subset of points and its time scaled to all of them.
-rays   shadow rays per second of the whole cut evaluation, against the same rays traced alone in one batch.
-cold   first render in a fresh process with an empty kernel cache, against ``path``.
-path   ``lightcuts`` and ``mdlightcuts`` against ``path`` in equal time, by compare.py, with its report in output/path.
+brute  same VPLs, one run: time and error of ``lightcuts`` at 1% against plugin ``vpl``, evaluated at a fixed random
+       subset of points and extrapolated to the time of all points.
+rays   shadow rays per second of the whole cut evaluation, against the same rays traced alone in a batch.
+cold   first render in a new process with an empty kernel cache, against ``path``.
+path   ``lightcuts`` and ``mdlightcuts`` against ``path`` at equal time by compare.py, with a report in output/path.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from vpl.transport.contribution import contribution, shadow_ray  # noqa: E402
 from vpl.transport.evaluation import sum_all_lights  # noqa: E402
 
 DEPTH, VPLS, SUBSET = 6, 200_000, 4000
-# What summing over all lights takes too
+# Stages that the sum of all lights also needs
 COMMON_STAGES = (Stage.SCENE, Stage.GATHER, Stage.TRACE, Stage.DIRECT, Stage.PROBE)
 
 
 def lightcuts(**more):
-    """The plugin with the settings that all parts share."""
+    """Plugin with the settings shared by all parts."""
     return mi.load_dict({"type": "lightcuts", "max_depth": DEPTH, "vpl_count": VPLS, "error": 0.01, **more})
 
 
@@ -81,7 +81,7 @@ def brute_force(names) -> dict:
 
 
 def _error_and_brute_seconds(scene, plugin):
-    """Relative L1 of a cut render on a fixed random subset, and seconds of the sum of all lights for all points."""
+    """Relative L1 of ``lightcuts`` on a fixed random subset, and extrapolated seconds of the sum of all lights."""
     prepared = plugin.prepare(scene, *scenes.camera_rays(scene, 0))
     points = prepared.paths.points.count
     difference = total = seconds = 0.0
@@ -91,7 +91,7 @@ def _error_and_brute_seconds(scene, plugin):
         rows = np.sort(np.random.default_rng(number).choice(job.batch.count, min(share, job.batch.count), False))
         part = job.batch.select(upload(mi.UInt32, rows))
         few = job.batch.select(upload(mi.UInt32, rows[:16]))
-        sum_all_lights(job.transport, few)  # compiles the kernel
+        sum_all_lights(job.transport, few)  # warm-up: compiles the kernel
         (exact, _), spent = scenes.timed(lambda: sum_all_lights(job.transport, part))  # noqa: B023
         exact, direct = download(exact), download(job.direct)[rows]
         scale = job.batch.count / len(rows)
@@ -123,7 +123,7 @@ def ray_rates(names) -> dict:
 
 
 def _seconds_alone(plugin, job) -> float:
-    """Seconds per shadow ray of a job's cuts, traced alone in one batch."""
+    """Seconds per shadow ray of a job's cuts, traced alone in a batch."""
     threshold = dr.full(mi.Float, plugin.error * job.mean, job.batch.count)
     threshold, sizes, _ = limited_cuts(job.lights, job.batch, threshold, plugin.max_cut)
     seconds = count = 0.0

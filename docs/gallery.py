@@ -91,7 +91,7 @@ def rows(scene, introduced):
     lines = [titles, ["---"] * 3, pictures, cells]
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     without_budgets = scene | {"renders": [one | {"budget": None} for one in scene["renders"]]}
-    warnings = tables.doubts(without_budgets) + unequal_times(found)
+    warnings = tables.scene_warnings(without_budgets) + unequal_times(found)
     doubts = "".join(f"\n{sentence}\n" for sentence in warnings)
     return f"## {name}\n\n{introduced[name]}\n\n{table}\n{doubts}"
 
@@ -136,7 +136,7 @@ def main():
             convert(WORK / f"{name}.{label}.png", PICTURES / f"{name}.{label}.jpg")
     introduced = described()
     renders = [one for scene in results["scenes"] for one in scene["renders"]]
-    doubts = BUSY if tables.busy(renders, results["machine"]["cores"]) else ""
+    doubts = BUSY if tables.load_warnings(renders, results["machine"]["cores"]) else ""
     introduction = INTRODUCTION.format(seconds=options.seconds, width=WIDTH, doubts=doubts)
     PAGE.write_text("\n".join([introduction, *(rows(scene, introduced) for scene in results["scenes"])]))
     return 0

@@ -67,7 +67,7 @@ def test_check_lets_pass_what_is_better_than_it_can_tell():
     assert len(baseline.check(without(fake_results(5), *cheap), fake_results(5), 0.2)) == 4
     assert baseline.check(without(fake_results(100), *cheap), fake_results(5), 0.2) == []
     lines = baseline.check(without(fake_results(5), ("path", "spp=1"), ("path", "spp=4")), fake_results(5), 0.2)
-    assert lines and all(line.endswith("only known by bounds now") for line in lines)
+    assert lines and all(line.endswith("only bounds are known now") for line in lines)
 
 
 def test_check_refuses_what_cannot_be_compared(tmp_path):

@@ -85,17 +85,25 @@ def test_nothing_is_read_off_beyond_the_ends():
 def test_places_are_between_two_settings():
     """Half way in logarithmic axes; beyond the ends it is the setting there, or nothing."""
     curve = power_law("a")
-    assert curve.between(2, 0) == pytest.approx({"0": 0.5, "1": 0.5})
-    assert curve.between(4**-1.75, 1) == pytest.approx({"1": 0.25, "2": 0.75})
-    assert curve.between(4, 0) == {"1": 1.0} and curve.between(1 / 16, 1) == {"2": 1.0}
-    assert curve.between(17, 0) == {"2": 1.0} and curve.between(2, 1) == {"0": 1.0}
-    assert curve.between(0.9, 0) == curve.between(0.06, 1) == Curve("b", []).between(1, 0) == {}
+    assert curve.interpolation_weights(2, 0) == pytest.approx({"0": 0.5, "1": 0.5})
+    assert curve.interpolation_weights(4**-1.75, 1) == pytest.approx({"1": 0.25, "2": 0.75})
+    assert curve.interpolation_weights(4, 0) == {"1": 1.0} and curve.interpolation_weights(1 / 16, 1) == {"2": 1.0}
+    assert curve.interpolation_weights(17, 0) == {"2": 1.0} and curve.interpolation_weights(2, 1) == {"0": 1.0}
+    assert (
+        curve.interpolation_weights(0.9, 0)
+        == curve.interpolation_weights(0.06, 1)
+        == Curve("b", []).interpolation_weights(1, 0)
+        == {}
+    )
     beaten = Curve("c", [point("c", "1", 1, 0.5), point("c", "2", 2, 0.6), point("c", "3", 4, 0.125)])
-    assert beaten.between(2, 0) == pytest.approx({"1": 0.5, "3": 0.5})
+    assert beaten.interpolation_weights(2, 0) == pytest.approx({"1": 0.5, "3": 0.5})
     hidden = Curve("d", [point("d", "1", 1, 1.0), point("d", "2", 4, 0.25, noise=0.3), point("d", "3", 8, 0.5)])
-    assert hidden.between(0.5, 1) == hidden.between(20, 0) == {"2": 1.0} and hidden.between(0.29, 1) == {}
+    assert (
+        hidden.interpolation_weights(0.5, 1) == hidden.interpolation_weights(20, 0) == {"2": 1.0}
+        and hidden.interpolation_weights(0.29, 1) == {}
+    )
     alike = Curve("e", [point("e", "1", 16, 0.1, noise=0.3), point("e", "2", 2, 0.2, noise=0.3)])
-    assert alike.between(4, 0) == {"2": 1.0}
+    assert alike.interpolation_weights(4, 0) == {"2": 1.0}
 
 
 def test_what_the_noise_hides_is_in_no_curve():

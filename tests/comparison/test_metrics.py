@@ -76,7 +76,7 @@ def test_relative_l1_of_exact_images_is_hidden_by_the_noise():
     for _ in range(20):
         result = metrics.compare(truth, truth + random.normal(size=truth.shape) * 0.1, np.full(truth.shape, 0.1))
         assert "relative_l1" in result["below_noise"]
-        assert result["relative_l1"] < metrics.least("relative_l1", result["noise"])
+        assert result["relative_l1"] < metrics.detection_threshold("relative_l1", result["noise"])
     image = truth + random.normal(size=truth.shape) * 0.2
     assert metrics.compare(image, truth, np.full(truth.shape, 0.1))["below_noise"] == []
 

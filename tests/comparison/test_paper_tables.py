@@ -86,7 +86,7 @@ def test_visibility_tells_both_methods_of_illuminationcut():
     assert [one["method"] for one in found["published"]] == ["LC(1%)", "IC(1.5%)", "IC-S(1%)"]
 
 
-# --- Runs as they are ---
+# --- Runs without interpolation ---
 
 
 def test_plain_runs_are_means_with_ratios_to_the_first():
@@ -103,7 +103,7 @@ def test_plain_runs_are_means_with_ratios_to_the_first():
     assert values(found, "illuminationcut", "speed_up") == [3.0]
     assert values(found, "illuminationcut", "rays") == [None]
     (shown, _) = paper_tables.shown({"paper_tables": paper_tables.make([*lightcuts, faster])})
-    assert "Runs as they are" in shown["reading"] and "ratios are not at equal error" in shown["reading"]
+    assert "Single settings, means" in shown["reading"] and "ratios are not at equal error" in shown["reading"]
     assert shown["rows"][1] == ["illuminationcut", "2", "2", "n/a", "20", "n/a", "0.1", "10.00%", "3"]
 
 

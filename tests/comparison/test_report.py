@@ -76,7 +76,7 @@ def test_a_reference_that_hides_an_error_is_reported(tmp_path, capsys, monkeypat
     few = [CORNELL, "-i", "path", "--width", "16", "--spp", "1", "-o", str(tmp_path), "--cache", str(tmp_path)]
     assert compare.main([*few, "-r", "path:auto", "--reference-limit", "64"]) == 0
     assert results_of(tmp_path)["scenes"][0]["reference_share"] is None
-    assert "its noise being larger than an error" in capsys.readouterr().out
+    assert "with noise larger than an error" in capsys.readouterr().out
 
 
 def test_references_that_are_no_use_lose_nothing_else(tmp_path, capsys):
@@ -122,7 +122,7 @@ def test_table_and_curves_agree_on_what_the_noise_hides():
             for seed, error in enumerate(errors)
         ]  # fmt: skip
         (row,) = tables.rows({"renders": renders} | analysis.analyse(renders, ["a"], metric))
-        ((_, (point,)), _) = analysis.points(renders, metric)
+        ((_, (point,)), _) = analysis.points_by_cost(renders, metric)
         assert (row[tables.COLUMNS.index("95%")] == "") == (point.mean() is None)
         return row, point
 
@@ -192,7 +192,7 @@ def test_errors_that_the_noise_hides_are_named():
         for cost in analysis.COSTS for label in "abc"
     ]  # fmt: skip
     (warning,) = tables.warnings({"renders": [], "points": points}, cores=2)
-    assert "hides the error of a spp=4, c spp=4:" in warning
+    assert "hides the error of a spp=4, c spp=4; use" in warning
 
 
 def test_a_busy_machine_is_named():
@@ -209,7 +209,7 @@ def test_errors_at_one_setting_each_are_bars():
             (of_budget("a", 3.0)[0], 0.1, 0.0), (of_budget("b", 4.0)[0], 0.02, 0.05), (of_budget("c", 5.0)[0], 0.0, 0.0)
         )
     ]  # fmt: skip
-    ((_, of), _) = analysis.points(renders, "relmse")
+    ((_, of), _) = analysis.points_by_cost(renders, "relmse")
     svg = plots.error_bars(of, ["a", "b", "c"], "relmse")
     texts = re.findall(r"<text[^>]*>([^<]*)</text>", svg)
     assert {"a", "b", "c", "0.1, 3 s", "&lt; 0.05, 4 s"} <= set(texts)
@@ -224,7 +224,7 @@ def test_page_begins_with_the_verdict(swept):
     places = [page.index(text) for text in (f'<p class="headline">{first}', '<table class="summary">', "<h2>cornell")]
     assert places == sorted(places)
     for scene in results["scenes"]:
-        for warning in tables.doubts(scene):
+        for warning in tables.scene_warnings(scene):
             assert page.index(warning) < places[1]
     assert results["summary"]["base"] == "path" and list(results["summary"]["scenes"]["cornell"]) == [
         "path", "lightcuts", "vpl",

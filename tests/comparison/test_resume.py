@@ -61,7 +61,7 @@ def test_interruption_leaves_a_report_of_what_is_finished(tmp_path, signal_numbe
     process.send_signal(signal_number)
     output, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
-    assert errors == f"\ncompare: interrupted; what was finished is in {tmp_path}; --resume goes on\n"
+    assert errors == f"\ncompare: interrupted; finished runs are in {tmp_path}; --resume continues\n"
     results = json.loads((tmp_path / "results.json").read_text())
     jsonschema.validate(results, SCHEMA, jsonschema.Draft202012Validator)
     renders = results["scenes"][0]["renders"]

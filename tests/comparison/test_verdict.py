@@ -66,7 +66,7 @@ def test_what_the_noise_hides_is_a_bound():
     both = scene("box", run("path", "", 10.0, 0.01, noise=0.02), run("ours", "", 10.0, 0.01, noise=0.02))
     assert outcome(both)["error"] is None
     assert verdict.summarise([both], "relmse")["sentences"] == [
-        "How ours compares with path cannot be told from these runs."
+        "These runs do not determine the performance of ours relative to path."
     ]
 
 
@@ -91,8 +91,8 @@ def test_sentences_count_scenes_and_name_the_others():
     scenes = [curves(name, factor) for name, factor in (("a", 10), ("b", 10), ("c", 0.5), ("d", 1.02))]
     summary = verdict.summarise(scenes, "relmse")
     assert summary["sentences"] == [
-        "ours needs less time than path for the same error in 2 of 4 scenes: 37% of its time in the geometric mean. It "
-        "needs more in c (2×)."
+        "ours needs less time than path for the same error in 2 of 4 scenes (geometric mean: 37% of the time). It "
+        "needs more time in c (2×)."
     ]
     mean = summary["means"]["ours"]["time"]
     assert mean["value"] == pytest.approx((0.1 * 0.1 * 2 / 1.02) ** 0.25) and mean["scenes"] == 4
@@ -104,8 +104,8 @@ def test_scenes_without_an_answer_are_counted():
     failed = {"name": "broken", "renders": [], "error": "no such file"}
     (sentence,) = verdict.summarise([images("a", 0.02), images("b", 0.02), failed], "relmse")["sentences"]
     assert sentence == (
-        "ours needs less time than path for the same error in 2 of 3 scenes: about a fifth of its time in the "
-        "geometric mean over 2 of them."
+        "ours needs less time than path for the same error in 2 of 3 scenes (geometric mean over 2 scenes: about a "
+        "fifth of the time)."
     )
 
 
@@ -127,7 +127,7 @@ def test_nothing_is_said_without_runs():
 )  # fmt: skip
 def test_sizes_in_words(value, bound, text):
     ratio = {"value": value, "bound": bound, "low": None, "high": None, "extrapolated": False}
-    assert verdict.size(ratio) == text
+    assert verdict.in_words(ratio) == text
 
 
 @pytest.mark.parametrize(
