@@ -1,11 +1,11 @@
-"""Images of every plugin on three small scenes, kept to be compared with those of another version of the code.
+"""Images of every plugin on small scenes, saved for a comparison with another version of the code.
 
     python benchmarks/equal_images.py --save before.npz     in the checkout of one version
     python benchmarks/equal_images.py --against before.npz  in that of another
 
-For changes that must leave images as they are.  Two runs of one version differ by about 1e-6 of an image's mean,
-because sums over threads have no fixed order; what differs by more than ``TOLERANCE`` is printed, and the exit status
-is 1.
+For changes that must keep images.  Two runs of one version differ by about 1e-6 of an image's mean, because sums over
+threads have no fixed order.  Prints the largest difference of each image, and exits with 1 if one exceeds
+``TOLERANCE``.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = ("cornell", "glossy", "kitchen_windows")
+# Scenes of ``manylights`` besides, for its many emitters, and images that are large enough for its pilot
+SPLIT_SCENES = (*SCENES, "hall", "concourse", "veils")
+SPLIT_SIZE, SPLIT_SPP = "32", 16
 # Largest difference of a pixel, relative to the mean of the image
 TOLERANCE = 1e-5
 SETTINGS = {
@@ -47,6 +50,22 @@ def images() -> dict[str, np.ndarray]:
             image = mi.render(scene, integrator=mi.load_dict(plugin), spp=4, seed=1)
             found[f"{name}: {label}"] = np.array(image)
             print(f"{name}: {label}", file=sys.stderr, flush=True)
+    return found | split_images()
+
+
+def split_images() -> dict[str, np.ndarray]:
+    """Images of ``manylights`` with virtual lights wherever they can carry anything, and without, by name."""
+    from vpl.split.cost_model import CostModel
+
+    found = {}
+    for name in SPLIT_SCENES:
+        scene = mi.load_file(str(ROOT / "scenes" / f"{name}.xml"), resx=SPLIT_SIZE, resy=SPLIT_SIZE)
+        for lights in (True, False):
+            plugin = mi.load_dict({"type": "manylights", "max_depth": 6, "virtual_lights": lights})
+            plugin.cost_model = CostModel(pays_below=1e30, fewest_light_paths=4000)
+            label = f"{name}: manylights" + ("" if lights else ", traced")
+            found[label] = np.array(mi.render(scene, integrator=plugin, spp=SPLIT_SPP, seed=1))
+            print(label, file=sys.stderr, flush=True)
     return found
 
 

@@ -33,52 +33,52 @@ class ManyLightsIntegrator(GatheringIntegrator):
 
      {knobs}
 
-    The image of ``path``, with less noise in the same time: the mean over seeds is the same for the same ``max_depth``,
-    nothing is clamped and nothing left out.
+    The image of ``path`` with less variance in the same time.  The mean over seeds equals that of ``path`` for the same
+    ``max_depth``: nothing is clamped or left out.
 
-    **How.** Radiance that the camera's first surface x1 receives by way of a second one, x2, is split in two,
+    **Method.** Let x1 be the first surface that a camera path meets, x2 the next one, and f the BSDFs.  The radiance
+    that x1 receives from x2 is split in two parts,
 
     .. math:: f_1 f_2 = w F_1 F_2 + (f_1 f_2 - w F_1 F_2), \qquad w = 1 / (1 + c^2 \cos\theta_1 \cos\theta_2 / d^2).
 
-    F is the *floor* of a BSDF, its Lambertian part. The first term is left to virtual lights on the surfaces where
-    camera paths arrive, each with the irradiance that one path finds there. They are clustered in a light tree; those
+    F is the *minorant* of a BSDF, its Lambertian part.  Virtual lights carry the first part.  They lie on the surfaces
+    where camera paths arrive, each with the irradiance that one path finds there, and a light tree clusters them.  The
     gather vertices of a pixel that face the same way share one light cut, as in Multidimensional Lightcuts, with a
-    representative drawn anew for every pair. The second term is traced as by ``path``; most of its paths end at x2,
-    where little is left of them. w keeps lights from being bright spots in corners; c is a multiple of the distance
-    between lights. See :mod:`vpl.split`.
+    representative light drawn for every pair.  Paths trace the second part as ``path`` does; most of them end at x2,
+    where little is left.  w prevents bright spots in corners; c is a multiple of the distance between lights.  See
+    :mod:`vpl.split`.
 
-    **Many emitters.** Where there are 64 or more, all of them with a constant radiance, what a surface receives from
-    emitters directly is split as well, if that pays: point and spot emitters are virtual lights themselves, with w = 1,
-    and area emitters have points that are. A cut of a hundred lights stands for all, where ``path`` draws one emitter.
-    Light of environments, directional emitters, and meshes whose vertices have other normals than their surface is
+    **Many emitters.** In scenes of 64 emitters or more, each with a constant radiance, the direct light of x1 is split
+    as well, if that pays.  Point and spot emitters are virtual lights themselves, with w = 1; area emitters get virtual
+    lights on random points.  One cut of a hundred lights then stands for all emitters, where ``path`` draws one
+    emitter.  Environments, directional emitters, and meshes with vertex normals other than their geometric normals are
     traced.
 
-    **Chooses by itself.** A pilot of some ten thousand paths tells where lights are wanted, how many, at how many of a
-    pixel's samples, and whether they pay: where they would take little of the noise away, or the image has few samples,
-    there are none, and what is left is ``path`` with well spread samples. What was chosen is in ``statistics``, in the
-    log (level Info) and in files that the command writes. The same seed chooses the same.
+    **Decisions.** A pilot of some ten thousand paths decides whether virtual lights pay, how many there are, where they
+    lie, and how many samples of a pixel they light.  Without lights, ``manylights`` is ``path`` with stratified
+    samples.  The decision is in ``statistics``, in the log (level Info) and in the files that the command writes.  It
+    depends on the seed and not on the clock.
 
-    **Kept lights.** With ``keep_lights`` the frames of a camera that moves, or several sensors, share their lights and
-    the tree over them, each seed its own, as far as these are two million. Every frame still has the mean of ``path``,
-    and a pilot of its own; lights that stand for emitters are made anew. It costs quality: lights are aimed at what the
-    first camera saw, so that what others see has fewer of them and more noise, and the noise of lights is the same in
-    all frames: it stands still where it would flicker, and does not average out over them. Whether the scene is still
-    the same is asked before each pass: of every object but sensors and the integrator, all that Mitsuba prints of it
-    and the values of all parameters are compared (by hashes, 10 to 40 ms in most scenes); where anything differs,
-    lights are made anew. To change what Mitsuba neither prints nor lists as a parameter, such as how a texture is
-    filtered, takes a scene that is loaded anew: give it an integrator of its own.
+    **Kept lights.** With ``keep_lights``, the frames of a moving camera or several sensors share the virtual lights of
+    a seed and their tree, up to two million lights.  Each frame keeps the mean of ``path`` and has a pilot of its own;
+    lights that stand for emitters are made for each frame.  The price is quality.  The lights lie where the first
+    camera looked, so other cameras have fewer lights and more variance.  All frames share the error of the lights,
+    which neither flickers nor averages out.  Before each pass, the plugin compares hashes of all that Mitsuba prints of
+    the scene's objects and of all parameters, without sensors and integrator (10 to 40 ms in most scenes), and makes
+    new lights if anything differs.  A change that Mitsuba neither prints nor lists as a parameter, such as the filter
+    of a texture, needs a new scene and a new integrator.
 
-    - Values of single pixels may be negative while samples are few: what is traced is a difference.
-    - Samplers: where a sample lies in its pixel, on the lens and in time is left to the sensor's sampler; what emitters
-      and directions it chooses at surfaces that scatter is spread by the plugin. With ``multijitter`` instead of
-      ``independent``, Mitsuba's default, there is 2% (bistro_interior), 8% (kitchen) or 23% (cornell) less variance.
-    - Masks: the image is that of ``prb``. ``path`` (Mitsuba 3.9.1) shows black for samples that have passed nothing but
-      masks when their paths end, and so is too dark where nothing is behind a mask; with ``hide_emitters`` it hides an
-      environment behind a mask by that, which is seen through it here. Alpha is that of ``path``.
-    - Surfaces only: a scene with a participating medium is refused.
-    - ``*_rgb`` and ``*_mono`` variants only. Not differentiable.
-    - Materials and emitters: all that ``path`` renders. Light that metals and surfaces with bump or normal maps send
-      on is traced, and so is what passes a mask or thin glass between x1 and x2.
+    - Single pixels may be negative while samples are few, because the traced part is a difference.
+    - Samplers: the sensor's sampler places samples in the pixel, on the lens and in time.  The plugin stratifies the
+      choice of emitters and directions.  ``multijitter`` instead of ``independent``, Mitsuba's default, reduces the
+      variance by 2% (bistro_interior), 8% (kitchen) or 23% (cornell).
+    - Masks: the image is that of ``prb``.  ``path`` (Mitsuba 3.9.1) shows black for samples whose path ends after it
+      passed only masks, so it is too dark where nothing is behind a mask.  With ``hide_emitters``, ``path`` hides an
+      environment behind a mask, which ``manylights`` shows.  Alpha is that of ``path``.
+    - Surfaces only: the plugin refuses a scene with a participating medium.
+    - ``*_rgb`` and ``*_mono`` variants only.  Not differentiable, and no recording by ``dr.freeze``.
+    - Materials and emitters: all that ``path`` renders.  Virtual lights do not carry light that metals or surfaces with
+      bump or normal maps reflect, nor light that passes a mask or thin glass between x1 and x2: paths trace it.
 
     .. tabs::
         .. code-tab:: xml
@@ -96,13 +96,13 @@ class ManyLightsIntegrator(GatheringIntegrator):
     knobs = (
         Boolean(
             "virtual_lights", True,
-            "Whether virtual lights may carry indirect light, and that of many emitters, where they pay. Without them "
-            "all of it is traced.",
+            "Whether virtual lights may carry indirect light and the light of many emitters, where they pay. Otherwise "
+            "paths trace all light.",
         ),
         Boolean(
             "keep_lights", False,
-            "Whether the virtual lights of a seed are kept for the next image of it, by the same integrator, as long "
-            "as the scene stays as it is but for its sensors.",
+            "Whether the integrator keeps the virtual lights of a seed for its next image with that seed, while only "
+            "the sensors of the scene change.",
         ),
     )  # fmt: skip
 

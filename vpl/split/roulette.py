@@ -34,7 +34,7 @@ class OutgoingRadiance:
     """Radiance that surfaces send back to paths, learned from a pilot without regard to direction.
 
     ``cells``; ``radiance``: root mean square of each cell, mean over channels; ``known``: whether anything was learned;
-    ``least_survival``: see :class:`vpl.split.cost_model.CostModel`.  All opaque, so that one kernel serves all values.
+    ``least_survival``: see :class:`vpl.split.cost_model.CostModel`.  Opaque arrays, so that Dr.Jit compiles one kernel.
     """
 
     cells: SpatialCells

@@ -1,0 +1,122 @@
+"""Integrators that compete on a scene: passes of equal time, or images that end by time."""
+
+from __future__ import annotations
+
+import gc
+import re
+from contextlib import contextmanager
+from dataclasses import replace
+from unittest import mock
+
+import mitsuba as mi
+import numpy as np
+
+from benchmarks import scenes
+from comparison.render import render
+from vpl.split import estimator
+
+KINDS, SAMPLERS = ("path", "manylights"), ("independent", "multijitter")
+# Fraction of the pixels with the largest errors that averages leave out
+DEPTH, TRIMMED = 6, 0.001
+# Largest number of samples of a pass: bounds memory
+LARGEST_PASS = 1 << 24
+
+
+def load(name: str, width: int):
+    """Load a scene with a sensor for each of SAMPLERS.
+
+    A single scene, because kernels hold the code of all scenes that are alive.
+    """
+    gc.collect()
+    file = scenes.scene_file(name)
+    mi.file_resolver().prepend(str(file.parent))
+    text = file.read_text()
+    sensor = re.search(r"<sensor.*?</sensor>", text, re.DOTALL).group()
+    other = sensor.replace('<sampler type="independent"', f'<sampler type="{SAMPLERS[1]}"')
+    # Identifiers must be unique
+    other = re.sub(r' id="[^"]*"', "", other)
+    text = text.replace(sensor, f"{sensor}\n{other}")
+    return mi.load_string(text, resx=str(width), resy=str(scenes.height(name, width)))
+
+
+@contextmanager
+def light_paths_times(factor: float):
+    """While the block runs, ``manylights`` traces ``factor`` times the light paths that it chooses."""
+    choose = estimator.choose
+
+    def scaled(*arguments):
+        chosen = choose(*arguments)
+        return replace(chosen, light_paths=round(factor * chosen.light_paths))
+
+    with mock.patch.object(estimator, "choose", scaled):
+        yield
+
+
+class Rival:
+    """Passes of one integrator with one sampler on one scene, of about ``seconds`` each; ``light_paths``: factor on the
+    chosen number."""
+
+    def __init__(self, name: str, scene, kind: str, sampler: str, width: int, seconds: float, light_paths: float = 1):
+        self.kind, self.sampler, self.images, self.seconds, self.light_paths = kind, sampler, [], [], light_paths
+        self.scene, self.sensor = scene, SAMPLERS.index(sampler)
+        self.integrator = mi.load_dict({"type": kind, "max_depth": DEPTH})
+        # Two sizes separate the cost of samples from the fixed cost of a pass
+        most = int((LARGEST_PASS / (width * scenes.height(name, width))) ** 0.5)
+        side, times = min(8, most), []
+        for self.spp in (16, 16, side**2, side**2):
+            times.append(self.render(0)[1])
+        each = max(times[-1] - times[1], 0.1 * times[-1]) / max(side**2 - 16, 1)
+        wanted = side**2 + (seconds - times[-1]) / each
+        if sampler == "multijitter":
+            # Mitsuba rounds the samples of this sampler to squares
+            self.spp = min(max(round(max(wanted, 16) ** 0.5), 4), most) ** 2
+        else:
+            self.spp = min(max(round(wanted), 16), most**2)
+        self.render(0)
+
+    def render(self, seed: int):
+        """Render: (image, float64; seconds)."""
+        with light_paths_times(self.light_paths):
+            image, seconds = scenes.timed(
+                lambda: mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=self.spp, seed=seed)
+            )
+        return np.array(image, np.float64)[..., :3], seconds
+
+    def measure(self, seed: int) -> None:
+        """Render and keep one more pass."""
+        image, seconds = self.render(seed)
+        self.images.append(image)
+        self.seconds.append(seconds)
+
+    def product(self, scale: np.ndarray) -> float:
+        """Variance × seconds of a pass."""
+        error = np.var(self.images, axis=0, ddof=1) / scale
+        error = np.sort(error.mean(-1).ravel())
+        return error[: int(len(error) * (1 - TRIMMED))].mean() * float(np.median(self.seconds))
+
+    def mean(self) -> tuple[float, float]:
+        """Mean of the image over passes, and its standard error."""
+        means = [image.mean() for image in self.images]
+        return float(np.mean(means)), float(np.std(means, ddof=1) / np.sqrt(len(means)))
+
+
+class Timed(Rival):
+    """Images of one integrator on one scene that end by time."""
+
+    def __init__(self, scene, kind: str, seconds: float):
+        self.kind, self.images, self.seconds, self._wanted = kind, [], [], seconds
+        self._scene, self.integrator = scene, mi.load_dict({"type": kind, "max_depth": DEPTH})
+
+    def render(self, seed: int):
+        """Render: (image, float64; seconds)."""
+        # A render has a seed for each of its passes
+        image, took = render(self._scene, self.integrator, time=self._wanted, seed=1000 * seed)
+        self.spp = took.spp
+        return np.array(image, np.float64)[..., :3], took.seconds
+
+
+def measure_in_turn(rivals: list[Rival], passes: int) -> None:
+    """Measure ``passes`` more passes of each rival, in turn."""
+    for number in range(passes):
+        for rival in rivals:
+            rival.measure(100 + number)
