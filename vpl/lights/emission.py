@@ -1,7 +1,7 @@
-"""Rays that leave the emitters: the first edge of every light path.
+"""Emitter samplers: rays that leave the emitters, the first edge of every light path.
 
-Emitters are taken group by group (point and spot, area, directional, and each of the others by itself); every group
-gets paths in proportion to its power, and inside a group an emitter is chosen by power with stratified numbers.
+One sampler serves point and spot emitters, one area emitters, one directional emitters; the environment emitter and
+every further emitter have their own. Inside a sampler, stratified numbers choose an emitter in proportion to its power.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ from .virtual_lights import VirtualLights, spot_falloff
 
 
 def solid_angle_radiance(emitter, center, count: int = 4096) -> float:
-    """Integral of an emitter's radiance over all directions as seen from ``center``; mean over channels."""
+    """Integral of an emitter's radiance over all directions at ``center``, averaged over channels.
+
+    ``count``: number of samples.
+    """
     sampler = independent_sampler(0, count)
     reference = dr.zeros(mi.Interaction3f, count)
     reference.p = mi.Point3f(center)
@@ -28,7 +31,7 @@ def solid_angle_radiance(emitter, center, count: int = 4096) -> float:
 
 
 def other_power(emitter, bounding_sphere) -> float:
-    """Power of an emitter that only its own routines know, estimated from rays that it emits."""
+    """Power of any emitter, estimated by Mitsuba's sampling routines and averaged over channels."""
     if emitter.is_environment():
         return solid_angle_radiance(emitter, bounding_sphere.center) * np.pi * bounding_sphere.radius**2
     sampler = independent_sampler(0, 4096)
@@ -37,16 +40,16 @@ def other_power(emitter, bounding_sphere) -> float:
 
 
 def bounding_box(scene):
-    """The scene's box, with the shapes that Mitsuba 3.9.1 leaves out: rectangles that it merged have no box.
+    """Bounding box of the scene, including rectangles that Mitsuba 3.9.1 merged: merged rectangles have no valid box.
 
-    Raises a ValueError for a shape that was not merged and has no box either: its transformation is not finite.
+    Raises a ValueError for an unmerged shape without a valid box: its transformation is not finite.
     """
     box = scene.bbox()
     for shape in scene.shapes():
         if shape.is_mesh() and shape.vertex_count() and not shape.bbox().valid():
             vertices = parameters_of(shape, below=False).get("vertex_positions")
             if vertices is None:
-                raise ValueError(f'the shape "{shape.id()}" has no place in space: its size must be finite')
+                raise ValueError(f'the shape "{shape.id()}" has no bounding box: its size must be finite')
             vertices = np.asarray(vertices).reshape(-1, 3)
             box.expand(mi.ScalarPoint3f(vertices.min(0)))
             box.expand(mi.ScalarPoint3f(vertices.max(0)))
@@ -56,19 +59,19 @@ def bounding_box(scene):
 def bounding_sphere(scene):
     """Sphere around the scene's box.
 
-    Raises a ValueError for a scene whose size is not a finite number.
+    Raises a ValueError if the scene's size is not finite.
     """
     box = bounding_box(scene)
     sphere = box.bounding_sphere()
     if len(scene.shapes()) and not np.isfinite(float(sphere.radius)):
-        raise ValueError(f"the scene reaches from {box.min} to {box.max}: its size must be finite")
+        raise ValueError(f"the scene extends from {box.min} to {box.max}: its size must be finite")
     return sphere
 
 
 class OmniEmission:
     """Rays from point and spot emitters."""
 
-    # Whether no ray that is scattered by chance ever meets these emitters, so that only next-event estimation does
+    # Whether scattered rays never hit these emitters: only next-event estimation reaches them
     delta = True
 
     def __init__(self, points: VirtualLights, spots: VirtualLights):
@@ -96,7 +99,7 @@ class OmniEmission:
 
 
 class AreaEmission:
-    """Rays from area emitters: a point by area, a direction by the cosine."""
+    """Rays from area emitters, with a uniform position and a cosine-distributed direction."""
 
     delta = False
 
@@ -117,17 +120,18 @@ class AreaEmission:
 
 
 class ParallelRays:
-    """Rays in given directions through a scene: through its bounding sphere, evenly, or around the focus.
+    """Rays in given directions through the scene.
 
-    Half of those around a focus go through it, evenly; the other half pass by, as many of them in every octave of
-    distances from its middle, because what light from there brings falls with the squared distance.
+    Without a focus, rays cross the bounding sphere uniformly. With a focus, half of them cross the focus uniformly. The
+    other half pass it, with equal numbers in every octave of the distance from its centre, because their contribution
+    at the focus falls with the squared distance.
     """
 
     def __init__(self, sphere, focus: Focus | None):
         self._sphere, self._focus = sphere, focus
 
     def through(self, direction, sample):
-        """(Ray in a direction, area that it stands for across the direction), by two uniform numbers."""
+        """(Ray in a direction, inverse density of the ray per perpendicular area), from two uniform numbers."""
         frame = mi.Frame3f(direction)
         if self._focus is None:
             disk = mi.warp.square_to_uniform_disk_concentric(sample)
@@ -145,7 +149,7 @@ class ParallelRays:
 
     @property
     def area(self) -> float:
-        """Area of the disk that the bounding sphere shows to all directions."""
+        """Cross-section of the bounding sphere."""
         return np.pi * float(self._sphere.radius) ** 2
 
 
@@ -171,10 +175,10 @@ class DirectionalEmission:
 
 
 class EnvironmentEmission:
-    """Rays from the environment: a direction by its own importance sampling, then parallel rays.
+    """Rays from the environment emitter: Mitsuba's importance sampling chooses a direction, then a parallel ray.
 
-    Not by its ``sample_ray``: for a rotated environment map (Mitsuba 3.9.1) the rays of that do not fill the disk that
-    the scene shows to them, and several times too much light enters by windows.
+    Mitsuba's ``sample_ray`` is not used: for a rotated environment map (Mitsuba 3.9.1) its rays do not cover the
+    scene's cross-section, and windows admit several times too much light.
     """
 
     delta = False
@@ -193,7 +197,7 @@ class EnvironmentEmission:
 
 
 class OtherEmission:
-    """Rays from one emitter, by its own sampling routine."""
+    """Rays from one emitter, drawn by Mitsuba's sampling routine."""
 
     def __init__(self, emitter, sphere):
         self._emitter = emitter
@@ -207,7 +211,7 @@ class OtherEmission:
 
 
 def emission_groups(scene, emitters: Emitters, focus: Focus | None = None) -> list:
-    """The groups of emitters that radiate at all; what comes from infinity is aimed at the ``focus``, if any."""
+    """Samplers of all emitters with positive power.  Light from infinity is aimed at the ``focus``, if any."""
     sphere = bounding_sphere(scene)
     rays = ParallelRays(sphere, focus)
     groups = []
