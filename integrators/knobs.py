@@ -86,6 +86,14 @@ class _Limited(Knob):
     minimum: float = field(kw_only=True)
     maximum: float = field(default=math.inf, kw_only=True)
 
+    noun: ClassVar[str]  # kind of number, for error messages
+
+    @property
+    def allowed(self) -> str:
+        if self.maximum == math.inf:
+            return f"{self.noun} of at least {self.minimum:g}"
+        return f"{self.noun} from {self.minimum:g} to {self.maximum:g}"
+
     def _stated_limits(self) -> str:
         return f"; at least {self.minimum:g}" + (f", at most {self.maximum:g}" if self.maximum < math.inf else "")
 
@@ -96,13 +104,7 @@ class _Limited(Knob):
 class Integer(_Limited):
     """Whole number."""
 
-    type = "int"
-
-    @property
-    def allowed(self):
-        if self.maximum == math.inf:
-            return f"an integer of at least {self.minimum}"
-        return f"an integer from {self.minimum} to {self.maximum}"
+    type, noun = "int", "an integer"
 
     def parse(self, value):
         whole = isinstance(value, int) and not isinstance(value, bool)
@@ -112,13 +114,7 @@ class Integer(_Limited):
 class Number(_Limited):
     """Finite number."""
 
-    type = "float"
-
-    @property
-    def allowed(self):
-        if self.maximum == math.inf:
-            return f"a number of at least {self.minimum:g}"
-        return f"a number from {self.minimum:g} to {self.maximum:g}"
+    type, noun = "float", "a number"
 
     def parse(self, value):
         numeric = isinstance(value, int | float) and not isinstance(value, bool)

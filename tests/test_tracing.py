@@ -11,7 +11,7 @@ import pytest
 from vpl.core.arrays import download, upload
 from vpl.core.sampling import Choice, derived_seed
 from vpl.lights import tracing
-from vpl.lights.emission import bounding_box, emission_groups
+from vpl.lights.emission import bounding_box, emitter_samplers
 from vpl.lights.emitters import read_emitters
 from vpl.lights.tracing import PathSettings, trace_lights
 
@@ -140,8 +140,8 @@ def test_emitted_power_and_directions_equal_mitsubas(name):
         where = np.concatenate([np.broadcast_to(part, (count, part.shape[1])) for part in parts], axis=1)
         return (weight[:, :, None] * where[:, None, :]).mean(0)
 
-    (group,) = emission_groups(scene, read_emitters(scene))
-    ours = moments(group.sample)
+    (emitter_sampler,) = emitter_samplers(scene, read_emitters(scene))
+    ours = moments(emitter_sampler.sample)
     expected = moments(lambda a, b, c: scene.emitters()[0].sample_ray(0.0, a, b, c))
     # Position is compared through its mean weighted by power; directional rays may start on another plane
     columns = [0, 4, 5, 6] if name in ("directional", "constant") else slice(None)
@@ -158,10 +158,10 @@ def test_rays_from_infinity_fill_the_disk_that_the_scene_shows_to_them(kind):
         "directional": {"type": "directional", "direction": [0.3, 0.1, -1]},
     }[kind]
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "center": [3, 1, 2]}, "sky": emitter})
-    (group,) = emission_groups(scene, read_emitters(scene))
+    (emitter_sampler,) = emitter_samplers(scene, read_emitters(scene))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, 50_000)
-    ray, _ = group.sample(sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
+    ray, _ = emitter_sampler.sample(sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
     sphere = scene.bbox().bounding_sphere()
     offset = download(ray.o) - np.array(sphere.center).reshape(3)
     direction, radius = download(ray.d), float(sphere.radius)

@@ -2,6 +2,8 @@
 
 One sampler serves point and spot emitters, one area emitters, one directional emitters; the environment emitter and
 every further emitter have their own. Inside a sampler, stratified numbers choose an emitter in proportion to its power.
+
+Emitter samplers have ``power``, (n,) float64, averaged over channels, ``delta``, and a method ``sample``.
 """
 
 from __future__ import annotations
@@ -68,7 +70,7 @@ def bounding_sphere(scene):
     return sphere
 
 
-class OmniEmission:
+class OmniSampler:
     """Rays from point and spot emitters."""
 
     # Whether scattered rays never hit these emitters: only next-event estimation reaches them
@@ -98,7 +100,7 @@ class OmniEmission:
         return ray, rgb_to_spectrum(intensity) / density
 
 
-class AreaEmission:
+class AreaSampler:
     """Rays from area emitters, with a uniform position and a cosine-distributed direction."""
 
     delta = False
@@ -153,7 +155,7 @@ class ParallelRays:
         return np.pi * float(self._sphere.radius) ** 2
 
 
-class DirectionalEmission:
+class DirectionalSampler:
     """Parallel rays from directional emitters."""
 
     delta = True
@@ -174,7 +176,7 @@ class DirectionalEmission:
         return ray, irradiance * area / self._choice.probability(row)
 
 
-class EnvironmentEmission:
+class EnvironmentSampler:
     """Rays from the environment emitter: Mitsuba's importance sampling chooses a direction, then a parallel ray.
 
     Mitsuba's ``sample_ray`` is not used: for a rotated environment map (Mitsuba 3.9.1) its rays do not cover the
@@ -196,7 +198,7 @@ class EnvironmentEmission:
         return ray, finite_or_zero(mi.unpolarized_spectrum(weight)) * area
 
 
-class OtherEmission:
+class OtherSampler:
     """Rays from one emitter, drawn by Mitsuba's sampling routine."""
 
     def __init__(self, emitter, sphere):
@@ -210,18 +212,18 @@ class OtherEmission:
         return mi.Ray3f(ray.o, ray.d), weight
 
 
-def emission_groups(scene, emitters: Emitters, focus: Focus | None = None) -> list:
+def emitter_samplers(scene, emitters: Emitters, focus: Focus | None = None) -> list:
     """Samplers of all emitters with positive power.  Light from infinity is aimed at the ``focus``, if any."""
     sphere = bounding_sphere(scene)
     rays = ParallelRays(sphere, focus)
-    groups = []
+    samplers = []
     if emitters.points.count + emitters.spots.count:
-        groups.append(OmniEmission(emitters.points, emitters.spots))
+        samplers.append(OmniSampler(emitters.points, emitters.spots))
     if emitters.area.power.sum() > 0:
-        groups.append(AreaEmission(emitters.area))
+        samplers.append(AreaSampler(emitters.area))
     if emitters.directional.count:
-        groups.append(DirectionalEmission(emitters.directional, rays))
-    groups += [OtherEmission(emitter, sphere) for _, emitter in emitters.others]
+        samplers.append(DirectionalSampler(emitters.directional, rays))
+    samplers += [OtherSampler(emitter, sphere) for _, emitter in emitters.others]
     if emitters.environment is not None:
-        groups.append(EnvironmentEmission(emitters.environment, sphere, rays))
-    return [group for group in groups if group.power.sum() > 0]
+        samplers.append(EnvironmentSampler(emitters.environment, sphere, rays))
+    return [sampler for sampler in samplers if sampler.power.sum() > 0]

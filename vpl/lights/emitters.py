@@ -170,7 +170,7 @@ def _can_be_sampled(shape) -> bool:
 
 
 def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
-    """Area emitters, the number of rows with invalid values, and shape-bound emitters of other classes."""
+    """(Area emitters, number of rows with invalid values, shape-bound emitters of further classes)."""
     indices, radiances, textured, spheres, unusual = [], [], [], [], []
     emitting = [(index, shape) for index, shape in registered_shapes(scene) if shape.is_emitter()]
     # Mitsuba loads shapes in parallel, in an order that changes from run to run; the same seed must give the same image
@@ -180,17 +180,8 @@ def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
         if emitter.class_name() != "AreaLight":
             unusual.append((emitter.class_name(), emitter))
             continue
-        if not _can_be_sampled(shape):
-            raise ValueError(
-                f'shape "{shape.id()}" ({shape.class_name()}): area emitters on this kind of shape are not '
-                f"supported, because Mitsuba cannot sample it; supported are meshes, {', '.join(SAMPLED_SHAPES)}"
-            )
         radiance = _constant_rgb(parameters_of(emitter), "radiance")
-        if radiance is None and "MeshAttribute[" in str(emitter):
-            raise ValueError(
-                f'shape "{shape.id()}" ({shape.class_name()}): the emitted radiance is a mesh attribute, which is '
-                "not supported; supported are a constant and an image"
-            )
+        _require_supported(shape, constant=radiance is not None)
         if radiance is None:
             textured.append((len(indices), emitter))
             radiance = _textured_radiance(emitter, shape)
@@ -201,19 +192,40 @@ def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
     bad = ~usable(radiance).all(1)
     radiance[bad] = 0
     shape_index = np.array(indices, np.uint32)
-    area, shapes = np.zeros(len(indices), np.float32), None
-    all_shapes = scene.shapes()
-    by_pointer = _SHAPES_BY_POINTER * len(indices) > len(all_shapes)
-    if len(indices) and by_pointer and all(_can_be_sampled(shape) for shape in all_shapes):
-        pointers = dr.reinterpret_array(mi.ShapePtr, upload(mi.UInt32, shape_index))
-        area = download(pointers.surface_area())
-    elif len(indices):
-        by_index = dict(emitting)
-        shapes = [by_index[index] for index in indices]
-        row = dr.arange(mi.UInt32, len(shapes))
-        area = download(dr.switch(row, [shape.surface_area for shape in shapes]))
+    by_index = dict(emitting)
+    area, shapes = _surface_areas(scene, shape_index, [by_index[index] for index in indices])
     rows = SphereRows(spheres) if any(spheres) else None
     return AreaEmitters(shape_index, radiance, area, textured, shapes, rows), int(bad.sum()), unusual
+
+
+def _require_supported(shape, constant: bool) -> None:
+    """Raise a ValueError for an area emitter on a shape that cannot be sampled, or with a mesh attribute as radiance.
+
+    ``constant``: whether the radiance is constant.
+    """
+    if not _can_be_sampled(shape):
+        raise ValueError(
+            f'shape "{shape.id()}" ({shape.class_name()}): area emitters on this kind of shape are not supported, '
+            f"because Mitsuba cannot sample it; supported are meshes, {', '.join(SAMPLED_SHAPES)}"
+        )
+    if not constant and "MeshAttribute[" in str(shape.emitter()):
+        raise ValueError(
+            f'shape "{shape.id()}" ({shape.class_name()}): the emitted radiance is a mesh attribute, which is not '
+            "supported; supported are a constant and an image"
+        )
+
+
+def _surface_areas(scene, shape_index: np.ndarray, shapes: list[mi.Shape]):
+    """(Areas of the emitting shapes, (n,) float32, ``shapes`` of :class:`AreaEmitters`)."""
+    if not shapes:
+        return np.zeros(0, np.float32), None
+    all_shapes = scene.shapes()
+    by_pointer = _SHAPES_BY_POINTER * len(shapes) > len(all_shapes)
+    if by_pointer and all(_can_be_sampled(shape) for shape in all_shapes):
+        pointers = dr.reinterpret_array(mi.ShapePtr, upload(mi.UInt32, shape_index))
+        return download(pointers.surface_area()), None
+    row = dr.arange(mi.UInt32, len(shapes))
+    return download(dr.switch(row, [shape.surface_area for shape in shapes])), shapes
 
 
 def _sorted_rows(rows: list, columns: int) -> np.ndarray:

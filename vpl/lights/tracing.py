@@ -25,19 +25,19 @@ import numpy as np
 from ..core.arrays import download, even_chunks, ones, select_record, spectrum_to_rgb
 from ..core.garbage import garbage_kept
 from ..core.sampling import derived_seed, independent_sampler, stratified
-from .emission import emission_groups
+from .emission import emitter_samplers
 from .emitters import Emitters
 from .focus import Focus
 from .perturbed import Perturbed, Scattered, scatter_perturbed
 from .virtual_lights import VirtualLights
 
-# Pilot paths of each group of emitters
+# Pilot paths of each emitter sampler
 _PILOT_PATHS = 4096
 # Light paths traced at a time
 _LARGEST_WAVEFRONT = 1 << 20
 # Upper bound of emitted paths per wanted light, for scenes in which few paths store a light
 _MOST_PATHS_PER_LIGHT = 16
-# Fraction of the lights divided equally between the groups of emitters
+# Fraction of the lights divided equally between the emitter samplers
 _DEFENSIVE_SHARE = 0.05
 # Fraction of effective lights below which a warning is logged
 _LEAST_EFFECTIVE = 0.02
@@ -144,15 +144,15 @@ def _bounce(scene, perturbed, settings: PathSettings, sampler, ray, throughput, 
     return light, onward, bad
 
 
-def _paths_of_group(walk: _Walk, group, first: int, count: int, total: int, seed: int):
-    """Trace the paths first .. first + count - 1 of the ``total`` paths of a group of emitters.
+def _trace_wavefront(walk: _Walk, emitter_sampler, first: int, count: int, total: int, seed: int):
+    """Trace the paths first .. first + count - 1 of the ``total`` paths of an emitter sampler.
 
     Mirrors, glass and masks end paths straight from a point, spot or directional emitter, because Mitsuba's ``path``
     does not count them.
     """
     sampler = independent_sampler(derived_seed(seed, 0), count)
     chosen = stratified(sampler, count, first, total)
-    ray, power = group.sample(chosen, sampler.next_2d(), sampler.next_2d())
+    ray, power = emitter_sampler.sample(chosen, sampler.next_2d(), sampler.next_2d())
     power = mi.unpolarized_spectrum(power) / dr.opaque(mi.Float, float(total))
     origin, direction, throughput = ray.o, ray.d, ones(count)
 
@@ -161,7 +161,7 @@ def _paths_of_group(walk: _Walk, group, first: int, count: int, total: int, seed
         sampler.seed(derived_seed(seed, depth), count)
         dr.make_opaque(origin, direction, throughput, power)  # otherwise every depth compiles its own kernel
         ray = mi.Ray3f(origin, direction)
-        refuses_delta = dr.opaque(mi.Bool, group.delta and depth == 1)
+        refuses_delta = dr.opaque(mi.Bool, emitter_sampler.delta and depth == 1)
         edges = dr.opaque(mi.UInt32, depth)
         stored, alive, bad = walk.bounce(sampler, ray, throughput, power, edges, refuses_delta)
         dropped += int(dr.count(bad)[0])
@@ -177,35 +177,35 @@ def _paths_of_group(walk: _Walk, group, first: int, count: int, total: int, seed
     return parts, dropped
 
 
-def _trace_group(walk: _Walk, group, number: int, paths: int, seed: int):
-    """Trace the ``paths`` of a group in wavefronts of at most _LARGEST_WAVEFRONT paths."""
+def _trace_paths(walk: _Walk, emitter_sampler, number: int, paths: int, seed: int):
+    """Trace the ``paths`` of an emitter sampler in wavefronts of at most _LARGEST_WAVEFRONT paths."""
     parts, dropped = [VirtualLights.of("oriented", [], [], [])], 0
     for first, last in even_chunks(paths, most=_LARGEST_WAVEFRONT):
         stream = derived_seed(seed, number, first)
-        new_parts, bad = _paths_of_group(walk, group, first, last - first, paths, stream)
+        new_parts, bad = _trace_wavefront(walk, emitter_sampler, first, last - first, paths, stream)
         parts += new_parts
         dropped += bad
     return VirtualLights.concatenate(parts), dropped
 
 
-def _shares(walk: _Walk, groups, count: int, seed: int) -> list[int]:
-    """Number of paths of each group, from a pilot pass whose lights are discarded.
+def _path_counts(walk: _Walk, samplers, count: int, seed: int) -> list[int]:
+    """Number of paths of each emitter sampler, from a pilot pass whose lights are discarded.
 
-    The number of a group's lights is proportional to the flux that its pilot stored, not to its power: an environment
+    The number of lights is proportional to the flux stored by the sampler's pilot, not to its power: an environment
     emitter around a closed building has nearly all the power and stores hardly any light.  A fraction _DEFENSIVE_SHARE
     is divided equally, in case a pilot missed flux.  Flux far from a focus has less weight.
     """
-    flux, lights_per_path = np.zeros(len(groups)), np.zeros(len(groups))
-    for number, group in enumerate(groups):
-        lights, _ = _trace_group(walk, group, number, _PILOT_PATHS, derived_seed(seed, 1))
+    flux, lights_per_path = np.zeros(len(samplers)), np.zeros(len(samplers))
+    for number, emitter_sampler in enumerate(samplers):
+        lights, _ = _trace_paths(walk, emitter_sampler, number, _PILOT_PATHS, derived_seed(seed, 1))
         lights, _ = lights.without_bad()
         flux[number] = _importance(walk, lights).sum()
         lights_per_path[number] = lights.count / _PILOT_PATHS
-    wanted = np.full(len(groups), count / len(groups))
+    wanted = np.full(len(samplers), count / len(samplers))
     if flux.sum() > 0:
-        wanted = count * ((1 - _DEFENSIVE_SHARE) * flux / flux.sum() + _DEFENSIVE_SHARE / len(groups))
+        wanted = count * ((1 - _DEFENSIVE_SHARE) * flux / flux.sum() + _DEFENSIVE_SHARE / len(samplers))
     paths = wanted / np.maximum(lights_per_path, 1 / _MOST_PATHS_PER_LIGHT)
-    return [max(round(share), 1) for share in paths]
+    return [max(round(number), 1) for number in paths]
 
 
 def _importance(walk: _Walk, lights: VirtualLights) -> np.ndarray:
@@ -241,15 +241,15 @@ def trace_lights(
     lights: the estimate is unbiased.  Depth of a light: edges of its path (1 for the first surface).  ``focus``:
     visible part of the scene, if small.
     """
-    groups = emission_groups(scene, emitters, focus)
+    samplers = emitter_samplers(scene, emitters, focus)
     traced = TracedLights(VirtualLights.of("oriented", [], [], []), 0, 0)
-    if not groups or settings.deepest < 1:
+    if not samplers or settings.deepest < 1:
         return traced
     walk = _Walk.of(scene, focus, settings)
-    shares = _shares(walk, groups, count, seed)
+    path_counts = _path_counts(walk, samplers, count, seed)
     parts = [traced.lights]
-    for number, (group, paths) in enumerate(zip(groups, shares, strict=True)):
-        lights, dropped = _trace_group(walk, group, number, paths, derived_seed(seed, 2))
+    for number, (emitter_sampler, paths) in enumerate(zip(samplers, path_counts, strict=True)):
+        lights, dropped = _trace_paths(walk, emitter_sampler, number, paths, derived_seed(seed, 2))
         parts.append(lights)
         traced.dropped += dropped
         traced.paths += paths
