@@ -72,7 +72,7 @@ class Scattered:
     stored: mi.Bool
     leaving: mi.UnpolarizedSpectrum
     normal: mi.Normal3f
-    facing: mi.Vector3f
+    facing: mi.Normal3f | mi.Vector3f
     goes_on: mi.Bool
     direction: mi.Vector3f
     following: mi.UnpolarizedSpectrum

@@ -113,6 +113,7 @@ def probe_materials(points: GatherPoints, traits: SceneTraits) -> MaterialProxy:
         level, top = dr.max(excess), dr.max(peak)
         wider = (level > 0) & (level < top) & (cosine > 0) & (cosine < 1)
         exponent = dr.select(wider, dr.minimum(exponent, dr.log(level / top) / dr.log(cosine)), exponent)
+        # The limits keep the scale finite; cosines of near probes are above 0.7
         scale = dr.select(level > top, dr.power(dr.maximum(cosine, 0.1), -dr.minimum(exponent, 100)), 1)
         peak = dr.maximum(peak, excess * scale)
         k += 1

@@ -178,8 +178,8 @@ class Receiver:
     """
 
     position: mi.Point3f
-    normal: mi.Normal3f
+    normal: mi.Normal3f | mi.Vector3f
     proxy: MaterialProxy
-    extent: mi.Vector3f | None = None
+    extent: mi.Point3f | None = None
     normal_cosine: mi.Float | None = None
     mirror_cosine: mi.Float | None = None
