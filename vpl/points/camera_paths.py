@@ -167,13 +167,13 @@ def emitted_towards(emitters: Emitters, si, active=True):
     return emission
 
 
-def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughput, depth, limits, skip, active):
+def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughput, depth, path_settings, skip, active):
     """One edge of the camera paths, evaluated in one kernel.
 
     ``skip``: None, or a function that intersects rays with non-emitting surfaces only (hidden emitters).  Returns
     emission, hit mask, (gather mask, surface interaction, weight), (mask, ray, throughput) of continuing paths.
     """
-    max_depth, rr_depth = limits
+    max_depth, rr_depth = path_settings
     if skip is None:
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 1, active=active)
     else:
@@ -220,7 +220,7 @@ def follow_camera_rays(
     ray.maxt += dr.zeros(mi.Float, count)
     lane = dr.arange(mi.UInt32, count)
     active = mi.Bool(active) & (lane < dr.opaque(mi.UInt32, count))
-    limits = (upload_limit(max_depth), dr.opaque(mi.UInt32, rr_depth))
+    path_settings = (upload_limit(max_depth), dr.opaque(mi.UInt32, rr_depth))
     throughput, depth = ones(count), 1
     found = None
     while True:
@@ -228,7 +228,7 @@ def follow_camera_rays(
         # Opaque: the waves of all depths share one kernel
         dr.make_opaque(ray, active, throughput, random)
         emitted, hit, gathered, going = _wave(
-            scene, emitters, traits, random, ray, throughput, dr.opaque(mi.UInt32, depth), limits, skip, active
+            scene, emitters, traits, random, ray, throughput, dr.opaque(mi.UInt32, depth), path_settings, skip, active
         )
         skip = None
         if found is None:
