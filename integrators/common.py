@@ -89,7 +89,7 @@ class Prepared(CameraPass):
     ``direct``: known radiance per gather point; ``jobs``: one per batch; ``counts``: statistics.
     """
 
-    direct: mi.UnpolarizedSpectrum = None
+    direct: mi.UnpolarizedSpectrum | None = None
     jobs: list[ShadeJob] = field(default_factory=list)
     counts: dict = field(default_factory=dict)
 
