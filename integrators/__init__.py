@@ -1,15 +1,15 @@
-"""Many-light integrators for Mitsuba 3: ``import manylights`` and use them like any other plugin.
+"""Many-light integrators for Mitsuba 3: ``import manylights`` registers them as Mitsuba plugins.
 
-``manylights`` renders the image of Mitsuba's ``path``, with less noise in the same time; the others are the methods of
-papers.
+``manylights`` renders the image of Mitsuba's ``path``, with less error in equal time.  The remaining plugins implement
+methods of papers.
 
-That imports this package, which registers them for the current variant, and again whenever ``mi.set_variant`` changes
-it; and it finds out whether another module of the same name is in the way.  They exist for the vectorised ``*_rgb`` and
-``*_mono`` variants; elsewhere loading one fails with an error that says so.
+``import manylights`` checks for another module named ``manylights``, then imports this package.  This package registers
+the plugins for the current variant, and again after every ``mi.set_variant``.  Supported are the vectorised ``*_rgb``
+and ``*_mono`` variants; any other variant raises an error when a plugin is loaded.
 
-Mitsuba 3.10 will do without the import: for each variant it imports or reloads the modules that the entry points of the
-group ``mitsuba`` name, in the order of their names, among all that call ``mi.set_variant``.  Ours are the plugins' own
-modules, each of which registers its plugin.  Whichever of the two is the last, all classes are of the variant then.
+Mitsuba 3.10 will not need the import: for every variant it imports or reloads the modules of the entry points in the
+group ``mitsuba``, in the order of their names.  Each plugin's module is an entry point and registers its plugin.  The
+order of this mechanism and of the callback below is irrelevant: after both, every class belongs to the variant.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from vpl.core.backend import check_backend, import_drjit
 
 import_drjit()
 
-import mitsuba as mi  # noqa: E402  (after the check that turns its import error into advice)
+import mitsuba as mi  # noqa: E402  (import_drjit explains import errors)
 
 PLUGINS = (
     "manylights",
@@ -47,7 +47,7 @@ VARIANTS = (
 
 
 def _register(_old: str | None, variant: str) -> None:
-    """Register all plugins for ``variant``; classes are made anew because their base class belongs to the variant."""
+    """Register the plugins for ``variant``: reload their modules, because the base class belongs to the variant."""
     if variant in VARIANTS:
         check_backend(variant)
     for name in ("gathering", "bands", "common", "direct", *PLUGINS):

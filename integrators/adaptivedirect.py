@@ -1,4 +1,4 @@
-"""Iterative adaptive sampling of direct light: shadow rays go where light was found to arrive."""
+"""Iterative adaptive sampling of direct light: learned probabilities direct shadow rays to visible emitters."""
 
 from __future__ import annotations
 
@@ -23,23 +23,30 @@ class AdaptiveDirectIntegrator(DirectLightIntegrator):
 
      {knobs}
 
-    Donikian et al. 2006, "Accurate direct illumination using iterative adaptive sampling" [IAS]. In passes, every pixel
-    samples clusters of emitters; what the samples of the pixel and of the 8 x 8 pixels around it found decides which
-    clusters the next pass samples, until the estimated error is below ``error``. It is for many emitters of which each
-    point sees a few: occlusion is learned instead of paid for again and again.
+    Donikian et al. 2006, "Accurate direct illumination using iterative adaptive sampling" [IAS]. Every pixel samples
+    clusters of emitters in passes. The results of the pixel and of its block of 8 x 8 pixels determine the
+    probabilities of the clusters in the next pass, until the estimated error is below ``error``. The method suits many
+    emitters with few visible from each point: occlusion is learned, and occluded emitters get few shadow rays.
 
-    {what direct light is estimated}
+    {direct estimate}
 
-    **Departures from the paper.** Probabilities start from the clusters' unoccluded contribution instead of uniform
-    ones, and statistics hold what samples found in relation to it; passes are combined by weights that do not depend on
-    what they found, which leaves no bias, instead of by their estimated variances; each half of a pixel's samples
-    decides whether the other half goes on, so that no pixel ends because it happened to look converged; dark pixels are
-    held to a fraction of the image's mean (``dark_floor``); emitter samples are combined with BSDF samples for glossy
-    surfaces and near emitters (``bsdf_share``); variances come from neighbouring strata; a sample takes the point of
-    any camera ray of its pixel, which costs no more than one point for each region of a pixel and is less noisy; faint
-    clusters may be coarse (``cluster_angle``). Cuts, groups and clusters differ in detail: see
-    :mod:`vpl.direct.cluster_cuts`, :mod:`vpl.direct.sites` and :mod:`vpl.direct.emitter_clusters`. A black pixel is
-    given up after three passes and 250 samples without light, as in the paper.
+    **Departures from the paper.**
+
+    - Initial probabilities are proportional to the clusters' unoccluded contribution, not uniform. Statistics store
+      results relative to the unoccluded contribution.
+    - The weights that combine passes are independent of the results, which avoids bias; the paper uses estimated
+      variances.
+    - Each half of a pixel's samples decides whether the second half continues, so that no pixel stops early by chance.
+    - Dark pixels need only reach the error at a fraction of the image's mean (``dark_floor``).
+    - BSDF samples complement emitter samples on glossy surfaces and near emitters (``bsdf_share``).
+    - Variances come from neighbouring strata.
+    - A sample uses the point of a random camera ray of its pixel, which costs no more than one point per region of a
+      pixel and has less variance.
+    - Clusters with small contribution may be coarse (``cluster_angle``).
+    - Cuts, groups and clusters differ in detail: see :mod:`vpl.direct.cluster_cuts`, :mod:`vpl.direct.sites` and
+      :mod:`vpl.direct.emitter_clusters`.
+
+    As in the paper, a black pixel ends after three passes and 250 samples without light.
 
     .. tabs::
         .. code-tab:: xml
@@ -57,18 +64,18 @@ class AdaptiveDirectIntegrator(DirectLightIntegrator):
     knobs = (
         Choice(
             "lights", DirectOptions.lights,
-            "``clusters``: clusters of emitters are sampled adaptively. ``all``: every emitter gets one shadow ray at "
-            "every point, again and again until the noise of those with an extent is low enough. ``auto``: for every "
-            "group of points the cheaper of both.",
+            "``clusters``: adaptive sampling of clusters of emitters. ``all``: one shadow ray from every point to "
+            "every emitter, repeated until the error due to emitters with an extent is below ``error``. ``auto``: the "
+            "cheaper of the two for every group of points.",
             words=("auto", "clusters", "all"),
         ),
         Number(
             "cluster_angle", DirectOptions.cluster_angle,
-            "Largest solid angle of a cluster as seen from a point, in steradians. Clusters whose unoccluded "
-            "contribution is less than 0.5% of the light may fill up to 0.3.",
+            "Largest solid angle of a cluster at a point, in steradians. Clusters with an unoccluded contribution "
+            "below 0.5% of the light may have up to 0.3 steradians.",
             minimum=0,
         ),
-        Integer("max_passes", DirectOptions.max_passes, "Most passes over a pixel.", minimum=1),
+        Integer("max_passes", DirectOptions.max_passes, "Largest number of passes over a pixel.", minimum=1),
     )  # fmt: skip
 
 

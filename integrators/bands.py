@@ -1,7 +1,7 @@
-"""Images rendered in bands of rows: memory that does not grow with the film, for methods that need a pixel whole.
+"""Rendering in bands of rows, with memory independent of the film's size, for methods with a stopping rule per pixel.
 
-Mitsuba divides large renders into passes of fewer samples a pixel.  A method that decides for each pixel when to stop
-would do so in every pass anew, so its images are divided by rows instead.
+Mitsuba divides large renders into passes with fewer samples per pixel.  A stopping rule per pixel would restart in
+every pass.  Bands of rows avoid this: they contain every sample of their pixels.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from vpl.core.sampling import derived_seed
 from vpl.direct.sites import BLOCK
 from vpl.points.camera_paths import PixelGrid
 
-# Camera rays of a band; some 300 bytes each
+# Largest number of camera rays in a band; a ray needs some 300 bytes
 LARGEST_BAND = 1 << 22
 
 
 def rows_of_a_band(film, samples: int) -> int:
-    """Rows that are rendered at a time, a multiple of the blocks' size where that many fit."""
+    """Rows of a band: a multiple of the block size, unless fewer rows than a block fit."""
     rows = max(1, LARGEST_BAND // ((int(film.crop_size()[0]) + 2 * _border(film)) * samples))
     return rows if rows < BLOCK else rows - rows % BLOCK
 
 
 def fits_one_band(film, samples: int) -> bool:
-    """Whether the whole image is no more than one band."""
+    """Whether the whole image fits in one band."""
     return int(film.crop_size()[1]) + 2 * _border(film) <= rows_of_a_band(film, samples)
 
 
@@ -33,7 +33,7 @@ def _border(film) -> int:
 
 
 def random_rays(sensor, seed: int, count: int):
-    """Sampler and camera rays all over the film."""
+    """(Sampler, ``count`` camera rays), uniformly distributed over the film."""
     sampler = sensor.sampler().clone()
     sampler.set_sample_count(1)
     sampler.set_samples_per_wavefront(1)
@@ -46,8 +46,8 @@ def random_rays(sensor, seed: int, count: int):
 def render_in_bands(integrator, scene, sensor, seed: int, samples: int, trace) -> None:
     """Render into the sensor's film.
 
-    ``trace(sampler, ray, grid, share)`` does what ``integrator.sample`` does; ``share``: of the rows that are left,
-    those of the band.
+    ``trace(sampler, ray, grid, fraction)`` returns the results of ``integrator.sample``; ``fraction``: rows of the band
+    over the remaining rows.
     """
     film = sensor.film()
     film.prepare(integrator.aov_names())
@@ -75,7 +75,7 @@ def render_in_bands(integrator, scene, sensor, seed: int, samples: int, trace) -
 
 
 def _camera_rays(sensor, film, sampler, pixel):
-    """One ray in each pixel: (rays, weights, where they belong on the film)."""
+    """One ray in each pixel: (rays, weights, film positions)."""
     position = mi.Vector2f(pixel) + sampler.next_2d()
     on_sensor = (position - mi.Vector2f(film.crop_offset())) / mi.Vector2f(film.crop_size())
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
@@ -83,11 +83,12 @@ def _camera_rays(sensor, film, sampler, pixel):
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     ray, weight = sensor.sample_ray_differential(time, 0.5, on_sensor, aperture)
-    # Box filters take the pixel's corner, so that rounding moves no sample to its neighbour
+    # With a box filter, the pixel's corner: rounding of a position could select the neighbouring pixel
     return ray, weight, mi.Point2f(pixel) if film.rfilter().is_box_filter() else mi.Point2f(position)
 
 
 def _put(block, film, position, radiance, valid, channels) -> None:
+    """Put samples into an image block, with the channels that the film stores."""
     alpha = dr.select(valid, mi.Float(1), mi.Float(0))
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         values = film.prepare_sample(radiance, mi.Spectrum(0), block.channel_count(), weight=mi.Float(1), alpha=alpha)

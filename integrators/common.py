@@ -1,4 +1,4 @@
-"""The base class of the integrators that use virtual point lights; the methods differ in one hook."""
+"""Base class of the integrators with virtual point lights; each method overrides ``shade``."""
 
 from __future__ import annotations
 
@@ -23,38 +23,38 @@ from vpl.transport.evaluation import Transport, mean_radiance
 from .gathering import CameraPass, GatheringIntegrator, whole_sum
 from .knobs import Choice, Fraction, Integer, Number, Words
 
-# Gather points by which is judged where the camera looks
+# Gather points that determine the visible part of the scene
 _PLACES = 1024
 AOVS = ("shadow_rays", "upper_bounds", "cut_size")
 AOVS_TEXT = "Comma-separated channels to return, per camera ray and from the same pass: {allowed}."
-# Of the methods that compare bounds with the radiance around them
+# For methods that compare error bounds with a radiance estimate
 DARK_FLOOR = Number(
     "dark_floor", 0.5,
-    "What is darker than this fraction of the image's mean is refined as if it had it; 0 holds the bound everywhere, "
-    "at several times the cost in dark corners.",
+    "Smallest radiance in the error threshold, as a fraction of the image's mean: darker points are refined as if they "
+    "had this radiance. 0 applies the relative bound everywhere, at several times the cost in dark corners.",
     minimum=0,
 )  # fmt: skip
 
 
 @dataclass
 class ShadeJob:
-    """Job of one ``shade`` call: a batch of gather points, and what is known of them.
+    """Input of one ``shade`` call.
 
-    ``transport``: the scene and its lights; ``batch``: the points; ``direct``: radiance per point that is known
-    already (direct light of extended emitters); ``mean``: an estimate of the mean radiance over all gather points of
-    the render and over channels; ``share``: the fraction of them that is in this batch; ``ray``: UInt32, the camera ray
-    of each point; ``weight``: what its radiance counts in that ray; ``grid``: how camera rays lie in the image;
-    ``stopped``: whether to give up early.
+    ``transport``: the scene and its lights; ``batch``: gather points; ``direct``: known radiance per point (direct
+    light of emitters with an extent); ``mean``: estimated mean radiance over the render's gather points and over
+    channels; ``share``: fraction of the gather points in this batch; ``ray``: camera ray of each point; ``weight``:
+    throughput of each point to the camera; ``grid``: layout of camera rays in the image; ``stopped``: whether to stop
+    early.
     """
 
     transport: Transport
     batch: Batch
-    direct: object
+    direct: mi.UnpolarizedSpectrum
     mean: float
     share: float
     seed: int
-    ray: object
-    weight: object
+    ray: mi.UInt32
+    weight: mi.UnpolarizedSpectrum
     grid: PixelGrid
     stopped: Callable[[], bool]
 
@@ -67,94 +67,94 @@ class ShadeJob:
 class ShadeResult:
     """Result of one ``shade`` call: radiance due to the lights, and counters, per point of the batch.
 
-    ``shadow_rays``, ``upper_bounds``, ``cut_size``: UInt32, or Float where several points share one; ``seconds``: time
-    by stage; ``phase_one``: radiance that a first phase assumed, where the method has one; ``dropped``: values left out
-    because they were not finite; ``counts``: numbers for the statistics, which are added up over batches.
+    ``shadow_rays``, ``upper_bounds``, ``cut_size``: UInt32, or Float if a count is divided between points; ``seconds``:
+    time by stage; ``phase_one``: radiance estimate of the first phase, for methods with two phases; ``dropped``: number
+    of omitted non-finite values; ``counts``: statistics, summed over batches.
     """
 
-    radiance: object
-    shadow_rays: object
-    upper_bounds: object
-    cut_size: object
-    seconds: dict = field(default_factory=dict)
-    phase_one: object = None
+    radiance: mi.UnpolarizedSpectrum
+    shadow_rays: mi.UInt32 | mi.Float
+    upper_bounds: mi.UInt32 | mi.Float | None
+    cut_size: mi.UInt32 | mi.Float
+    seconds: dict[str, float] = field(default_factory=dict)
+    phase_one: mi.Float | None = None
     dropped: int = 0
-    counts: dict = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass
 class Prepared(CameraPass):
-    """A render before its method has worked.
+    """Input of a method for one pass.
 
-    ``direct``: radiance per gather point; ``counts``: for statistics.
+    ``direct``: known radiance per gather point; ``jobs``: one per batch; ``counts``: statistics.
     """
 
-    direct: object = None
+    direct: mi.UnpolarizedSpectrum | None = None
     jobs: list[ShadeJob] = field(default_factory=list)
     counts: dict = field(default_factory=dict)
 
 
 class ManyLightIntegrator(GatheringIntegrator):
-    """Base class: makes lights and gather points, and asks ``shade`` for the rest."""
+    """Base class: generates lights and gather points, and calls ``shade`` for their radiance."""
 
     needs_trees = True
     offered_aovs = AOVS
     knobs = (
-        Integer("vpl_count", 200_000, "How many virtual point lights to aim for.", minimum=1),
+        Integer("vpl_count", 200_000, "Approximate number of virtual point lights.", minimum=1),
         Choice(
             "direct", "nee",
-            "Light that comes straight from emitters. ``nee``: area emitters and environments by emitter and BSDF "
-            "sampling with multiple importance sampling. ``vpl``: they become virtual lights, as in the papers. "
-            "``none``: left out. ``adaptive``: area emitters and environments by iterative adaptive sampling, as in "
-            "``adaptivedirect``. Point, spot and directional emitters are virtual lights already, exact and never "
-            "clamped, in all of these but ``none``.",
+            "Method for direct light. ``nee``: next-event estimation with multiple importance sampling for area "
+            "emitters and environments. ``adaptive``: iterative adaptive sampling for area emitters and environments, "
+            "see ``adaptivedirect``. ``vpl``: virtual lights on area emitters and environments, as in the papers. "
+            "``none``: no direct light. Except with ``none``, point, spot and directional emitters are virtual lights, "
+            "exact and never clamped.",
             words=("nee", "adaptive", "vpl", "none"),
         ),
         Integer(
             "emitter_samples", 16,
-            "Pairs of an emitter and a BSDF sample per gather point with ``direct=\"nee\"``. More of them cost little "
-            "beside virtual lights, and their noise is often most of what is left.",
+            "Pairs of an emitter and a BSDF sample per gather point with ``direct=\"nee\"``. Their cost is small "
+            "compared to virtual lights, and their variance is often the largest part of an image's.",
             minimum=1,
         ),
         Fraction(
             "direct_error", 0.05,
-            "Standard error of the direct light, relative to it, with ``direct=\"adaptive\"``.",
+            "Relative standard error of the direct light with ``direct=\"adaptive\"``.",
             minimum=1e-4,
         ),
         Integer(
             "direct_count", 4096,
-            "Virtual lights on area emitters, and as many for the environment, with ``direct=\"vpl\"``.",
+            "Number of virtual lights on area emitters, and again for the environment, with ``direct=\"vpl\"``.",
             minimum=1,
         ),
         Number(
             "clamping", 2.0,
-            "Smallest distance to a virtual light that stands for a surface, as a multiple of the typical distance "
-            "between such lights where the camera looks; light from nearer is dimmed instead of becoming a bright "
-            "spot. With more lights, less is cut off. 0 turns it off.",
+            "Smallest distance to a virtual light on a surface, as a multiple of the typical distance between these "
+            "lights in the visible part of the scene. The contribution of nearer lights is clamped, which prevents "
+            "bright spots and darkens corners; more lights reduce the loss. 0: no clamping.",
             minimum=0,
         ),
         Number(
             "lobe_limit", 1.0,
-            "A glossy lobe stores virtual lights where its density is at most this, per steradian, as though it were "
-            "diffuse (which has at most 1/pi); 0 stores the light of diffuse lobes only.",
+            "Largest density, per steradian, of a glossy lobe that stores virtual lights like a diffuse lobe (density "
+            "at most 1/pi). 0: only diffuse lobes store lights.",
             minimum=0,
         ),
         Words("aovs", "", AOVS_TEXT, words=offered_aovs),
     )  # fmt: skip
 
     def shade(self, job: ShadeJob) -> ShadeResult:
-        """Light of ``job.lights`` at the points of ``job.batch``: the one thing that a method defines."""
+        """Radiance due to ``job.lights`` at the points of ``job.batch``, by the method of the derived class."""
         raise NotImplementedError
 
     def light_options(self) -> LightOptions:
-        """The part of the properties that decides which lights are made."""
+        """Properties that determine the lights."""
         return LightOptions(
             self.vpl_count, self.direct_count, self.clamping, self.direct, self.max_depth, self.rr_depth,
             self.lobe_limit, self.needs_trees,
         )  # fmt: skip
 
     def prepare(self, scene, sampler, ray, active=True) -> Prepared:
-        """Everything before the method's own work: camera paths, lights, direct light, batches of gather points."""
+        """Camera paths, lights, direct light and batches of gather points: the input of ``shade``."""
         return self._prepare(scene, sampler, self.begin(scene, sampler, ray, active))
 
     def _prepare(self, scene, sampler, camera: CameraPass) -> Prepared:
@@ -182,14 +182,14 @@ class ManyLightIntegrator(GatheringIntegrator):
         return prepared
 
     def _nee(self, scene, camera: CameraPass, grid):
-        """Direct light of extended emitters by a fixed number of samples: (radiance, rays)."""
+        """Direct light of emitters with an extent, by a fixed number of samples: (radiance, shadow rays)."""
         return direct_light(
             scene, ExtendedEmitters(scene, camera.emitters), camera.traits, camera.paths.points, self.max_depth,
             self.emitter_samples, grid.samples, derived_seed(camera.seed, 30),
         )  # fmt: skip
 
     def _adaptive(self, scene, camera: CameraPass, grid):
-        """Direct light of extended emitters by adaptive sampling: (radiance, rays)."""
+        """Direct light of emitters with an extent, by adaptive sampling: (radiance, shadow rays)."""
         # Point, spot and directional emitters are virtual lights already
         sources = Sources(scene, camera.emitters.extended_only())
         options = DirectOptions(error=self.direct_error)
@@ -200,7 +200,7 @@ class ManyLightIntegrator(GatheringIntegrator):
         return found.radiance, whole_sum(found.shadow_rays)
 
     def light(self, scene, sampler, camera: CameraPass):
-        """Prepare, ask the method, and put its batches together."""
+        """Sum ``shade`` over the batches: (radiance, channels, statistics)."""
         prepared = self._prepare(scene, sampler, camera)
         radiance, totals = prepared.direct, {}
         for job in prepared.jobs:
@@ -220,7 +220,7 @@ class ManyLightIntegrator(GatheringIntegrator):
         return radiance, totals, found | {"lights": {}, "light_paths": 0, "emitter_rays": 0} | prepared.counts
 
     def _jobs(self, transport: Transport, prepared: Prepared, seed: int, grid: PixelGrid) -> list[ShadeJob]:
-        """One job per batch of gather points, each knowing the mean radiance over all of them."""
+        """One job per batch of gather points, with the estimated mean radiance over the batches."""
         points, jobs, mean = prepared.paths.points, [], 0.0
         prepared.clock.begin(Stage.PROBE)
         batches = make_batches(points, probe_materials(points, transport.traits))

@@ -1,4 +1,4 @@
-"""The base class of the integrators of direct light alone; they differ in what they choose for its core."""
+"""Base class of the integrators of direct light; derived classes choose the options of :mod:`vpl.direct.adaptive`."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from .bands import fits_one_band, random_rays, render_in_bands
 from .gathering import CameraPass, GatheringIntegrator, add_statistics, whole_sum
 from .knobs import Depth, Fraction, Integer, Number, Words, knobs_of
 
+# Camera rays that estimate the mean radiance of an image rendered in bands
 _LEVEL_RAYS = 4096
 
 
 @dataclass
 class Band:
-    """Band of rows, with what it knows of the image: how its pixels lie, the mean radiance, its share of the time."""
+    """Band of rows: pixel layout, the image's mean radiance (``level``), and the band's ``time`` in seconds."""
 
     grid: PixelGrid
     level: float
@@ -34,40 +35,45 @@ class Band:
 class DirectLightIntegrator(GatheringIntegrator):
     """Base class: lights gather points by :func:`vpl.direct.adaptive.light_directly`, large images in bands."""
 
-    along_curve = False  # the pixels' points stay together
+    along_curve = False  # the points of a pixel remain consecutive
     knobs = (
         Fraction(
             "error", DirectOptions.error,
-            "Standard error to reach in each pixel, as a fraction of its radiance: 0.03 is 3%.",
+            "Target standard error of each pixel, as a fraction of its radiance: 0.03 is 3%.",
             minimum=1e-4,
         ),
         Number(
             "dark_floor", DirectOptions.dark_floor,
-            "Pixels darker than this fraction of the image's mean are rendered about as precisely as if they had it.",
+            "Smallest radiance in the error threshold, as a fraction of the image's mean: darker pixels reach about "
+            "the absolute error of a pixel with this radiance.",
             minimum=0,
         ),
         Integer(
             "max_samples", DirectOptions.max_samples,
-            "Most emitter samples of a pixel; at least four are taken for each half of the estimate.",
+            "Largest number of emitter samples of a pixel; each half of the estimate has at least four.",
             minimum=1, maximum=100_000,
         ),
         Number(
             "bsdf_share", DirectOptions.bsdf_share,
-            "BSDF samples for each emitter sample, where surfaces are glossy or emitters near; 0 leaves them out, "
-            "which is noisy there and loses emitters behind glass.",
+            "BSDF samples per emitter sample, on glossy surfaces and near emitters. 0: none, which increases the "
+            "variance there and loses emitters behind glass.",
             minimum=0,
         ),
-        Number("time", DirectOptions.time, "Seconds after which to stop, at whatever error; 0 is no limit.", minimum=0),
+        Number(
+            "time", DirectOptions.time,
+            "Time limit in seconds, after which rendering stops at any error; 0 is no limit.",
+            minimum=0,
+        ),
         Depth(
             "max_depth", 2,
-            "Longest path from camera to emitter, in edges, as Mitsuba's ``path`` counts them: 1 shows emitters only, "
-            "2 adds direct light at the surfaces that the camera sees; more follows mirrors, glass and masks to the "
-            "surface behind them, whose direct light is shown. -1 is no limit.",
+            "Longest path from camera to emitter, in edges, as counted by Mitsuba's ``path``: 1 shows emitters only, 2 "
+            "adds direct light at directly visible surfaces. Larger values follow mirrors, glass and masks, and add "
+            "direct light at the surface behind. -1 is no limit.",
         ),
         Words(
             "aovs", "",
-            "Comma-separated channels to return, per camera ray: {allowed}. ``noise`` is the estimated standard error "
-            "relative to the radiance, ``visible`` the share of samples that found light.",
+            "Comma-separated channels to return, per camera ray: {allowed}. ``noise`` is the estimated relative "
+            "standard error, ``visible`` the fraction of samples with light.",
             words=FIELDS,
         ),
     )  # fmt: skip
@@ -77,15 +83,15 @@ class DirectLightIntegrator(GatheringIntegrator):
         self._in_base, self._band = False, None
 
     def options(self) -> DirectOptions:
-        """The knobs that the core takes, under their own names."""
-        taken = {field.name for field in fields(DirectOptions)}
-        names = [knob.name for knob in knobs_of(type(self)) if knob.name in taken]
+        """Options of :func:`vpl.direct.adaptive.light_directly`, from the knobs of the same names."""
+        known = {field.name for field in fields(DirectOptions)}
+        names = [knob.name for knob in knobs_of(type(self)) if knob.name in known]
         return DirectOptions(**{name: getattr(self, name) for name in names})
 
     def _render(self, scene, sensor, seed, spp, develop, evaluate):
-        """Render as Mitsuba does, but large images in bands of rows; see :mod:`integrators.bands`."""
+        """Render large images in bands of rows (:mod:`integrators.bands`), and small images by Mitsuba's ``render``."""
         samples = spp or sensor.sampler().sample_count()
-        # Mitsuba's `render` calls this method again
+        # Mitsuba's `render` calls this method recursively
         if self._in_base or self.samples_per_pass < samples or fits_one_band(sensor.film(), samples):
             self._in_base = True
             try:
@@ -97,11 +103,11 @@ class DirectLightIntegrator(GatheringIntegrator):
         return sensor.film().develop() if develop else mi.TensorXf()
 
     def _render_bands(self, scene, sensor, seed: int, samples: int) -> None:
-        """One level of brightness and one budget of time for all bands."""
+        """Render the bands with a common mean radiance and a common time limit."""
         level, start, totals = self._find_level(scene, sensor, derived_seed(seed, 1)), perf_counter(), {}
 
-        def trace(sampler, ray, grid, share):
-            left = max(self.time - (perf_counter() - start), 1e-3) * share if self.time > 0 else 0.0
+        def trace(sampler, ray, grid, fraction):
+            left = max(self.time - (perf_counter() - start), 1e-3) * fraction if self.time > 0 else 0.0
             self._band = Band(grid, level, left)
             try:
                 return self.sample(scene, sampler, ray)
@@ -113,7 +119,7 @@ class DirectLightIntegrator(GatheringIntegrator):
         self.statistics = totals
 
     def _find_level(self, scene, sensor, seed: int) -> float:
-        """Mean radiance of direct light over the film, from one pass at few points."""
+        """Mean radiance of direct light over the film, from one pass with _LEVEL_RAYS camera rays."""
         camera = self.begin(scene, *random_rays(sensor, seed, _LEVEL_RAYS))
         if camera.dark or self.max_depth < 2:
             return 0.0
@@ -129,7 +135,7 @@ class DirectLightIntegrator(GatheringIntegrator):
         return self._band.grid if self._band else super().pixel_grid(scene, sampler)
 
     def light(self, scene, sampler, camera: CameraPass):
-        """Direct light of all emitters; see :func:`vpl.direct.adaptive.light_directly`."""
+        """Direct light of every emitter by :func:`vpl.direct.adaptive.light_directly`."""
         points = camera.paths.points
         if camera.dark or self.max_depth < 2:
             return mi.UnpolarizedSpectrum(0), {}, {"shadow_rays": 0}

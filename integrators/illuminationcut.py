@@ -1,4 +1,4 @@
-"""IlluminationCut: clusters of gather points and clusters of lights, chosen together."""
+"""IlluminationCut: pairs of a cluster of gather points and a cluster of lights, by simultaneous refinement."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ from .gathering import Clock
 from .knobs import Choice, Fraction, Integer, Number, Words
 from .manual import manual_page
 
-# Pairs held before they are evaluated: bounds the memory whatever the image and the error
+# Pairs collected before evaluation: bounds the memory for any image and error
 _PAIRS_HELD = 1 << 23
-# One point in so many tells how large the cuts around it are
+# Stride of the points that test the size of light cuts
 _TRIED_STRIDE = 32
+# Default errors by ``visibility``: those of [IC] section 4
 _DEFAULT_ERROR = {"all": 0.015, "adaptive": 0.01}
 
 
@@ -41,25 +42,30 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
 
      {knobs}
 
-    Bus, Mustafa and Biri 2015, "IlluminationCut" [IC]. Like :ref:`lightcuts <integrator-lightcuts>`, but points are
-    clustered too: a tree over all gather points and the trees over the lights are descended together, until every pair
-    of a cluster of points and a cluster of lights has a bound of at most ``error`` times the radiance of its points
-    (eq. 4, Algorithm 1). Bounds are computed once for many points, and the shadow rays of a pair leave from one place
-    towards one light. A first, approximate image (Phase I) says how bright the points are.
+    Bus, Mustafa and Biri 2015, "IlluminationCut" [IC]. This method extends :ref:`lightcuts <integrator-lightcuts>` by
+    clusters of points: a tree over the gather points and the trees over the lights are descended simultaneously, until
+    every pair of a cluster of points and a cluster of lights has a bound of at most ``error`` times the least radiance
+    of its points (eq. 4, Algorithm 1). A bound is computed once for many points, and the shadow rays of a pair have
+    close origins and a common light. A first, approximate image (Phase I) estimates the radiance of the points.
 
     With ``visibility="adaptive"`` (Algorithm 2, "IlluminationCut-Sampling") a pair of 32 points or more is probed
-    with 8 or 16 rays. If all arrive, or none does, no more are traced; otherwise the pair is divided and its parts
-    are probed. An occluder that lies between the probes is missed: the result is biased at small shadows and where a
-    shadow's edge passes between probes, by amounts that the error bound does not cover.
+    with 8 or 16 shadow rays. If every probe is unoccluded, or every probe is occluded, the result counts for the whole
+    pair; otherwise the pair is divided and its parts are probed. An occluder between the probes is missed: the result
+    is biased at small shadows and at shadow edges between probes, by amounts that the error bound does not cover.
 
-    {what is estimated}
+    {estimate}
 
-    **Departures from the paper.** Order of refinement: see :mod:`vpl.cuts.product_cuts`. Tree of points: see
-    :mod:`vpl.points.point_tree`. Phase I: see :mod:`vpl.cuts.phase_one`. Adaptive visibility: see
-    :mod:`vpl.cuts.adaptive_visibility`. ``dark_floor`` and ``max_cut`` are ours: without the latter, sharp lobes take
-    thousands of clusters; it is held by raising the bound around points for which a light cut at their bound is larger,
-    tried at every 32nd point. A cluster's representative counts with its own colour, so that pairs are unbiased where
-    colours differ. Lambertian points and all others are in trees of their own.
+    **Departures from the paper.**
+
+    - Order of refinement: see :mod:`vpl.cuts.product_cuts`.
+    - Tree of points: see :mod:`vpl.points.point_tree`.
+    - Phase I: see :mod:`vpl.cuts.phase_one`.
+    - Adaptive visibility: see :mod:`vpl.cuts.adaptive_visibility`.
+    - ``dark_floor`` and ``max_cut`` are additions. Without ``max_cut``, sharp lobes need thousands of clusters. Every
+      32nd point tests the size of its light cut, and the bounds around points with larger cuts are raised.
+    - A cluster's representative light contributes with its own colour: pairs of lights with different colours are
+      unbiased.
+    - Lambertian and non-Lambertian points have separate trees.
 
     .. tabs::
         .. code-tab:: xml
@@ -79,27 +85,27 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
     knobs = (
         Choice(
             "visibility", "all",
-            "``all``: one shadow ray for every point of a pair. ``adaptive``: a few of them are traced, and where they "
-            "agree the others are taken to see the same; fewer rays, and a bias (see below).",
+            "``all``: one shadow ray for every point of a pair. ``adaptive``: a few probe rays per pair, whose result "
+            "counts for the whole pair if they agree; fewer rays, and a bias (see below).",
             words=tuple(_DEFAULT_ERROR),
         ),
         Fraction(
             "error", lambda plugin: _DEFAULT_ERROR[plugin.visibility],
-            "Largest bound of what a pair of clusters contributes to one of its points, as a fraction of the least "
-            "radiance among them: 0.01 is 1%. 0 refines to single lights.",
+            "Largest bound of a pair's contribution to one of its points, as a fraction of the least radiance of its "
+            "points: 0.01 is 1%. 0 refines to single lights.",
             minimum=0, stated_default='0.015, with ``visibility="adaptive"`` 0.01',
         ),
         DARK_FLOOR,
         Integer(
             "max_cut", 1000,
-            "About how many clusters a point may be lit by; where the bound asks for more, it is raised. 0 is no "
+            "Approximate largest number of clusters per point; the error bound is raised where it needs more. 0 is no "
             "limit.",
             minimum=0,
         ),
         Number(
             "phase_one_error", 0.5,
-            "Bound, as a fraction of the image's mean, up to which pairs of the first, approximate image are not "
-            "refined. 0 leaves it to the paper's criterion alone.",
+            "Bound, as a fraction of the image's mean, up to which pairs of Phase I are not refined. 0 uses the "
+            "paper's criterion alone.",
             minimum=0,
         ),
         Words("aovs", "", AOVS_TEXT, words=offered_aovs),
@@ -132,7 +138,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         return replace(shaded, **dict(zip(names, found, strict=True)))
 
     def _approximate(self, job: ShadeJob, clusters: PointClusters, counter: BoundCounter):
-        """Phase I: approximate radiance at every leaf, (m,) float64, and the shadow rays it took, per point."""
+        """Phase I: (approximate radiance of every node, (m,) float64, shadow rays per point)."""
         negligible = self.phase_one_error * job.mean
         generator = np.random.default_rng(job.seed)
         reflected, rays = approximate_radiance(job.transport, clusters, negligible, generator, counter)
@@ -141,7 +147,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         return reflected + direct, rays
 
     def _threshold(self, job: ShadeJob, clusters: PointClusters, bright: np.ndarray, counter: BoundCounter):
-        """Largest bound that a pair may have, per point node: error × least radiance of its points ([IC] eq. 4)."""
+        """Largest accepted bound per point node: error × least radiance of its points ([IC] eq. 4)."""
         tree, leaves = clusters.tree, clusters.tree.leaves
         allowed = self.error * np.maximum(bright[leaves], self.dark_floor * job.mean)
         at_points = np.repeat(allowed, tree.count[leaves])
@@ -150,7 +156,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
         return upload_thresholds(tree.gather_up(allowed, leaves, np.minimum))
 
     def _pairs(self, job: ShadeJob, clusters: PointClusters, threshold, counter: BoundCounter):
-        """Phase II: yield (group of lights, illumination-aware pairs), about _PAIRS_HELD of them at a time."""
+        """Phase II: yield (group of lights, about _PAIRS_HELD illumination-aware pairs)."""
 
         def illumination_aware(points, lights, bound, index):
             return bound <= dr.gather(mi.Float, threshold, index)  # [IC] Algorithm 1, line 26
@@ -160,7 +166,7 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
                 yield group, pairs
 
     def _evaluate(self, job: ShadeJob, group, clusters, pairs: Pairs, shaded: ShadeResult, clock: Clock):
-        """Add the light of some pairs to ``shaded``."""
+        """Add the contributions of ``pairs`` to ``shaded``."""
         seen, traced = [], [pairs]
         if self.visibility == "adaptive":
             clock.begin(Stage.VISIBILITY)

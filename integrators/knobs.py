@@ -1,8 +1,8 @@
-"""Properties of plugins, each declared once: what may be given, what is said of it, and what it is by default.
+"""Knobs: properties of plugins, with allowed values, description and default declared once.
 
-A plugin class has a tuple ``knobs`` of those that it adds to its base classes' or has otherwise than they.  Its
-constructor calls :func:`read_knobs`, which checks what was given and sets an attribute of the same name for each; its
-``to_string`` prints them by :func:`show_knobs`, and its manual page lists them (:mod:`integrators.manual`).
+A plugin class has a tuple ``knobs``, which adds to or replaces knobs of its base classes.  Its constructor calls
+:func:`read_knobs`, which checks the given values and sets an attribute of the same name for each knob.  Its
+``to_string`` prints the knobs by :func:`show_knobs`, and its manual page lists them (:mod:`integrators.manual`).
 """
 
 from __future__ import annotations
@@ -10,13 +10,15 @@ from __future__ import annotations
 import difflib
 import math
 import textwrap
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+# Columns of an entry in the manual page; the page's indentation adds up to two
 _PAGE_WIDTH = 118
-# Errors above are likely to be meant as percentages
+# Error above which a percentage was probably intended
 _LARGEST_FRACTION = 0.5
-# Read by Mitsuba itself
+# Properties read by Mitsuba's base class
 _OF_MITSUBA = ("timeout", "samples_per_pass", "block_size")
 
 
@@ -24,33 +26,33 @@ _OF_MITSUBA = ("timeout", "samples_per_pass", "block_size")
 class Knob:
     """Property of a plugin.
 
-    ``default``: what it is where nothing is given, or a function of the plugin, which has the knobs declared before;
-    ``text``: what it does, in reStructuredText, where ``{allowed}`` stands for the words that may be given;
-    ``stated_default``: what the page says of the default, if not its value.
+    ``default``: default value, or a function of the plugin, whose previously declared knobs are already set;
+    ``text``: description in reStructuredText; ``{allowed}`` in it is replaced by the allowed words; ``stated_default``:
+    text of the default in the manual page, if different from its value.
     """
 
     name: str
-    default: object
+    default: bool | int | float | str | Callable
     text: str
     stated_default: str = field(default="", kw_only=True)
 
-    type: ClassVar[str]  # as Mitsuba's manual has it
+    type: ClassVar[str]  # name of the type in Mitsuba's manual
 
     @property
     def allowed(self) -> str:
-        """Values that may be given, in words."""
+        """Description of the allowed values, for error messages."""
         raise NotImplementedError
 
     def parse(self, value):
-        """The attribute that becomes of a given value; None if that is not allowed."""
+        """Attribute for a given value; None if the value is not allowed."""
         raise NotImplementedError
 
     def show(self, value):
-        """Text of an attribute: that which would have to be given for it."""
+        """Value to give for an attribute: inverse of :meth:`parse`."""
         return value
 
     def read(self, plugin, props):
-        """The value that was given or the default; raises ValueError, which names property, value, what is allowed."""
+        """Attribute for the given value or the default; ValueError with property, value and allowed values."""
         value = props.get(self.name, self.default(plugin) if callable(self.default) else self.default)
         parsed = self.parse(value)
         if parsed is None:
@@ -58,7 +60,7 @@ class Knob:
         return parsed
 
     def entry(self) -> str:
-        """The property's entry of Mitsuba's directive ``pluginparameters``."""
+        """The property's entry in Mitsuba's directive ``pluginparameters``."""
         default = self.stated_default or self._stated(self.default)
         text = f"{self.text.replace('{allowed}', self._stated_words())} (Default: {default}{self._stated_limits()})"
         wrapped = textwrap.fill(
@@ -79,10 +81,18 @@ class Knob:
 
 @dataclass(frozen=True)
 class _Limited(Knob):
-    """Number between two others, both allowed."""
+    """Number from ``minimum`` to ``maximum``, both included."""
 
     minimum: float = field(kw_only=True)
     maximum: float = field(default=math.inf, kw_only=True)
+
+    noun: ClassVar[str]  # kind of number, for error messages
+
+    @property
+    def allowed(self) -> str:
+        if self.maximum == math.inf:
+            return f"{self.noun} of at least {self.minimum:g}"
+        return f"{self.noun} from {self.minimum:g} to {self.maximum:g}"
 
     def _stated_limits(self) -> str:
         return f"; at least {self.minimum:g}" + (f", at most {self.maximum:g}" if self.maximum < math.inf else "")
@@ -94,13 +104,7 @@ class _Limited(Knob):
 class Integer(_Limited):
     """Whole number."""
 
-    type = "int"
-
-    @property
-    def allowed(self):
-        if self.maximum == math.inf:
-            return f"an integer of at least {self.minimum}"
-        return f"an integer from {self.minimum} to {self.maximum}"
+    type, noun = "int", "an integer"
 
     def parse(self, value):
         whole = isinstance(value, int) and not isinstance(value, bool)
@@ -110,13 +114,7 @@ class Integer(_Limited):
 class Number(_Limited):
     """Finite number."""
 
-    type = "float"
-
-    @property
-    def allowed(self):
-        if self.maximum == math.inf:
-            return f"a number of at least {self.minimum:g}"
-        return f"a number from {self.minimum:g} to {self.maximum:g}"
+    type, noun = "float", "a number"
 
     def parse(self, value):
         numeric = isinstance(value, int | float) and not isinstance(value, bool)
@@ -124,7 +122,7 @@ class Number(_Limited):
 
 
 class Fraction(Number):
-    """Number that says what share of something an error may be."""
+    """Relative error; warns of values that look like percentages."""
 
     def read(self, plugin, props):
         value = super().read(plugin, props)
@@ -146,7 +144,7 @@ class Boolean(Knob):
 
 
 class Depth(Knob):
-    """Number of edges, -1 for as many as there are, which the attribute has as infinity."""
+    """Number of edges; -1 for no limit, stored as infinity."""
 
     type = "int"
     allowed = "-1 (no limit) or an integer of at least 0"
@@ -162,7 +160,7 @@ class Depth(Knob):
 
 @dataclass(frozen=True)
 class _Worded(Knob):
-    """One or several of the words ``words``."""
+    """Property with the allowed words ``words``."""
 
     words: tuple[str, ...] = field(kw_only=True)
 
@@ -176,7 +174,7 @@ class _Worded(Knob):
 
 
 class Choice(_Worded):
-    """One of some words."""
+    """One of the words."""
 
     @property
     def allowed(self):
@@ -190,7 +188,7 @@ class Choice(_Worded):
 
 
 class Words(_Worded):
-    """Any of some words, separated by commas, each at most once; the attribute is a tuple of them."""
+    """Comma-separated list of distinct words, stored as a tuple."""
 
     @property
     def allowed(self):
@@ -209,21 +207,21 @@ class Words(_Worded):
         return f"``{default}``" if default else "none"
 
 
-# What all integrators that follow camera rays have in common, with the defaults of Mitsuba's ``path``
+# Path settings of every integrator, with the defaults of Mitsuba's ``path``
 PATH_KNOBS = (
     Depth(
         "max_depth", -1,
-        "Longest path from camera to emitter, in edges, counted as Mitsuba's ``path`` counts them: 1 shows emitters "
-        "only, 2 adds direct light, and -1 is no limit.",
+        "Longest path from camera to emitter, in edges, as counted by Mitsuba's ``path``: 1 shows emitters only, 2 "
+        "adds direct light, and -1 is no limit.",
     ),
-    Integer("rr_depth", 5, "Edges after which paths may end by Russian roulette.", minimum=1),
-    Boolean("hide_emitters", False, "Do not show area emitters and environments to the camera."),
+    Integer("rr_depth", 5, "Number of edges from which Russian roulette may end paths.", minimum=1),
+    Boolean("hide_emitters", False, "Hide area emitters and environments from the camera."),
 )  # fmt: skip
 
 
 def doubt_percentage(name: str, value: float) -> None:
-    """Warn of a fraction that looks like a percentage; ``name``: what it is called."""
-    import mitsuba as mi  # not above: pages are filled without it
+    """Log a warning for a fraction that looks like a percentage; ``name``: name of the value in the message."""
+    import mitsuba as mi  # local, because manual pages are filled without Mitsuba
 
     if value > _LARGEST_FRACTION:
         said = f"{name} is a fraction, {value:g} means {value:.0%}; {value:g}% would be {value / 100:g}"
@@ -231,19 +229,18 @@ def doubt_percentage(name: str, value: float) -> None:
 
 
 def knobs_of(plugin: type) -> tuple[Knob, ...]:
-    """All knobs of a class: its own, then those of its base classes that it has no knob of the same name for."""
+    """Knobs of a class, then the knobs of its base classes with different names."""
     found: dict[str, Knob] = {}
-    for one in plugin.__mro__:
-        for knob in vars(one).get("knobs", ()):
+    for base in plugin.__mro__:
+        for knob in vars(base).get("knobs", ()):
             found.setdefault(knob.name, knob)
     return tuple(found.values())
 
 
 def read_knobs(plugin, props) -> None:
-    """Set an attribute of ``plugin`` for each of its knobs, after Mitsuba's own constructor has read what it knows.
+    """Set an attribute of ``plugin`` for each of its knobs, after Mitsuba's constructor has read its properties.
 
-    Raises ValueError where a value is not allowed, and where there is a property that nobody reads, with the one that
-    may have been meant.
+    Raises ValueError for values that are not allowed, and for unknown properties, with the closest known name.
     """
     knobs = knobs_of(type(plugin))
     for knob in knobs:
@@ -256,6 +253,6 @@ def read_knobs(plugin, props) -> None:
 
 
 def show_knobs(plugin) -> str:
-    """One line a knob, as Mitsuba's plugins print themselves."""
+    """One line per knob, in the format of Mitsuba's plugins."""
     lines = [f"  {knob.name} = {knob.show(getattr(plugin, knob.name))}" for knob in knobs_of(type(plugin))]
     return f"{type(plugin).__name__}[\n" + ",\n".join(lines) + "\n]"

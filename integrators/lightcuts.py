@@ -1,4 +1,4 @@
-"""Lightcuts: a few hundred clusters instead of all virtual lights, with a bound on the error of each."""
+"""Lightcuts: a few hundred clusters instead of every virtual light, with an error bound for each cluster."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .gathering import Clock
 from .knobs import Fraction, Integer
 from .manual import manual_page
 
-# A point's radiance is estimated from coarse cuts at every eighth point, averaged over sixteen neighbours on the curve
+# Stride of the points with a coarse cut for the radiance estimate
 _ESTIMATE_STRIDE = 8
 
 
@@ -30,20 +30,23 @@ class LightcutsIntegrator(ManyLightIntegrator):
 
      {knobs}
 
-    Walter et al. 2005, "Lightcuts: a scalable approach to illumination" [LC]. All virtual lights are clustered into
-    one tree per kind (point, spot, oriented, directional, environment); every gather point is lit by a *cut*: clusters
-    that together hold each light once, each stood for by one representative light with the cluster's intensity. The cut
-    is the coarsest whose clusters all have an upper bound of their contribution of at most ``error`` times the radiance
-    of the point.
+    Walter et al. 2005, "Lightcuts: a scalable approach to illumination" [LC]. The virtual lights are clustered into one
+    tree per kind (point, spot, oriented, directional, environment). Every gather point is lit by a *cut*: clusters that
+    contain each light exactly once. A representative light with the cluster's intensity replaces each cluster. The cut
+    is the coarsest in which every cluster's contribution has an upper bound of at most ``error`` times the radiance of
+    the point.
 
-    {what is estimated}
+    {estimate}
 
-    **Departures from the paper.** The radiance that bounds are compared with is not the running total of the cut but an
-    estimate made before, from coarse cuts of every eighth point and the direct light, averaged over sixteen
-    neighbouring points: thresholds are known in advance, so that cuts need no heap and no stack, and all shadow rays of
-    many points can be traced together. ``dark_floor`` is ours. The representative's colour is its own, not the
-    cluster's, so that the cut is unbiased for lights of different colours. Bounds and the cluster metric differ in
-    detail: see :mod:`vpl.transport.bounds` and :mod:`vpl.lights.light_tree`. There are no reconstruction cuts.
+    **Departures from the paper.**
+
+    - Bounds are compared with a radiance estimate instead of the running total of the cut. The estimate comes from
+      coarse cuts at every eighth point plus direct light, averaged over sixteen neighbouring points. Thresholds are
+      known in advance: cuts need no heap and no stack, and the shadow rays of many points are traced together.
+    - ``dark_floor`` is an addition.
+    - The representative has its own colour, not the cluster's: the cut is unbiased for lights of different colours.
+    - Bounds and the cluster metric differ in detail: see :mod:`vpl.transport.bounds` and :mod:`vpl.lights.light_tree`.
+    - There are no reconstruction cuts.
 
     .. tabs::
         .. code-tab:: xml
@@ -62,14 +65,14 @@ class LightcutsIntegrator(ManyLightIntegrator):
     knobs = (
         Fraction(
             "error", 0.01,
-            "Largest bound of the error of one cluster, as a fraction of the radiance around the point: 0.01 is 1%. 0 "
+            "Largest error bound of a cluster, as a fraction of the estimated radiance of the point: 0.01 is 1%. 0 "
             "refines to single lights.",
             minimum=0,
         ),
         DARK_FLOOR,
         Integer(
             "max_cut", 1000,
-            "Most clusters in the cut of a point, at least one per kind of light; 0 is no limit.",
+            "Largest number of clusters in the cut of a point, at least one per kind of light; 0 is no limit.",
             minimum=0,
         ),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Matrix sampling and recovery: slices whose visibility is mostly predicted, not traced."""
+"""Matrix sampling and recovery: slices with mostly predicted visibility."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .gathering import Clock
 from .knobs import Integer, Number, Words
 from .manual import manual_page
 
-# Slices that are sampled together: bounds the memory of their samples
+# Slices sampled together: bounds the memory of their samples
 _SLICES = 128
 
 
@@ -42,39 +42,45 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
 
      {knobs}
 
-    Huo et al. 2015, "A matrix sampling-and-recovery approach for many-lights rendering" [MSR]. What the clusters of
-    lights of a slice send to its pixels is a matrix, most entries of which differ from those beside them only by smooth
-    factors that need no shadow ray. So visibility is traced for a few percent of the entries and predicted for the
-    others; what a predictor got wrong is found as that which does not fit a matrix of low rank, and traced as well.
-    It takes about a tenth of the shadow rays that tracing all entries would. Predicting an entry costs as much as a few
-    rays in scenes of moderate size, though: unless a ray takes microseconds, :ref:`lightslice <integrator-lightslice>`
-    and :ref:`mdlightcuts <integrator-mdlightcuts>` are faster at the same error.
+    Huo et al. 2015, "A matrix sampling-and-recovery approach for many-lights rendering" [MSR]. The contributions of a
+    slice's clusters of lights to its pixels form a matrix. Most entries differ from adjacent entries only by smooth
+    factors that need no shadow ray. Visibility is traced for a few percent of the entries, and predicted for the rest.
+    Prediction errors are detected as deviations from a matrix of low rank, and traced. The number of shadow rays is
+    about a tenth of the number of entries. In scenes of moderate size, predicting an entry costs as much as a few rays:
+    unless a ray takes microseconds, :ref:`lightslice <integrator-lightslice>` and :ref:`mdlightcuts
+    <integrator-mdlightcuts>` are faster at equal error.
 
-    {what is estimated}
+    {estimate}
 
-    There is no bound on the error. One light stands for each cluster in a whole slice, which ``alpha`` holds small and
-    averages out over seeds; slices show as blotches where ``alpha`` is large. What is predicted wrongly does not
-    average out, and most of it is light that is taken to be blocked: where it arrives, near a lamp, are fewer of the
-    traced rows than where it does not. Beside all the same virtual lights, images of 64 pixels' width are brighter by
-    0.8% in the Cornell box, darker by 1 to 5% in the scenes ``arcade``, ``banquet`` and ``kitchen_lamps``, and where
-    many small lamps each light a little of the scene by more: ``hall`` by 6%, ``corridor`` by 12%, with
-    ``direct="vpl"`` by 20% (blocks of 8 x 8 pixels by up to 40%). What a pixel has most of its light from is traced
-    (step ``largest``), so what is lost is light of hundreds of clusters, each of them less than 3% of it. It is less
-    the larger ``sampling`` is and the more points slices have. Penumbrae are noisy, since predictors answer at random
-    where they are not sure. The visibility of a light is one number for all channels: what masks and thin glass tint
-    arrives grey.
+    There is no error bound.
 
-    **Departures from the paper.** Visibility is separated, not light (see :mod:`vpl.matrix.recovery`), once for all
-    channels, and every gather point is shaded exactly. Slices are halved at medians by the number of points
-    (:mod:`vpl.points.slice_rows`). Clusters are split in rounds, and lend their samples to those beside them along the
-    light tree (:mod:`vpl.matrix.reduced_columns`); ``alpha`` is a tenth of the paper's, with which slices have 200
-    columns here rather than its 700; entries are traced where 65% of those around them are wrong instead of 20%, for
-    errors lie denser here, and at last, which the paper does not do, where they may be more than 3% of the light of
-    their pixel. Clusters of whose samples none is lit may be split all the same. Rows that are traced follow
-    each other by golden sections instead of being drawn at random (:mod:`vpl.matrix.visibility_samples`). Nearest rows
-    are found by looking at all samples of a column, and the line of the linear predictor lies in the slice's plane
-    (:mod:`vpl.matrix.visibility_prediction`). Where the separation of a slice fails, all entries of the columns in
-    question are traced, and the slice is counted. Lambertian points and all others are in slices of their own.
+    - One light represents each cluster in a whole slice. ``alpha`` limits this error, and the mean over seeds has none
+      of it; with a large ``alpha``, slices appear as blotches.
+    - Prediction errors do not average out. Most of them predict visible light as occluded, because near a lamp there
+      are fewer traced rows with light than without. Compared to images of the same virtual lights, 64 pixels wide, the
+      Cornell box is brighter by 0.8%; the scenes ``arcade``, ``banquet`` and ``kitchen_lamps`` are darker by 1 to 5%.
+      Scenes where each of many small lamps lights a small part lose more: ``hall`` 6%, ``corridor`` 12%, with
+      ``direct="vpl"`` 20% (blocks of 8 x 8 pixels up to 40%). The largest contributions to a pixel are traced (step
+      ``largest``), hence the lost light belongs to hundreds of clusters with less than 3% of the pixel's light each.
+      The loss decreases with larger ``sampling`` and with more points per slice.
+    - Penumbrae are noisy, because uncertain predictors answer at random.
+    - The visibility of a light is one number for every channel: light tinted by masks and thin glass becomes grey.
+
+    **Departures from the paper.**
+
+    - Visibility is separated instead of light (see :mod:`vpl.matrix.recovery`), once for every channel, and every
+      gather point is shaded exactly.
+    - Slices are halved at medians of the number of points (:mod:`vpl.points.slice_rows`).
+    - Clusters are split in rounds, and share samples with their neighbours along the light tree
+      (:mod:`vpl.matrix.reduced_columns`). Clusters without a lit sample may be split.
+    - ``alpha`` is a tenth of the paper's; slices then have 200 columns here rather than the paper's 700.
+    - Entries are traced where 65% of the surrounding entries are wrong instead of 20%, because errors are denser here.
+      In addition, entries are traced that may be more than 3% of the light of their pixel.
+    - Traced rows are selected by golden sections instead of at random (:mod:`vpl.matrix.visibility_samples`).
+    - Nearest rows are found among every sample of a column, and the line of the linear predictor lies in the slice's
+      plane (:mod:`vpl.matrix.visibility_prediction`).
+    - If the separation of a slice fails, every entry of the affected columns is traced, and the slice is counted.
+    - Lambertian and non-Lambertian points have separate slices.
 
     .. tabs::
         .. code-tab:: xml
@@ -93,68 +99,67 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
     knobs = (
         Integer(
             "slice_rows", 1024,
-            "Most rows of a slice: pixels whose gather points are lit by the same clusters.",
+            "Largest number of rows of a slice: pixels whose gather points have common clusters of lights.",
             minimum=1, maximum=65536,
         ),
         Integer(
             "initial_columns", 200,
-            "Clusters of lights that a slice begins with, at most, chosen by upper bounds.",
+            "Largest initial number of clusters of lights per slice, chosen by upper bounds.",
             minimum=1,
         ),
         Integer(
             "max_columns", 2000,
-            "Most clusters that a slice ends with, but one for each kind of light at least.",
+            "Largest final number of clusters per slice, at least one per kind of light.",
             minimum=1,
         ),
         Number(
             "alpha", 0.002,
-            "Clusters are split that may send more than this fraction of what all of them may send. The error falls "
-            "and the time grows as it falls.",
+            "A cluster is split if it may contribute more than this fraction of the slice's total. A smaller value "
+            "reduces the error and increases the time.",
             minimum=0,
         ),
         Number(
             "sampling", 0.01,
-            "How many rows are traced for each column in every round, of those where light would arrive: this fraction "
-            "of the rows that slices have on average.",
+            "Number of traced rows per column and round, among rows with a positive unoccluded contribution, as a "
+            "fraction of the mean number of rows per slice.",
             minimum=1e-6,
         ),
         Number(
             "prediction_error", 0.1,
-            "A column is sampled until its visibility is predicted with fewer errors than this fraction of the new "
-            "samples.",
+            "A column is sampled until predictors are wrong for less than this fraction of its new samples.",
             minimum=0,
         ),
-        Integer("rounds", 20, "How often a column is sampled at most after the first time.", minimum=1),
+        Integer("rounds", 20, "Largest number of sampling rounds of a column after the first.", minimum=1),
         Words(
             "steps", ",".join(STEPS),
-            "What is done, out of {allowed}. The first three predict visibility: by the nearest rows that were traced, "
-            "by a line between light and shadow, by the same row in nearby columns, each column by the best of those "
-            "named; where none is, all that was not traced is taken to arrive. ``separation``: errors of the "
-            "prediction are found by separating the matrix into a part of low rank and sparse errors. ``correction``: "
-            "entries are traced where these lie dense. ``largest``: entries are traced that may be more than 3% of the "
+            "Steps of the method, out of {allowed}. The first three are predictors of visibility: by the nearest "
+            "traced rows, by a line between light and shadow, by the same row in nearby columns. Each column uses its "
+            "best predictor; without predictors, every untraced entry counts as visible. ``separation``: detect "
+            "prediction errors by separating the matrix into a part of low rank and sparse errors. ``correction``: "
+            "trace entries where these errors are dense. ``largest``: trace entries that may be more than 3% of the "
             "light of their pixel.",
             words=STEPS,
         ),
     )  # fmt: skip
 
     def shade(self, job: ShadeJob) -> ShadeResult:
-        """Slices, their columns, what is traced of their matrices, and what these send to the points of one batch."""
+        """Slices of one batch, their recovered matrices, and the radiance of their points."""
         if job.transport.traits.null:
-            mi.Log(mi.LogLevel.Warn, "Light that passes through coloured glass or masks loses its colour there.")
+            mi.Log(mi.LogLevel.Warn, "Light through coloured glass or masks becomes grey in this integrator.")
         work = self.start(job)
         clusters = work.entries.rows.clusters
         for block, found in self.recovered(job, work):
             work.light(block, found.visibility)
         if failed := work.counts["failed_slices"]:
             whole = work.counts["slices"]
-            mi.Log(mi.LogLevel.Warn, f"{failed} of {whole} slices could not be separated and were traced instead.")
+            mi.Log(mi.LogLevel.Warn, f"The separation of {failed} of {whole} slices failed; their entries were traced.")
         radiance, used = clusters.in_batch_order([work.radiance, work.columns])
         spent = (work.entries.rays, work.bounds)
         rays, bounds = (dr.opaque(mi.Float, count / clusters.count, clusters.count) for count in spent)
         return ShadeResult(radiance, rays, bounds, used, work.clock.seconds, counts=work.counts)
 
     def start(self, job: ShadeJob) -> Work:
-        """The slices of a batch."""
+        """Build the slices of a batch."""
         clock = Clock(Stage.SLICES)
         pixel = download(job.ray).astype(np.int64) // job.grid.samples
         clusters = PointClusters(job.batch, partial(build_row_slices, pixel, self.slice_rows))
@@ -163,7 +168,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
         return Work(MatrixEntries(job.transport, rows), clock)
 
     def recovered(self, job: ShadeJob, work: Work):
-        """Yield the matrices of all slices, recovered: (block, what was found), block by block."""
+        """Yield the recovered matrices of the slices: (block, recovery), block by block."""
         rows = work.entries.rows
         work.begin(Stage.INITIAL_CUT)
         columns, work.bounds = initial_columns(work.entries, job.mean, min(self.initial_columns, self.max_columns))
@@ -185,7 +190,7 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
     def _blocks(
         self, job: ShadeJob, work: Work, samples: VisibilitySamples, count: int, slices: tuple[int, int], seed: int
     ):
-        """Predict the columns of some slices, and recover their matrices as many at a time as memory allows."""
+        """Predict the columns of some slices, and recover their matrices in blocks of bounded memory."""
         work.begin(Stage.PREDICTION)
         entries, columns = work.entries, samples.columns
         named = tuple(kind for name, kind in PREDICTORS.items() if name in self.steps)
@@ -208,10 +213,10 @@ class MatrixRecoveryIntegrator(ManyLightIntegrator):
 
 
 class Work:
-    """Light of all points along the slices, filled block by block, and what it took.
+    """Radiance of the points in slice order, filled block by block, with statistics.
 
-    ``bounds``: upper bounds that were computed; ``counts``: slices, rows and entries; shadow rays by stage;
-    columns by predictor; slices that failed.
+    ``bounds``: number of computed upper bounds; ``counts``: slices, rows and entries, shadow rays by stage, columns by
+    predictor, failed slices.
     """
 
     def __init__(self, entries: MatrixEntries, clock: Clock):
@@ -225,17 +230,17 @@ class Work:
         self.counts |= {f"{stage}_rays": 0 for stage in (Stage.COLUMNS, Stage.PREDICTION, Stage.CORRECTION)}
 
     def add(self, name: str, number: int) -> None:
-        """Count something."""
+        """Add a number to a count."""
         self.counts[name] = self.counts.get(name, 0) + number
 
     def begin(self, stage: Stage) -> None:
-        """A stage begins, and the one before ends."""
+        """Begin a stage and end the previous one."""
         self.stop()
         self.stage = stage
         self.clock.begin(stage)
 
     def stop(self) -> None:
-        """The stage ends: its time, and its shadow rays."""
+        """End the stage: record its time and shadow rays."""
         self.clock.stop()
         if self.stage is not None:
             before = sum(number for name, number in self.counts.items() if name.endswith("_rays"))
@@ -243,7 +248,7 @@ class Work:
             self.stage = None
 
     def light(self, block: MatrixBlock, visibility) -> None:
-        """Add what the columns of a block send to the points of its slices."""
+        """Store the radiance of the points of a block's slices."""
         first, last = int(self._begin[block.begin]), int(self._begin[block.begin + block.slices])
         radiance, columns = block.light_points(visibility, first, last)
         point = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
@@ -253,7 +258,7 @@ class Work:
 
 
 def _chunks(entries: MatrixEntries, columns, slices: tuple[int, int]):
-    """Ranges of slices whose matrices, padded to one size, hold at most ENTRIES entries (or a single slice)."""
+    """Ranges of slices whose padded matrices have at most ENTRIES entries in total (or a single slice)."""
     begin, end = slices
     width = np.bincount(columns.piece - begin, minlength=end - begin)
     height = np.diff(entries.rows.first[begin : end + 1])

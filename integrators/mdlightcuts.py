@@ -1,4 +1,4 @@
-"""Multidimensional Lightcuts: one cut for all samples of a pixel."""
+"""Multidimensional Lightcuts: one cut for the samples of a pixel."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from .common import DARK_FLOOR, ManyLightIntegrator, ShadeJob, ShadeResult
 from .knobs import Fraction, Integer
 from .manual import manual_page
 
-# Pairs that are shaded and traced at a time, at least
+# Least number of pairs shaded and traced at a time
 _PAIRS_PER_KERNEL = 1 << 22
-# A coarse cut of one point for so many pixels tells how bright they are
+# Pixels per coarse cut of the radiance estimate
 _ESTIMATE_PIXELS = 8
-# One pixel in so many tells how large the cuts around it are
+# Pixels per point that tests the size of its light cut
 _TRIED_PIXELS = 32
 
 
@@ -41,24 +41,29 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
 
      {knobs}
 
-    Walter et al. 2006, "Multidimensional lightcuts" [MDLC]. Like :ref:`lightcuts <integrator-lightcuts>`, but what is
-    cut is the product of two trees: the gather points of all samples of a pixel (over its area, the lens and the
-    shutter, as far as the sensor and the scene have them) and the lights. Where neighbouring samples would be lit by
-    the same clusters, one of them is lit for all: the cost of a pixel grows far slower than its samples.
+    Walter et al. 2006, "Multidimensional lightcuts" [MDLC]. This method extends :ref:`lightcuts <integrator-lightcuts>`
+    to cuts through the product of two trees: a gather tree over the gather points of a pixel's samples (over the
+    pixel's area, and over lens and shutter, if present) and a light tree. One representative point is lit for
+    neighbouring samples with common clusters: the cost of a pixel grows far more slowly than its number of samples.
 
-    {what is estimated}
+    {estimate}
 
-    The samples of a pixel share the light that arrives at them, and each reflects it by itself: with a box filter the
-    image is that of all samples in expectation; wider filters leave textures as they are and blur edges of shadows and
-    glossy highlights inside of a pixel, and second moments over samples mean nothing. Pixels are told apart only for
-    the sensors of the scene; with another one every camera ray counts as a pixel, which is as slow as ``lightcuts``.
+    The samples of a pixel share the incident light, and each point reflects it with its own BSDF. With a box filter the
+    expected image is that of independent samples. Wider filters preserve textures, and blur shadow edges and glossy
+    highlights within a pixel. Second moments over samples are meaningless. Pixels are known only for the scene's
+    sensors; with any other sensor, every camera ray counts as a pixel, which is as slow as ``lightcuts``.
 
-    **Departures from the paper.** Thresholds come from an estimate made before instead of from a running total, and the
-    upper levels of both trees are descended for blocks of pixels at once; see :mod:`vpl.cuts.pixel_cuts`. A
-    representative counts with its own colour, light or point, so that cuts are unbiased where colours differ. Gather
-    trees: see :mod:`vpl.points.gather_tree`. ``dark_floor`` is ours. ``max_cut`` is held only about, by raising the
-    bound where the light cut of a point at every 32nd pixel is larger. Lambertian points and all others are in trees of
-    their own, so a pixel that sees both has two cuts, each held to what its own points give to the pixel.
+    **Departures from the paper.**
+
+    - Thresholds come from a radiance estimate instead of a running total, and the upper levels of both trees are
+      descended once for blocks of pixels; see :mod:`vpl.cuts.pixel_cuts`.
+    - A representative light or point contributes with its own colour: cuts are unbiased for different colours.
+    - Gather trees: see :mod:`vpl.points.gather_tree`.
+    - ``dark_floor`` is an addition.
+    - ``max_cut`` is approximate: at every 32nd pixel a point tests its light cut, and the bound is raised where the cut
+      is larger.
+    - Lambertian and non-Lambertian points have separate trees: a pixel with both has two cuts, each with a threshold
+      for its points' contribution to the pixel.
 
     .. tabs::
         .. code-tab:: xml
@@ -77,29 +82,30 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
     knobs = (
         Fraction(
             "error", 0.01,
-            "Largest bound of what a pair of clusters contributes to its pixel, as a fraction of the pixel's radiance: "
-            "0.01 is 1%. 0, with ``max_cut`` 0 and ``leaf_points`` 1, takes every light at every point.",
+            "Largest bound of a pair's contribution to its pixel, as a fraction of the pixel's radiance: 0.01 is 1%. "
+            "0, with ``max_cut`` 0 and ``leaf_points`` 1, evaluates every light at every point.",
             minimum=0,
         ),
         DARK_FLOOR,
         Integer(
             "max_cut", 1000,
-            "About how many pairs a pixel may be lit by; where the bound asks for more, it is raised. 0 is no limit.",
+            "Approximate largest number of pairs per pixel; the error bound is raised where it needs more. 0 is no "
+            "limit.",
             minimum=0,
         ),
         Integer(
             "leaf_points", 4,
-            "Neighbouring samples of a pixel, on diffuse surfaces, that are never told apart: for every cluster "
-            "of lights one of them, drawn at random, stands for all, whatever ``error`` says. 1: there are none.",
+            "Largest number of neighbouring samples of a pixel, on diffuse surfaces, in a leaf of the gather tree. One "
+            "random sample per cluster of lights represents a leaf, at any ``error``. 1: every sample is a leaf.",
             minimum=1,
         ),
     )  # fmt: skip
 
     def shade(self, job: ShadeJob) -> ShadeResult:
-        """Gather trees, thresholds, and the cut of every pixel, for one batch."""
+        """Gather trees, thresholds and cuts of the pixels of one batch."""
         clock = Clock(Stage.ESTIMATE)
         if not job.grid.known:
-            mi.Log(mi.LogLevel.Warn, "The sensor is not one of the scene's: every camera ray counts as a pixel.")
+            mi.Log(mi.LogLevel.Warn, "The sensor does not belong to the scene: every camera ray counts as a pixel.")
         pixel = download(job.ray).astype(np.int64) // job.grid.samples
         per_pixel = job.batch.count / np.count_nonzero(np.bincount(pixel))
         estimate = estimate_radiance(
@@ -132,7 +138,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
         return ShadeResult(radiance, rays, bounds, pairs, clock.seconds, dropped=cuts.dropped)
 
     def _pairs(self, job: ShadeJob, clusters: PointClusters, rule, counter: BoundCounter):
-        """Yield (group of lights, pairs), at least _PAIRS_PER_KERNEL of them at a time but for the last."""
+        """Yield (group of lights, at least _PAIRS_PER_KERNEL pairs), fewer in the last of a group."""
         accept, points_first = rule
         for group in job.lights.groups:
             found = find_pairs(clusters, job.lights, group, accept, counter, points_first)
@@ -140,7 +146,7 @@ class MultidimensionalLightcutsIntegrator(ManyLightIntegrator):
                 yield group, pairs
 
     def _allowed(self, job: ShadeJob, estimate: Estimate, pixel: np.ndarray) -> np.ndarray:
-        """Most that a pair may add to the radiance of its pixel, for every point, (n,) float64."""
+        """Largest contribution of a pair to its pixel's radiance, for every point, (n,) float64."""
         weighted = estimate.radiance * download(job.weight).mean(1, dtype=np.float64)
         radiance = np.bincount(pixel, weighted)[pixel] / job.grid.samples
         return self.error * np.maximum(radiance, self.dark_floor * job.mean)

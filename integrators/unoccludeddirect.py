@@ -1,4 +1,4 @@
-"""Direct light by emitter sampling in proportion to unoccluded contributions: what adaptive sampling is measured by."""
+"""Direct light by emitter sampling in proportion to unoccluded contributions: the baseline of adaptive sampling."""
 
 from __future__ import annotations
 
@@ -25,16 +25,19 @@ class UnoccludedDirectIntegrator(DirectLightIntegrator):
 
      {knobs}
 
-    The reference solution of Donikian et al. 2006 [IAS section 5.1], with which ``adaptivedirect`` is compared: at
-    every point emitters are drawn in proportion to their unoccluded contribution, one camera ray of the pixel after
-    another, until its error is below ``error`` by the same rule. Needs a sampler with several samples a pixel to
-    antialias; it goes round them as often as it has to.
+    The reference solution of Donikian et al. 2006 [IAS section 5.1], the baseline of ``adaptivedirect``. At every point
+    emitters are drawn in proportion to their unoccluded contribution. The camera rays of a pixel take turns, in several
+    rounds if needed, until the pixel's error is below ``error`` by the rule of ``adaptivedirect``. Antialiasing needs a
+    sampler with several samples per pixel.
 
-    {what direct light is estimated}
+    {direct estimate}
 
-    **Departures from the paper.** Samples are stratified by jitter along the emitters and by an additive recurrence on
-    them, instead of a Sobol sequence; a tenth of the samples is spread evenly over the emitters, because unoccluded
-    contributions are estimated from the middle of each; emitter samples are combined with BSDF samples.
+    **Departures from the paper.**
+
+    - Instead of a Sobol sequence, jitter stratifies samples along the emitters, and an additive recurrence on them.
+    - A tenth of the samples is distributed uniformly over the emitters, because unoccluded contributions are evaluated
+      at the emitters' centres.
+    - BSDF samples complement emitter samples.
 
     .. tabs::
         .. code-tab:: xml
@@ -52,13 +55,13 @@ class UnoccludedDirectIntegrator(DirectLightIntegrator):
     knobs = (
         Integer(
             "samples_per_ray", DirectOptions.samples_per_ray,
-            "Emitter samples for each camera ray of a pixel, before the next ray is taken.",
+            "Emitter samples for each camera ray of a pixel before the next ray's turn.",
             minimum=2,
         ),
     )  # fmt: skip
 
     def options(self) -> DirectOptions:
-        """As many passes as the limit of samples allows."""
+        """Options without a limit on passes: only the number of samples is limited."""
         return replace(super().options(), lights="unoccluded", max_passes=1 << 20)
 
 

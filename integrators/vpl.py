@@ -1,4 +1,4 @@
-"""Every virtual point light at every gather point: the oracle of all other methods."""
+"""Every virtual point light at every gather point: the reference for the approximate methods."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class VPLIntegrator(ManyLightIntegrator):
 
      {knobs}
 
-    Instant radiosity without any approximation but the virtual lights themselves: every light, one shadow ray each, at
-    every gather point. It is what ``lightcuts`` and its relatives converge to, and slow: the time grows as pixels times
-    lights. With the same seed and parameters it uses the same lights as they do.
+    Instant radiosity with every virtual light at every gather point, one shadow ray each. ``lightcuts`` and the related
+    methods converge to this image; with equal seed and parameters they use the same lights. The time is proportional to
+    pixels times lights.
 
-    {what is estimated}
+    {estimate}
 
     .. tabs::
         .. code-tab:: xml
@@ -48,7 +48,7 @@ class VPLIntegrator(ManyLightIntegrator):
     needs_trees = False
 
     def shade(self, job: ShadeJob) -> ShadeResult:
-        """Sum over all lights; see :func:`vpl.transport.evaluation.sum_all_lights`."""
+        """Sum over every light by :func:`vpl.transport.evaluation.sum_all_lights`."""
         count, clock = job.batch.count, Clock(Stage.EVALUATE)
         radiance, rays = sum_all_lights(job.transport, job.batch, job.stopped)
         clock.stop()

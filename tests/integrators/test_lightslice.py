@@ -395,7 +395,7 @@ def test_pixels_of_a_block_and_their_samples_take_all_sets(samples, sets):
     plugin = mi.load_dict({"type": NAME, "sets": sets})
     grid = SimpleNamespace(samples=samples, width=12)
     job = SimpleNamespace(ray=dr.arange(mi.UInt32, 12 * 8 * samples), grid=grid)
-    turn = plugin._turns(job).reshape(8, 12, samples)
+    turn = plugin._light_sets(job).reshape(8, 12, samples)
     assert all(len(np.unique(of_pixel)) == min(samples, sets) for of_pixel in turn.reshape(-1, samples))
     blocks = turn.reshape(2, 4, 3, 4, samples).transpose(0, 2, 1, 3, 4).reshape(6, -1)
     assert all(np.array_equal(np.unique(block), np.arange(min(sets, 16 * samples))) for block in blocks)

@@ -124,7 +124,7 @@ def test_a_page_does_not_depend_on_the_indentation_of_its_docstring():
 
      {knobs}
 
-    {what is estimated}
+    {estimate}
 
     .. code-tab:: python
 
@@ -139,7 +139,7 @@ def test_a_page_does_not_depend_on_the_indentation_of_its_docstring():
 
 
 def test_texts_that_nobody_wrote_are_refused_and_no_docstring_is_none():
-    with pytest.raises(ValueError, match='no text is called "who wrote it": there are what is estimated'):
+    with pytest.raises(ValueError, match='unknown text "who wrote it": allowed are estimate, direct estimate, knobs'):
         manual_page(type("Plugin", (), {"__doc__": "Title\n\n{who wrote it}\n"}))
     assert manual_page(type("Plugin", (), {"__doc__": None})).__doc__ is None
 

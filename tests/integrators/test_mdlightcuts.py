@@ -153,7 +153,7 @@ def test_representatives_stand_for_points_of_all_weights_and_colours(black):
         total = strength.sum(0)
         mean = (strength * arriving[inside]).sum(0) / np.where(total > 0, total, 1)
         assert np.allclose(found, mean, rtol=0.03, atol=1e-6)
-        assert np.isclose(cuts._share[node], weight[inside].sum(0).max() / 6, rtol=1e-5)
+        assert np.isclose(cuts._fraction[node], weight[inside].sum(0).max() / 6, rtol=1e-5)
 
 
 def test_a_pixel_with_many_samples_takes_hardly_more_pairs_than_with_one():

@@ -1,12 +1,12 @@
-"""Light cuts by threshold: the largest clusters of a light tree whose error bound a gather point can accept.
+"""Light cuts by threshold: the coarsest clusters of a light tree with error bounds below a gather point's threshold.
 
 Lightcuts [LC section 4] refines the cluster with the largest bound until every bound is at most ``error`` times the
-radiance of the point.  For a given radiance that cut does not depend on the order of refinement: from the root down,
-refine a node exactly while its bound is above the threshold.  So no heap and no stack is needed: nodes lie in preorder,
-and one walks on to ``i + 1`` to refine and to ``escape[i]`` to take or to skip.
+radiance of the point.  For a given radiance the cut is independent of the order of refinement: from the root down, a
+node is refined while its bound exceeds the threshold.  No heap and no stack is needed, because nodes are in preorder:
+traversal continues at ``i + 1`` to refine and at ``escape[i]`` to accept or skip.
 
-The paper compares bounds with the running total of the cut it is refining.  Here the radiance is estimated before, from
-coarse cuts at a few points (:func:`estimate_radiance`), so that thresholds are known in advance.
+Departure from the paper, which compares bounds with the running total of the cut: thresholds follow from a radiance
+estimate, computed in advance with coarse cuts at few points (:func:`estimate_radiance`).
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from ..points.surfaces import Batch
 from ..transport.bounds import contribution_bound
 from ..transport.evaluation import Transport, evaluate_representatives
 
-# Pairs that are shaded and traced at a time: bounds the memory whatever the size of image and cuts
+# Pairs shaded and traced at a time: bounds the memory for any size of image and cuts
 _PAIRS_PER_CHUNK = 1 << 22
-# How the threshold that keeps a cut below its largest size is searched for
+# Search for the threshold of a cut with limited size: first factor of the bracket, and number of bisections
 _BRACKET, _BISECTIONS = 4.0, 3
-# Bounds of the coarse cuts are accepted up to this fraction of the image's mean
+# Error bound of the coarse cuts as a fraction of the image's mean
 _ESTIMATE_ERROR = 0.05
 
 
 @dataclass
 class CutSizes:
-    """Per point and group of lights: ``count`` of nodes in the cut, and ``visits``: nodes whose bound was computed."""
+    """Per group of lights, an array over points: ``count``: nodes in the cut; ``visits``: computed bounds."""
 
-    count: list
-    visits: list
+    count: list[mi.UInt32]
+    visits: list[mi.UInt32]
 
     def total(self) -> np.ndarray:
-        """Nodes in the whole cut of every point, (n,) int64."""
+        """Nodes in the cut of every point over the groups, (n,) int64."""
         return sum(download(count).astype(np.int64) for count in self.count)
 
 
 def _step(group: LightGroup, batch: Batch, threshold, smallest_distance, i):
-    """Look at node ``i``: (taken into the cut, next node).  A bound of zero skips the node: nothing can arrive."""
+    """Visit node ``i``: (whether the cut contains it, next node).  A bound of zero skips the node's subtree."""
     node = group.tree.gather(i)
     bound = contribution_bound(group.kind, batch.receiver, node, smallest_distance)
     reached = bound > 0
@@ -54,7 +54,10 @@ def _step(group: LightGroup, batch: Batch, threshold, smallest_distance, i):
 
 @dr.syntax
 def _count_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: float, most: int):
-    """Walk a group's tree for every point: (nodes taken, nodes visited).  Gives up beyond ``most`` nodes (0: never)."""
+    """Traverse a group's tree for every point: (nodes in the cut, nodes visited).
+
+    Stops when a cut exceeds ``most`` nodes (0: never).
+    """
     end, limit = dr.opaque(mi.UInt32, group.tree.count), upload_limit(most or NO_LIMIT)
     clamp = dr.opaque(mi.Float, smallest_distance)
     i, count, visits = mi.UInt32(0), dr.zeros(mi.UInt32, batch.count), dr.zeros(mi.UInt32, batch.count)
@@ -68,11 +71,10 @@ def _count_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: 
 
 @dr.syntax
 def _collect_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: float, offset, length, total: int):
-    """Walk as :func:`_count_nodes` does, writing (row of the batch, node) of every node taken: ``length`` of them from
-    ``offset`` on.
+    """Repeat the traversal of :func:`_count_nodes` and store (row of the batch, node) of every node in a cut.
 
-    Returns (rows, nodes), how many were written per point, and how many were visited.  Should rounding make this walk
-    take other nodes than the one that counted, nothing is written outside of a point's part.
+    A point has ``length`` entries from ``offset`` on.  Rounding may change the cut between the traversals; entries
+    beyond ``length`` are dropped.  Returns (rows, nodes, entries written per point, nodes visited per point).
     """
     end = dr.opaque(mi.UInt32, group.tree.count)
     clamp = dr.opaque(mi.Float, smallest_distance)
@@ -95,7 +97,7 @@ def _collect_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance
 
 @dr.syntax
 def _sum_segments(values, offset, count):
-    """Sum ``count`` consecutive values from ``offset`` on, in order: the same result on any number of threads."""
+    """Sum ``count`` consecutive values from ``offset`` on, in order: independent of the number of threads."""
     total = dr.zeros(type(values), dr.width(offset))
     k = mi.UInt32(0)
     while dr.hint(k < count, exclude=[values]):
@@ -106,28 +108,28 @@ def _sum_segments(values, offset, count):
 
 
 def cut_sizes(lights: LightSet, batch: Batch, threshold, most: int = 0) -> CutSizes:
-    """Sizes of the cuts at a threshold: the largest bound that is accepted, per point.
+    """Sizes of the cuts at a threshold, the largest accepted bound per point.
 
-    Points whose cut has more than ``most`` nodes are not counted to the end (0: all are).
+    Counting stops at the first node beyond ``most`` per group of lights (0: never).
     """
     found = [_count_nodes(group, batch, threshold, lights.smallest_distance, most) for group in lights.groups]
     return CutSizes([count for count, _ in found], [visits for _, visits in found])
 
 
 def upload_thresholds(values: np.ndarray):
-    """Thresholds in double precision to the device; beyond float32 they are infinite, as unclamped bounds may be."""
+    """Upload float64 thresholds; overflow becomes infinity, which is valid because unclamped bounds can be infinite."""
     with np.errstate(over="ignore"):
         return upload(mi.Float, values.astype(np.float32))
 
 
 def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
-    """Sizes of the cuts, with thresholds raised where a cut would have more than ``max_cut`` nodes (0: nowhere).
+    """Sizes of the cuts, with thresholds raised for cuts of more than ``max_cut`` nodes (0: no limit).
 
-    Refining the worst cluster until ``max_cut`` nodes are reached ([LC] section 4.2) gives a threshold cut too, with a
-    larger threshold: it is bracketed by growing steps, which end because the roots alone are a cut at an infinite
-    threshold, and narrowed by bisection of its logarithm.  Returns (threshold, sizes, nodes visited in all).
+    Refinement of the worst cluster up to ``max_cut`` nodes ([LC] section 4.2) is equivalent to a larger threshold.
+    Growing steps bracket the threshold; they end because the roots form the cut at an infinite threshold.  Bisection of
+    the logarithm narrows the bracket.  Returns (threshold, sizes, nodes visited per point).
     """
-    max_cut = max(max_cut, len(lights.groups)) if max_cut else 0  # the roots of all kinds are the coarsest cut
+    max_cut = max(max_cut, len(lights.groups)) if max_cut else 0  # the roots of the groups form the coarsest cut
     sizes = cut_sizes(lights, batch, threshold, max_cut)
     visits = sum(sizes.visits)
     rows = np.flatnonzero(sizes.total() > max_cut)
@@ -135,11 +137,11 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
         return threshold, sizes, visits
     index = upload(mi.UInt32, rows)
     part = batch.select(index)
-    # In NumPy: they are mostly few, and as kernels they would take longer to compile than to compute
+    # NumPy, because the points are mostly few: kernels would take longer to compile than to run
     spent, fitting = np.zeros(len(rows), np.uint32), [np.zeros(len(rows), np.uint32) for _ in sizes.count]
 
     def too_large(values):
-        """Mask of the cuts that are too large at these thresholds; keeps the sizes of those that are not."""
+        """Mask of cuts above ``max_cut`` at the given thresholds; stores the sizes of the remaining cuts."""
         nonlocal spent, fitting
         found = cut_sizes(lights, part, upload_thresholds(values), max_cut)
         over = found.total() > max_cut
@@ -168,32 +170,32 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
 
 @dataclass
 class CutChunk:
-    """Part of the cuts of a batch in one group of lights: ``rows`` (in ``batch``) and ``nodes``, point by point.
+    """Part of the cuts of a batch in one group of lights.
 
-    ``points``: the rows of the whole batch that ``batch`` holds; ``offset``, ``length``: where the nodes of each are;
-    ``visits``: nodes visited to collect them.
+    ``batch``: points of this part; ``points``: their rows in the whole batch; ``rows`` (in ``batch``), ``nodes``:
+    entries of the cuts, point by point; ``offset``, ``length``: range of each point's entries; ``visits``: number of
+    visited nodes per point.
     """
 
     group: LightGroup
     batch: Batch
-    points: object
-    offset: object
-    length: object
-    rows: object
-    nodes: object
-    visits: object
+    points: mi.UInt32
+    offset: mi.UInt32
+    length: mi.UInt32
+    rows: mi.UInt32
+    nodes: mi.UInt32
+    visits: mi.UInt32
 
     @property
     def written(self):
-        """Mask of the ``rows`` and ``nodes`` that are part of a cut: rounding may leave one shorter than was counted,
-        and the rest of its part 0."""
+        """Mask of valid entries: rounding may shorten a cut after the counting traversal and leave entries unused."""
         row = dr.arange(mi.UInt32, dr.width(self.rows))
         place = row - dr.gather(mi.UInt32, self.offset, self.rows)
         return place < dr.gather(mi.UInt32, self.length, self.rows)
 
 
 def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
-    """Yield the cuts of a batch as :class:`CutChunk`, evaluated, each of bounded size."""
+    """Yield the cuts of a batch as evaluated :class:`CutChunk` of bounded size."""
     for group, group_count in zip(lights.groups, sizes.count, strict=True):
         count = download(group_count).astype(np.int64)
         for first, last in chunks(count, _PAIRS_PER_CHUNK):
@@ -214,11 +216,10 @@ def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
 def evaluate_cuts(
     transport: Transport, batch: Batch, threshold, sizes: CutSizes, second=False, stopped=lambda: False
 ):  # fmt: skip
-    """Radiance of every point from its cut: representatives, scaled to the intensity of their clusters.
+    """Radiance of every point from its cut: representative lights, scaled to their clusters' intensity [LC, section 3].
 
-    ``second``: use the second representative of every cluster, for an estimate that another cut may depend on;
-    ``stopped``: asked between kernels; once true the sum ends early.  Returns (radiance, shadow rays, nodes visited)
-    per point of the batch.
+    ``second``: whether to use second representatives, for estimates that determine a later cut; ``stopped``: called
+    between kernels; true ends the sum early.  Returns (radiance, shadow rays, nodes visited) per point of the batch.
     """
     radiance = dr.zeros(mi.UnpolarizedSpectrum, batch.count)
     rays, visits = dr.zeros(mi.UInt32, batch.count), dr.zeros(mi.UInt32, batch.count)
@@ -238,19 +239,18 @@ def evaluate_cuts(
 
 @dataclass
 class Estimate:
-    """Per point: ``radiance``, (n,) float64, the mean over channels; ``shadow_rays`` and ``upper_bounds`` that finding
-    it took, UInt32."""
+    """Per point: ``radiance``, (n,) float64, mean over channels; numbers of ``shadow_rays`` and of ``upper_bounds``."""
 
     radiance: np.ndarray
-    shadow_rays: object
-    upper_bounds: object
+    shadow_rays: mi.UInt32
+    upper_bounds: mi.UInt32
 
 
 def estimate_radiance(transport: Transport, batch: Batch, direct, mean: float, max_cut: int, stride: int) -> Estimate:
-    """Coarse cuts at every ``stride``-th point, averaged, with the direct light of all, over the blocks of 2 strides.
+    """Radiance estimate from coarse cuts at every ``stride``-th point plus direct light, averaged over 2 strides.
 
-    Points should lie along a curve, so that those of a block are neighbours.  ``direct``: radiance per point that is
-    known already; ``mean``: of the image; ``max_cut``: most clusters of a cut, 0 is no limit.
+    Points must lie along a curve, because the average is over consecutive points.  ``direct``: known radiance per
+    point; ``mean``: mean radiance of the image; ``max_cut``: most clusters of a cut, 0 is no limit.
     """
     count = batch.count
     rows = np.arange(0, count, stride)
@@ -258,7 +258,7 @@ def estimate_radiance(transport: Transport, batch: Batch, direct, mean: float, m
     part = batch.select(index)
     threshold = dr.opaque(mi.Float, _ESTIMATE_ERROR * mean, len(rows))
     threshold, sizes, searched = limited_cuts(transport.lights, part, threshold, max_cut)
-    # Second representatives: the thresholds must not depend on the lights that the final cuts are made of
+    # Second representatives, because thresholds must be independent of the final cuts' representatives
     radiance, rays, collected = evaluate_cuts(transport, part, threshold, sizes, second=True)
     reflected = np.repeat(download(radiance).mean(1, dtype=np.float64), stride)[:count]
     level = block_mean(reflected + download(direct).mean(1, dtype=np.float64), 2 * stride)
@@ -269,7 +269,7 @@ def estimate_radiance(transport: Transport, batch: Batch, direct, mean: float, m
 
 
 def block_mean(values: np.ndarray, block: int) -> np.ndarray:
-    """Replace values by the mean over their block of consecutive ones; the last block may be shorter."""
+    """Replace values by the mean over blocks of ``block`` consecutive values; the last block may be shorter."""
     start = np.arange(0, len(values), block)
     length = np.diff(np.append(start, len(values)))
     return np.repeat(np.add.reduceat(values, start) / length, length)

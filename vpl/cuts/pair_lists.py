@@ -1,9 +1,8 @@
-"""Evaluating pairs of clusters: every gather point walks the lists of light nodes paired with it and its ancestors.
+"""Evaluation of pairs of clusters: every gather point traverses the light lists of its leaf and its leaf's ancestors.
 
-The pairs of a point are those of its leaf and of all nodes above.  So the light nodes are put in one list per point
-node, and a kernel with one lane per point, along the curve, goes through the lists from the root down to its leaf.
-Neighbouring lanes share nearly all lists, so that packets of rays leave from one place towards one light; nothing is
-expanded to points times lights, and every point sums its own light.
+Every point node has a list of its light nodes.  A kernel with one lane per point, along the curve, traverses the lists
+from the root to the point's leaf.  Neighbouring lanes share nearly all lists, hence packets of rays have close origins
+and a common light.  No array of points times lights is needed, and every point sums its own radiance.
 """
 
 from __future__ import annotations
@@ -22,35 +21,34 @@ from ..points.surfaces import Batch
 from ..transport.evaluation import Transport, evaluate_pairs
 from .product_cuts import Pairs
 
-# The bit of a light node's index that marks it as seen by all points of the pair
+# Bit of a light's index that marks it as visible from every point of the pair
 _SEEN = 1 << 31
 
 
 @dataclass
 class PairLists:
-    """Lights by point node: those of node i are ``lights[start[i] : end[i]]``, with factors ``scales`` on their
-    intensity.
+    """Lists of lights per point node: node i has ``lights[start[i] : end[i]]`` with scale factors ``scales``.
 
-    ``path``: for every leaf, the nodes from the root down to it that have any lights: those of each gather point are
-    ``path[path_start : path_end]``.  ``any_seen``: whether any light is marked as seen; ``length``: lights in all lists
-    of each gather point.
+    ``path``: for every leaf, the nodes with a non-empty list from the root to the leaf; a gather point has the nodes
+    ``path[path_start : path_end]``.  ``any_seen``: whether any light is marked as visible; ``length``: total length of
+    each gather point's lists.
     """
 
-    lights: object
-    scales: object
-    start: object
-    end: object
-    path: object
-    path_start: object
-    path_end: object
+    lights: mi.UInt32
+    scales: mi.Float
+    start: mi.UInt32
+    end: mi.UInt32
+    path: mi.UInt32
+    path_start: mi.UInt32
+    path_end: mi.UInt32
     any_seen: bool
-    length: object
+    length: mi.UInt32
 
 
 def list_pairs(group: LightGroup, clusters: PointClusters, traced: list[Pairs], seen: list[Pairs]) -> PairLists:
-    """Sort pairs by point node; the lights of ``seen`` ones are marked, so that no ray will be traced towards them.
+    """Sort pairs by point node and replace light nodes by their representatives.
 
-    Light nodes become their representatives here, once for all points of a pair.
+    Lights of ``seen`` pairs are marked as visible: no ray is traced.
     """
     pairs = Pairs.join(traced + [Pairs(part.points, part.lights | mi.UInt32(_SEEN)) for part in seen])
     tree = clusters.tree
@@ -74,7 +72,7 @@ def list_pairs(group: LightGroup, clusters: PointClusters, traced: list[Pairs], 
 
 
 def _paths(tree: PointTree, filled: np.ndarray):
-    """Nodes with a list from the root down to every leaf, one leaf after the other, and where each point's are."""
+    """(``path``, ``path_start``, ``path_end``) of :class:`PairLists`; ``filled``: mask of nodes with a list."""
     length = tree.push_down(filled.astype(np.uint32))
     leaves = tree.leaves
     end = np.cumsum(length[leaves], dtype=np.int64)
@@ -92,13 +90,13 @@ def _paths(tree: PointTree, filled: np.ndarray):
 
 @dr.syntax
 def evaluate_lists(transport: Transport, group: LightGroup, batch: Batch, lists, rows):
-    """Light of a group at the points of a batch, and shadow rays traced for each: (radiance, rays).
+    """(Radiance due to a group of lights [IC eq. 3], shadow rays) at the points of a batch.
 
-    ``rows``: where each point of the batch lies along the tree that ``lists`` (:class:`PairLists`) belong to.
+    ``lists``: :class:`PairLists`; ``rows``: index of each point in the lists' tree order.
     """
     surface = batch.surfaces
     radiance, rays = dr.zeros(mi.UnpolarizedSpectrum, batch.count), dr.zeros(mi.UInt32, batch.count)
-    # One loop, not one in another: lanes share their lists down to where their paths part, and wait for nothing below
+    # One loop instead of nested loops: lanes with a common list stay together, and no lane waits at the end of a list
     j, last = dr.gather(mi.UInt32, lists.path_start, rows), dr.gather(mi.UInt32, lists.path_end, rows)
     node = dr.gather(mi.UInt32, lists.path, j, j < last)
     k, end = dr.gather(mi.UInt32, lists.start, node, j < last), dr.gather(mi.UInt32, lists.end, node, j < last)

@@ -1,16 +1,16 @@
 """Cuts through the product of a pixel's gather tree and the light trees [MDLC].
 
-A pixel's radiance is the sum, over all pairs of one of its gather points and a light, of what the light sends to the
-point, weighted by the point's share of the pixel.  A pair of a gather node and a light node stands for all pairs below;
-it is refined while its bound, times the share of its gather node, is above ``error`` times the radiance of the pixel.
-One point and one light represent it, each drawn by its strength, so that the cut is unbiased.  A point stands for what
-arrives at the others: each reflects it by itself, so that textures are not blurred under filters wider than a pixel.
+A pixel's radiance is the sum of the lights' contributions over pairs of a gather point and a light, weighted by the
+point's fraction of the pixel.  A pair of a gather node and a light node represents the pairs below.  It is refined
+while its bound, times the fraction of its gather node, exceeds ``error`` times the pixel's radiance.  A representative
+point and a representative light, drawn in proportion to their strengths, make the cut unbiased.  The representative
+point gives the incident light of the node.  Every point reflects it with its own reflectance, so that filters wider
+than a pixel do not blur textures.
 
-Departures from the paper: thresholds are known before refinement begins, from estimates of the pixels' radiance,
-instead of following from the running total of a heap, so that all pixels refine at once (:mod:`vpl.cuts.product_cuts`);
-and gather nodes above a pixel take part.  Pairs with blocks of pixels are never accepted, but what no pixel of a block
-can see is left out once for all of them, and a cluster of lights that is too coarse for every pixel of a block is
-divided once.
+Departures from the paper: thresholds come from a radiance estimate before refinement instead of the running total of a
+heap, so that the pixels are refined in parallel (:mod:`vpl.cuts.product_cuts`).  Gather nodes above pixels (blocks)
+participate.  A pair with a block is never accepted.  Clusters of lights invisible to a whole block are skipped once for
+the block, and clusters too coarse for every pixel of a block are split once.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ from ..transport.evaluation import Transport, evaluate_pairs
 from .light_cuts import upload_thresholds
 from .product_cuts import Pairs
 
-# A threshold that no bound is below
-_NONE = -1.0
+# A threshold below every bound
+_NEVER = -1.0
 
 
 class PixelCuts:
-    """Light of some pixels, found pair by pair, and what it took: ``pairs``, ``rays``, and how many values were
-    ``dropped`` because they were not finite.
+    """Radiance of pixels, accumulated pair by pair.
 
-    ``clusters``: points along their gather trees; ``pixel``, (n,) of NumPy: of every point along the tree; ``weight``:
-    the factor on its radiance in its camera ray; ``samples``: camera rays of a pixel.
+    ``pairs``: number of pairs per node; ``rays``: shadow rays per point; ``dropped``: number of non-finite values.
+
+    Arguments: ``clusters``: points in gather tree order; ``pixel``: (n,) NumPy array, pixel of every point in tree
+    order; ``weight``: throughput of every point to the camera; ``samples``: camera rays per pixel.
     """
 
     def __init__(self, clusters: PointClusters, pixel: np.ndarray, weight, samples: int, seed: int):
@@ -48,9 +49,9 @@ class PixelCuts:
         dr.eval(self._reflectance)
         strength = weight * self._reflectance
         self._cumulative, *self._channels = (running_sums(x) for x in (channel_mean(strength), *strength))
-        # Of the channel with most weight: where weights have colours, a pair may add more than the mean suggests
+        # Largest channel, because with coloured weights a pair's contribution can exceed the mean over channels
         channels = np.stack([download(running_sums(channel)) for channel in weight])
-        self._share = (channels[:, end] - channels[:, tree.first]).max(0) / samples
+        self._fraction = (channels[:, end] - channels[:, tree.first]).max(0) / samples
         self._parent, self._leaf = upload(mi.UInt32, tree.parent), upload(mi.UInt32, tree.leaf)
         self._light = dr.zeros(mi.UnpolarizedSpectrum, tree.size)
         self.dropped = 0
@@ -58,29 +59,29 @@ class PixelCuts:
         dr.eval(self._light, self.pairs, self.rays)
 
     def rule(self, allowed: np.ndarray):
-        """(accept, points first) for :func:`vpl.cuts.product_cuts.find_pairs`.
+        """(``accept``, ``points_first``) for :func:`vpl.cuts.product_cuts.find_pairs`.
 
-        ``allowed`` (n,): what a pair may add to the radiance of a pixel at most, for every point along the tree.
+        ``allowed`` (n,): largest contribution of a pair to its pixel's radiance, for every point in tree order.
         """
         tree = self.clusters.tree
         least = tree.gather_up(allowed[tree.first[tree.leaves]], tree.leaves, np.minimum)
-        # Bounds hold for one point of unit weight
-        share = np.maximum(self._share, np.finfo(np.float64).tiny)
-        of_pixels = upload_thresholds(np.where(self._of_pixel, least / share, _NONE))
-        of_blocks = upload_thresholds(np.where(self._of_pixel, _NONE, least))
+        # Bounds are for one point of unit weight
+        fraction = np.maximum(self._fraction, np.finfo(np.float64).tiny)
+        of_pixels = upload_thresholds(np.where(self._of_pixel, least / fraction, _NEVER))
+        of_blocks = upload_thresholds(np.where(self._of_pixel, _NEVER, least))
 
         def accept(points, lights, bound, index):
-            """Whether a pair is fine enough; with a block of pixels, none is."""
+            """Whether a pair's bound is small enough; never for a block of pixels."""
             return bound <= dr.gather(mi.Float, of_pixels, index)
 
         def points_first(points, lights, bound, index):
-            """Whether the lights of a pair are fine enough for every pixel of a block."""
+            """Whether the light node of a pair is fine enough for every pixel of a block."""
             return bound <= dr.gather(mi.Float, of_blocks, index)
 
         return accept, points_first
 
     def evaluate(self, transport: Transport, group: LightGroup, pairs: Pairs) -> None:
-        """Add the light of accepted pairs: one point and one light stand for each."""
+        """Add the contributions of accepted pairs, from a representative point and light for each."""
         self._kernels += 1
         point, factor = self._representative(pairs)
         light, scale = group.representatives(pairs.lights)
@@ -94,13 +95,13 @@ class PixelCuts:
         add_at(self.rays, dr.select(traced, mi.UInt32(1), 0), point)
         bad = dr.select(bad, mi.UInt32(1), 0)
         dr.eval(self._light, self.pairs, self.rays, bad)
-        # One such value would spoil all samples of its pixel
+        # A non-finite value would invalidate every sample of its pixel
         self.dropped += int(dr.sum(bad)[0])
 
     def _representative(self, pairs: Pairs):
-        """A point of every pair's gather node, drawn by weight and reflectance, and the factor on what arrives there.
+        """(Point of every pair's gather node, factor on its incident light), drawn by weight times reflectance.
 
-        Where these have colours, the factor makes up for those of the point that was drawn.
+        The factor is a spectrum, because the probability of a point is a mean over channels.
         """
         first, count = self.clusters.ranges(pairs.points)
         last = first + count
@@ -118,13 +119,14 @@ class PixelCuts:
         return point, mi.UnpolarizedSpectrum(*factor)
 
     def per_point(self):
-        """(Radiance, pairs): for every point along the tree, from all nodes that hold it; pairs are shared out."""
-        share = dr.rcp(mi.Float(upload(mi.UInt32, self.clusters.tree.count)))
-        radiance = self._reflectance * self._sum_from_root(self._light)
-        return radiance, self._sum_from_root(self.pairs * share)
+        """(Radiance, pairs) of every point in tree order; a node's pairs are divided equally between its points."""
+        per_point = dr.rcp(mi.Float(upload(mi.UInt32, self.clusters.tree.count)))
+        radiance = self._reflectance * self._sum_to_root(self._light)
+        return radiance, self._sum_to_root(self.pairs * per_point)
 
     @dr.syntax
-    def _sum_from_root(self, values):
+    def _sum_to_root(self, values):
+        """Sum of node values over the leaf of each point and the leaf's ancestors, evaluated."""
         dr.eval(values)
         node = mi.UInt32(self._leaf)
         total = dr.gather(type(values), values, node)

@@ -1,22 +1,22 @@
-"""From a scene's emitters to virtual lights and the trees over them [LC sections 3 and 5].
+"""From a scene's emitters to virtual lights and light trees [LC sections 3 and 5].
 
-How data flows, which is also the order to read in::
+Data flow and reading order::
 
     scene -> emitters -> emission -> tracing -> virtual_lights -> light_tree -> light_set
                                                                   (clustering)
 
-- ``emitters``: a scene's emitters as rows of arrays (``Emitters``), so that no kernel calls emitter objects
-- ``focus``: where the camera looks, and how far apart lights are there
-- ``spheres``: what Mitsuba says wrongly of points on spheres
-- ``emission``: rays that leave them, group by group
-- ``perturbed``: surfaces with bump or normal maps, and how they scatter light paths
-- ``tracing``: light paths; a virtual light at every diffuse bounce (instant radiosity)
-- ``virtual_lights``: ``VirtualLights`` as NumPy arrays, ``DeviceLights`` as kernels fetch them, and ``geometry``: how
-  their light arrives at a place
-- ``clustering``: pairs of clusters merged bottom-up, whatever a merge costs; [LC] and [IAS] both use it
-- ``light_tree``: the light tree of [LC], with representatives, boxes and cones; ``DeviceTree`` as kernels fetch it
-- ``light_set``: ``LightSet``, all of the above for one render, in one ``LightGroup`` for each kind of light;
-  extended emitters as virtual lights (``direct="vpl"``); what a representative stands for
+- ``emitters``: a scene's emitters in flat arrays (``Emitters``), because kernels must not call emitter objects
+- ``focus``: the part of the scene that the camera sees, and the distances between lights there
+- ``spheres``: corrections of Mitsuba's samples on spheres
+- ``emission``: emitter samplers, which start light paths
+- ``perturbed``: light paths at surfaces with bump or normal maps
+- ``tracing``: light paths with a virtual light at every diffuse bounce (instant radiosity)
+- ``virtual_lights``: ``VirtualLights`` in NumPy arrays, ``DeviceLights`` for kernels, and ``geometry``, the geometric
+  factor between a light and a point
+- ``clustering``: bottom-up clustering with any merge cost, for [LC] and [IAS]
+- ``light_tree``: the light tree of [LC] with representative lights, boxes and cones; ``DeviceTree`` for kernels
+- ``light_set``: ``LightSet``, the lights of a render with one ``LightGroup`` per kind; emitters with an extent turned
+  into virtual lights (``direct="vpl"``); scale factors of representative lights
 
-Symbols of the papers: *light tree*, *cluster*, *representative light* and *cluster size* are in ``light_tree``.
+Module ``light_tree`` defines the papers' terms *light tree*, *cluster*, *representative light* and *cluster size*.
 """

@@ -1,14 +1,14 @@
-"""Bottom-up clustering of lights into a binary tree, whatever a merge costs, and sums over that tree (NumPy only).
+"""Bottom-up clustering of lights into a binary tree with any merge cost, and reductions over the tree (NumPy only).
 
-Parallel locally-ordered clustering [PLOC]: sort the lights along a Morton curve; let every cluster find its cheapest
-partner within a window to either side; merge the pairs that chose each other; repeat. The lights' clusters, what they
-become when joined, and the cost of that are the caller's: clusters are the columns of an array.
+Parallel locally-ordered clustering [PLOC]: sort the lights along a Morton curve; find the cheapest partner of every
+cluster within a window to either side; merge mutual partners; repeat. A cluster is a column of an array. The caller
+defines its rows, the merge and the cost.
 
-Clustering n lights yields rounds of merges (nodes, left, right): the nodes of the slice join the earlier nodes of the
-two (k,) int32 arrays. The nodes 0 to n - 1 are the lights along the curve, n to 2n - 2 the inner ones.
+Clustering n lights yields rounds of merges (nodes, left, right): a slice of new nodes and two (k,) int32 arrays of
+their children. Nodes 0 to n - 1 are the lights along the curve, n to 2n - 2 the inner nodes.
 
-Departure from the paper: where mutual pairs are rare (costs that grow along the curve make chains), other clusters join
-their nearest neighbour too, so that the number of rounds, hence the depth, stays logarithmic.
+Departure from the paper: where mutual pairs are rare (costs that grow along the curve make chains), clusters without a
+mutual partner merge too. The number of rounds, hence the depth, stays logarithmic.
 
 [PLOC] Meister and Bittner 2018, Parallel locally-ordered clustering for bounding volume hierarchy construction.
 """
@@ -17,12 +17,12 @@ from itertools import pairwise
 
 import numpy as np
 
-# Clusters compared at a time: a chunk and its temporaries fit in a second-level cache. Even, as parity breaks ties.
+# Clusters per chunk: a chunk and its temporaries fit in a second-level cache. Even, because parity breaks ties.
 _CHUNK = 8192
 
 
 def require_rows(good, name, array, quality):
-    """Raise ValueError that names the argument, what its rows must be, and the first row that is not good."""
+    """Raise ValueError with the argument's name, the required quality, and the first row where ``good`` is false."""
     if not good.all():
         row = int(np.argmin(good))
         raise ValueError(f"{name} must be {quality}, but row {row} is {array[row].tolist()}")
@@ -31,16 +31,16 @@ def require_rows(good, name, array, quality):
 def cluster(clusters, nearest, join, rare=16):
     """Merge clusters until one is left [PLOC, algorithm 1]; returns the rounds of merges.
 
-    clusters: (k, n), one column per light along the curve. nearest: maps (k, m) clusters to the index of every one's
-    cheapest partner, (m,) int32. join: maps (k, r) first and (k, r) second clusters of pairs to (k, r) merged ones.
-    rare: mutual pairs are too few where there are more than this many clusters to each.
+    clusters: (k, n), one column per light along the curve. nearest: maps (k, m) clusters to the indices of their
+    cheapest partners, (m,) int32. join: maps (k, r) first and (k, r) second clusters of pairs to (k, r) merged
+    clusters. rare: number of clusters per mutual pair above which mutual pairs are too few.
     """
     node, made, rounds = np.arange(clusters.shape[1], dtype=np.int32), clusters.shape[1], []
     clusters = clusters.copy()
     while len(node) > 1:
         low, high = _match(nearest(clusters), rare)
         rounds.append((slice(made, made + len(low)), node[low], node[high]))
-        # The merged cluster takes the place of the first of the two on the curve; the second's place is closed up.
+        # The merged cluster replaces the first of the two on the curve; the second is removed.
         clusters[:, low] = join(clusters.take(low, axis=1), clusters.take(high, axis=1))
         node[low] = np.arange(made, made + len(low), dtype=np.int32)
         made += len(low)
@@ -54,11 +54,11 @@ def nearest_in_window(clusters, window, cost):
 
     cost: maps (k, r) first and (k, r) second clusters of pairs to (r,) float32, not negative (nor -0.0).
 
-    Every pair is evaluated once and offered to both ends, which keep the least of integer keys: the bits of the float32
-    cost (not negative, hence ordered as integers), the lowest of them replaced by the partner's place: 0 or 1 next
-    door, else 2 * distance, plus 1 if it comes later. So both ends see one total order of all pairs: by cost, then
-    distance (next door, pairs that begin at an even index first), then first index. Its least pair is mutual whatever
-    the ties, and equal clusters pair up two by two.
+    Every pair is evaluated once and offered to both of its clusters. A cluster keeps the least integer key: the bits of
+    the float32 cost, which order like integers because costs are not negative. The lowest bits hold the partner's
+    place: 0 or 1 for adjacent clusters, else 2 * distance, plus 1 if the partner comes later. All clusters share this
+    total order of pairs: by cost, then by distance (adjacent pairs with an even first index before odd), then by first
+    index. Therefore the least pair is mutual despite ties, and equal clusters pair up two by two.
     """
     count = clusters.shape[1]
     window = min(window, count - 1)
@@ -79,10 +79,9 @@ def nearest_in_window(clusters, window, cost):
 
 
 def nearest_of_all(clusters, cost):
-    """Index of every cluster's cheapest partner among all others, (m,) int32; time and memory grow as m².
+    """Index of every cluster's cheapest partner without a window, (m,) int32; time and memory grow as m².
 
-    cost: as of nearest_in_window, but for clusters that broadcast, and in any precision, which is used in full. Ties
-    are broken in the same way.
+    cost: the cost of nearest_in_window for clusters that broadcast, in any precision. The order of ties is the same.
     """
     count = clusters.shape[1]
     index = np.arange(count)
@@ -95,9 +94,10 @@ def nearest_of_all(clusters, cost):
 
 
 def _partner(place):
-    """Indices of partners by their places, (m,) int32: 0 or 1 next door, where the pair begins at an even or odd index.
+    """Indices of partners, (m,) int32, from their places.
 
-    Further away: 2 * distance, plus 1 if the partner comes later.
+    A place is 0 or 1 for an adjacent pair with an even or odd first index. Otherwise it is 2 * distance, plus 1 if the
+    partner comes later.
     """
     index = np.arange(len(place), dtype=np.int32)
     far = np.where(place & 1, place >> 1, -(place >> 1))
@@ -107,9 +107,10 @@ def _partner(place):
 def _match(neighbour, rare):
     """Disjoint pairs of clusters to merge, two (k,) arrays of indices, the lower of each pair first.
 
-    All mutual nearest neighbours merge. Where they are rare, the others propose to theirs, with distinct priorities in
-    no order (a Fibonacci hash of the index); a proposal that is foremost at both ends is accepted. Nobody gets more
-    than 2 * window of them, so some share of the clusters merges on average.
+    Mutual nearest neighbours merge. Where mutual pairs are rare, every remaining cluster proposes to its nearest
+    neighbour. Proposals have distinct pseudorandom priorities (a Fibonacci hash of the index). A proposal with the
+    highest priority at both clusters is accepted. No cluster receives more than 2 * window proposals, hence a constant
+    fraction of the clusters merges on average.
     """
     index = np.arange(len(neighbour), dtype=np.int32)
     mutual = neighbour[neighbour] == index
@@ -125,9 +126,9 @@ def _match(neighbour, rare):
 
 
 def layout(count, rounds):
-    """Preorder of a tree over count lights, three (2n - 1,) arrays: which node comes there, its leaves and its depth.
+    """Preorder of a tree over n lights, three (2n - 1,) arrays: node at each place, number of leaves, depth.
 
-    The node at place i has its children at i + 1 and, past the first one's leaves k, at i + 2k.
+    The children of place i are at i + 1 and at i + 2k, where k is the number of leaves of the first child.
     """
     leaves = accumulate(np.ones((1, count), np.int64), rounds, np.add)[0]
     preorder = np.zeros(2 * count - 1, np.int64)
@@ -142,7 +143,7 @@ def layout(count, rounds):
 
 
 def accumulate(leaf_values, rounds, join):
-    """Combine (k, n) values of the lights along the curve up the tree; returns (k, 2n - 1).
+    """Reduce (k, n) values of the lights along the curve to every node of the tree; returns (k, 2n - 1).
 
     join: a binary ufunc, or any function of two (k, r) arrays, the values of left and right children.
     """
@@ -157,11 +158,10 @@ def accumulate(leaf_values, rounds, join):
 def reduce_over_leaves(values, leaves, depth, function, ufunc, out):
     """Set out at every inner node to the ufunc's reduction, over the leaves below, of a function of node and leaf.
 
-    All in preorder: values (k, n) of the leaves, leaves and depth as from layout, out (2n - 1,). function: maps the
+    Arrays in preorder: values (k, n) of the leaves, leaves and depth from layout, out (2n - 1,). function: maps the
     (r,) node indices and (k, r) leaves' values of pairs to (r,).
 
-    The inner nodes at a depth cover, one after another, just the leaves that are deeper; so the work is the sum of the
-    leaves' depths.
+    The inner nodes at a depth cover consecutive ranges of the deeper leaves. The work is the sum of the leaves' depths.
     """
     leaf_depth = depth[leaves == 1]
     inner = np.flatnonzero(leaves > 1)
@@ -178,8 +178,9 @@ def reduce_over_leaves(values, leaves, depth, function, ufunc, out):
 def cone_axes(directions, rounds):
     """Unit axes of all nodes' cones, (3, 2n - 1) float64, for (3, n) unit directions of the lights along the curve.
 
-    They point at the centre of the directions' box, which unlike the mean direction is not pulled aside by a crowd of
-    equal directions: cuts are 1 to 3% smaller. Where that is zero, as for opposite walls, across the box.
+    An axis points at the centre of the directions' box. Unlike the mean direction, the centre is independent of how
+    many lights share a direction: cuts are 1 to 3% smaller. A zero centre (opposite walls) is replaced by the
+    coordinate axis of the box's shortest side.
     """
     low, high = (accumulate(directions, rounds, ufunc).astype(np.float64) for ufunc in (np.minimum, np.maximum))
     axis = low + high

@@ -1,7 +1,9 @@
-"""Rays that leave the emitters: the first edge of every light path.
+"""Emitter samplers: rays that leave the emitters, the first edge of every light path.
 
-Emitters are taken group by group (point and spot, area, directional, and each of the others by itself); every group
-gets paths in proportion to its power, and inside a group an emitter is chosen by power with stratified numbers.
+One sampler serves point and spot emitters, one area emitters, one directional emitters; the environment emitter and
+every further emitter have their own. Inside a sampler, stratified numbers choose an emitter in proportion to its power.
+
+Emitter samplers have ``power``, (n,) float64, averaged over channels, ``delta``, and a method ``sample``.
 """
 
 from __future__ import annotations
@@ -19,7 +21,10 @@ from .virtual_lights import VirtualLights, spot_falloff
 
 
 def solid_angle_radiance(emitter, center, count: int = 4096) -> float:
-    """Integral of an emitter's radiance over all directions as seen from ``center``; mean over channels."""
+    """Integral of an emitter's radiance over all directions at ``center``, averaged over channels.
+
+    ``count``: number of samples.
+    """
     sampler = independent_sampler(0, count)
     reference = dr.zeros(mi.Interaction3f, count)
     reference.p = mi.Point3f(center)
@@ -28,7 +33,7 @@ def solid_angle_radiance(emitter, center, count: int = 4096) -> float:
 
 
 def other_power(emitter, bounding_sphere) -> float:
-    """Power of an emitter that only its own routines know, estimated from rays that it emits."""
+    """Power of any emitter, estimated by Mitsuba's sampling routines and averaged over channels."""
     if emitter.is_environment():
         return solid_angle_radiance(emitter, bounding_sphere.center) * np.pi * bounding_sphere.radius**2
     sampler = independent_sampler(0, 4096)
@@ -37,16 +42,16 @@ def other_power(emitter, bounding_sphere) -> float:
 
 
 def bounding_box(scene):
-    """The scene's box, with the shapes that Mitsuba 3.9.1 leaves out: rectangles that it merged have no box.
+    """Bounding box of the scene, including rectangles that Mitsuba 3.9.1 merged: merged rectangles have no valid box.
 
-    Raises a ValueError for a shape that was not merged and has no box either: its transformation is not finite.
+    Raises a ValueError for an unmerged shape without a valid box: its transformation is not finite.
     """
     box = scene.bbox()
     for shape in scene.shapes():
         if shape.is_mesh() and shape.vertex_count() and not shape.bbox().valid():
             vertices = parameters_of(shape, below=False).get("vertex_positions")
             if vertices is None:
-                raise ValueError(f'the shape "{shape.id()}" has no place in space: its size must be finite')
+                raise ValueError(f'the shape "{shape.id()}" has no bounding box: its size must be finite')
             vertices = np.asarray(vertices).reshape(-1, 3)
             box.expand(mi.ScalarPoint3f(vertices.min(0)))
             box.expand(mi.ScalarPoint3f(vertices.max(0)))
@@ -56,19 +61,19 @@ def bounding_box(scene):
 def bounding_sphere(scene):
     """Sphere around the scene's box.
 
-    Raises a ValueError for a scene whose size is not a finite number.
+    Raises a ValueError if the scene's size is not finite.
     """
     box = bounding_box(scene)
     sphere = box.bounding_sphere()
     if len(scene.shapes()) and not np.isfinite(float(sphere.radius)):
-        raise ValueError(f"the scene reaches from {box.min} to {box.max}: its size must be finite")
+        raise ValueError(f"the scene extends from {box.min} to {box.max}: its size must be finite")
     return sphere
 
 
-class OmniEmission:
+class OmniSampler:
     """Rays from point and spot emitters."""
 
-    # Whether no ray that is scattered by chance ever meets these emitters, so that only next-event estimation does
+    # Whether scattered rays never hit these emitters: only next-event estimation reaches them
     delta = True
 
     def __init__(self, points: VirtualLights, spots: VirtualLights):
@@ -95,8 +100,8 @@ class OmniEmission:
         return ray, rgb_to_spectrum(intensity) / density
 
 
-class AreaEmission:
-    """Rays from area emitters: a point by area, a direction by the cosine."""
+class AreaSampler:
+    """Rays from area emitters, with a uniform position and a cosine-distributed direction."""
 
     delta = False
 
@@ -117,17 +122,18 @@ class AreaEmission:
 
 
 class ParallelRays:
-    """Rays in given directions through a scene: through its bounding sphere, evenly, or around the focus.
+    """Rays in given directions through the scene.
 
-    Half of those around a focus go through it, evenly; the other half pass by, as many of them in every octave of
-    distances from its middle, because what light from there brings falls with the squared distance.
+    Without a focus, rays cross the bounding sphere uniformly. With a focus, half of them cross the focus uniformly. The
+    other half pass it, with equal numbers in every octave of the distance from its centre, because their contribution
+    at the focus falls with the squared distance.
     """
 
     def __init__(self, sphere, focus: Focus | None):
         self._sphere, self._focus = sphere, focus
 
     def through(self, direction, sample):
-        """(Ray in a direction, area that it stands for across the direction), by two uniform numbers."""
+        """(Ray in a direction, inverse density of the ray per perpendicular area), from two uniform numbers."""
         frame = mi.Frame3f(direction)
         if self._focus is None:
             disk = mi.warp.square_to_uniform_disk_concentric(sample)
@@ -145,11 +151,11 @@ class ParallelRays:
 
     @property
     def area(self) -> float:
-        """Area of the disk that the bounding sphere shows to all directions."""
+        """Cross-section of the bounding sphere."""
         return np.pi * float(self._sphere.radius) ** 2
 
 
-class DirectionalEmission:
+class DirectionalSampler:
     """Parallel rays from directional emitters."""
 
     delta = True
@@ -170,11 +176,11 @@ class DirectionalEmission:
         return ray, irradiance * area / self._choice.probability(row)
 
 
-class EnvironmentEmission:
-    """Rays from the environment: a direction by its own importance sampling, then parallel rays.
+class EnvironmentSampler:
+    """Rays from the environment emitter: Mitsuba's importance sampling chooses a direction, then a parallel ray.
 
-    Not by its ``sample_ray``: for a rotated environment map (Mitsuba 3.9.1) the rays of that do not fill the disk that
-    the scene shows to them, and several times too much light enters by windows.
+    Mitsuba's ``sample_ray`` is not used: for a rotated environment map (Mitsuba 3.9.1) its rays do not cover the
+    scene's cross-section, and windows admit several times too much light.
     """
 
     delta = False
@@ -192,8 +198,8 @@ class EnvironmentEmission:
         return ray, finite_or_zero(mi.unpolarized_spectrum(weight)) * area
 
 
-class OtherEmission:
-    """Rays from one emitter, by its own sampling routine."""
+class OtherSampler:
+    """Rays from one emitter, drawn by Mitsuba's sampling routine."""
 
     def __init__(self, emitter, sphere):
         self._emitter = emitter
@@ -206,18 +212,18 @@ class OtherEmission:
         return mi.Ray3f(ray.o, ray.d), weight
 
 
-def emission_groups(scene, emitters: Emitters, focus: Focus | None = None) -> list:
-    """The groups of emitters that radiate at all; what comes from infinity is aimed at the ``focus``, if any."""
+def emitter_samplers(scene, emitters: Emitters, focus: Focus | None = None) -> list:
+    """Samplers of all emitters with positive power.  Light from infinity is aimed at the ``focus``, if any."""
     sphere = bounding_sphere(scene)
     rays = ParallelRays(sphere, focus)
-    groups = []
+    samplers = []
     if emitters.points.count + emitters.spots.count:
-        groups.append(OmniEmission(emitters.points, emitters.spots))
+        samplers.append(OmniSampler(emitters.points, emitters.spots))
     if emitters.area.power.sum() > 0:
-        groups.append(AreaEmission(emitters.area))
+        samplers.append(AreaSampler(emitters.area))
     if emitters.directional.count:
-        groups.append(DirectionalEmission(emitters.directional, rays))
-    groups += [OtherEmission(emitter, sphere) for _, emitter in emitters.others]
+        samplers.append(DirectionalSampler(emitters.directional, rays))
+    samplers += [OtherSampler(emitter, sphere) for _, emitter in emitters.others]
     if emitters.environment is not None:
-        groups.append(EnvironmentEmission(emitters.environment, sphere, rays))
-    return [group for group in groups if group.power.sum() > 0]
+        samplers.append(EnvironmentSampler(emitters.environment, sphere, rays))
+    return [sampler for sampler in samplers if sampler.power.sum() > 0]

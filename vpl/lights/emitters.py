@@ -1,8 +1,8 @@
-"""Emitters of a scene read into flat arrays, once, without ever dispatching a kernel over emitter objects.
+"""Emitters of a scene in flat arrays, so that no kernel calls emitter pointers.
 
 A virtual call on emitter pointers makes Dr.Jit trace every emitter instance of the process: a minute of compilation
-for some thousands of lights.  Here point, spot, directional and area emitters become rows of arrays; the few that
-cannot (environment maps, projectors, textured spot emitters) are called directly, one by one.
+for some thousands of lights.  Here point, spot, directional and area emitters become rows of arrays.  Environment maps,
+projectors and textured spot emitters keep their objects, which kernels call one by one.
 """
 
 from __future__ import annotations
@@ -19,26 +19,27 @@ from ..core.registry import RegistryTable
 from .spheres import SphereRows
 from .virtual_lights import VirtualLights
 
-# Shapes, besides meshes, on which Mitsuba can sample a point; of others, such as curves, it does not know the area
+# Shapes, besides meshes, that Mitsuba can sample by area (curves, for example, cannot)
 SAMPLED_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
-# A call of some shapes, one by one, takes as long to record as one of so many times as many by their pointers
+# Time to record a call of one shape object, in calls of one shape by pointer
 _SHAPES_BY_POINTER = 4
 
 
 @dataclass
 class AreaEmitters:
-    """Area emitters as rows: the shape's registry index, radiance (RGB), area; textured ones keep their object.
+    """Area emitters as n rows.
 
-    ``shapes``: the shapes one by one, for scenes of many other shapes, or of one that cannot be sampled; see
-    :meth:`on_shape`.
-    ``spheres``: None where no shape is a sphere.
+    ``shape_index`` (n,) uint32: registry index of the shape; ``radiance`` (n, 3) float32: RGB, of textured emitters the
+    mean; ``area`` (n,) float32, world units squared; ``textured``: (row, emitter object) of textured emitters;
+    ``shapes``: the n shape objects, or None if kernels may call shape pointers, see :meth:`on_shape`; ``spheres``: None
+    if no shape is a sphere.
     """
 
     shape_index: np.ndarray
     radiance: np.ndarray
     area: np.ndarray
-    textured: list = field(default_factory=list)
-    shapes: list | None = None
+    textured: list[tuple[int, mi.Emitter]] = field(default_factory=list)
+    shapes: list[mi.Shape] | None = None
     spheres: SphereRows | None = None
 
     @property
@@ -47,7 +48,7 @@ class AreaEmitters:
 
     @property
     def power(self) -> np.ndarray:
-        """Emitted power up to a constant shared by all kinds: (n,) float64."""
+        """Emitted power, averaged over channels: (n,) float64."""
         return np.pi * self.area.astype(np.float64) * self.radiance.mean(1, dtype=np.float64)
 
     def __post_init__(self):
@@ -56,15 +57,15 @@ class AreaEmitters:
         self._shapes = upload(mi.UInt32, self.shape_index)
 
     def row(self, si, active=True):
-        """Row of the emitter that a hit (surface interaction or preliminary) lies on, plus one; 0 where on none."""
+        """Row of the emitter at a (preliminary) surface interaction, plus one; 0 for a surface without emitter."""
         return self._row_of_shape.at(si.shape, active)
 
     def on_shape(self, method: str, row, *arguments):
         """Call a method of the shape of each row (counted from 0); the last argument is the mask of active lanes.
 
-        A call on pointers is recorded for all shapes of a scene, emitters or not: quickly for each, but it fails if one
-        of them, such as a curve or an instance, does not have the method.  Then, and where most shapes are no emitters,
-        only emitters are called.
+        A call on pointers is recorded for every shape of a scene, emitter or not.  Recording is quick per shape, but
+        fails if a shape, such as a curve or an instance, lacks the method.  In scenes with such a shape, or with mostly
+        non-emitting shapes, only the emitting shape objects are called.
         """
         if self.shapes is not None:
             return dr.switch(mi.UInt32(row), [getattr(shape, method) for shape in self.shapes], *arguments)
@@ -72,21 +73,21 @@ class AreaEmitters:
         return getattr(dr.reinterpret_array(mi.ShapePtr, index), method)(*arguments)
 
     def sample_position(self, row, time, sample, active):
-        """A point on the shape of each row, by area: a position sample of Mitsuba."""
+        """Draw a point on the shape of each row uniformly by area: Mitsuba's position sample."""
         found = self.on_shape("sample_position", row, time, sample, active)
         if self.spheres is not None:
             found.n = self.spheres.normal(row, found, active)
         return found
 
     def sample_direction(self, row, si, sample, active):
-        """A point on the shape of each row as seen from ``si``: a direction sample of Mitsuba."""
+        """Draw a point on the shape of each row towards ``si``: Mitsuba's direction sample."""
         found = self.on_shape("sample_direction", row, si, sample, active)
         if self.spheres is not None and self.textured:
             found.uv = self.spheres.coordinates(row, found, active)
         return found
 
     def emitted_in_front(self, row, sample, active=True):
-        """Radiance that a position sample (or direction sample) on the emitter of ``row`` sends to its front."""
+        """Radiance along the normal at a position or direction sample on the emitter of ``row``."""
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(row))
         si.p, si.n, si.uv, si.wi = sample.p, sample.n, sample.uv, mi.Vector3f(0, 0, 1)
         return self.emitted(row, si, active)
@@ -103,22 +104,23 @@ class AreaEmitters:
 
 @dataclass
 class Emitters:
-    """All emitters of a scene, sorted by what can be done with them.
+    """Emitters of a scene by representation.
 
     ``points``, ``spots``, ``directional``: virtual lights; ``area``: rows; ``environment``: the environment emitter or
-    None; ``others``: (name, emitter) of emitters that only their own sampling routines know.
+    None; ``others``: (class name, emitter) of the remaining emitters, sampled by Mitsuba's routines; ``dropped``:
+    number of emitters dropped because of negative or non-finite values.
     """
 
     points: VirtualLights
     spots: VirtualLights
     directional: VirtualLights
     area: AreaEmitters
-    environment: object | None
-    others: list
+    environment: mi.Emitter | None
+    others: list[tuple[str, mi.Emitter]]
     dropped: int
 
     def extended_only(self) -> Emitters:
-        """These emitters without point, spot and directional ones."""
+        """Copy without point, spot and directional emitters."""
         none = {name: getattr(self, name).select(slice(0)) for name in ("points", "spots", "directional")}
         return replace(self, **none)
 
@@ -131,7 +133,7 @@ class Emitters:
 
 
 def _constant_rgb(parameters, name):
-    """A spectrum parameter as RGB if it is the same everywhere, else None."""
+    """RGB value of a spectrum parameter without spatial variation, else None."""
     value = parameters.get(f"{name}.value")
     if value is None:
         return None
@@ -158,7 +160,7 @@ def _textured_radiance(emitter, shape) -> np.ndarray:
 
 
 def registered_shapes(scene) -> list:
-    """(Registry index, shape) of all shapes of a scene."""
+    """(Registry index, shape) of every shape of a scene."""
     registry = download(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())) if scene.shapes() else []
     return [(int(index), shape) for index, shape in zip(registry, scene.shapes(), strict=True)]
 
@@ -168,27 +170,18 @@ def _can_be_sampled(shape) -> bool:
 
 
 def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
-    """Area emitters, the number of rows with values that are not finite, and emitters that only look like area ones."""
+    """(Area emitters, number of rows with invalid values, shape-bound emitters of further classes)."""
     indices, radiances, textured, spheres, unusual = [], [], [], [], []
-    glowing = [(index, shape) for index, shape in registered_shapes(scene) if shape.is_emitter()]
+    emitting = [(index, shape) for index, shape in registered_shapes(scene) if shape.is_emitter()]
     # Mitsuba loads shapes in parallel, in an order that changes from run to run; the same seed must give the same image
-    glowing.sort(key=lambda row: (row[1].id(), *map(float, (*row[1].bbox().min, *row[1].bbox().max))))
-    for index, shape in glowing:
+    emitting.sort(key=lambda row: (row[1].id(), *map(float, (*row[1].bbox().min, *row[1].bbox().max))))
+    for index, shape in emitting:
         emitter = shape.emitter()
         if emitter.class_name() != "AreaLight":
             unusual.append((emitter.class_name(), emitter))
             continue
-        if not _can_be_sampled(shape):
-            raise ValueError(
-                f'shape "{shape.id()}" ({shape.class_name()}): an area emitter on a shape of this kind is not '
-                f"supported, because no point on it can be sampled; one on a mesh, {', '.join(SAMPLED_SHAPES)} is"
-            )
         radiance = _constant_rgb(parameters_of(emitter), "radiance")
-        if radiance is None and "MeshAttribute[" in str(emitter):
-            raise ValueError(
-                f'shape "{shape.id()}" ({shape.class_name()}): the emitted radiance is a mesh attribute, which is '
-                "not supported; a constant or an image is"
-            )
+        _require_supported(shape, constant=radiance is not None)
         if radiance is None:
             textured.append((len(indices), emitter))
             radiance = _textured_radiance(emitter, shape)
@@ -199,31 +192,52 @@ def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
     bad = ~usable(radiance).all(1)
     radiance[bad] = 0
     shape_index = np.array(indices, np.uint32)
-    area, shapes = np.zeros(len(indices), np.float32), None
-    all_shapes = scene.shapes()
-    by_pointer = _SHAPES_BY_POINTER * len(indices) > len(all_shapes)
-    if len(indices) and by_pointer and all(_can_be_sampled(shape) for shape in all_shapes):
-        pointers = dr.reinterpret_array(mi.ShapePtr, upload(mi.UInt32, shape_index))
-        area = download(pointers.surface_area())
-    elif len(indices):
-        by_index = dict(glowing)
-        shapes = [by_index[index] for index in indices]
-        row = dr.arange(mi.UInt32, len(shapes))
-        area = download(dr.switch(row, [shape.surface_area for shape in shapes]))
+    by_index = dict(emitting)
+    area, shapes = _surface_areas(scene, shape_index, [by_index[index] for index in indices])
     rows = SphereRows(spheres) if any(spheres) else None
     return AreaEmitters(shape_index, radiance, area, textured, shapes, rows), int(bad.sum()), unusual
 
 
+def _require_supported(shape, constant: bool) -> None:
+    """Raise a ValueError for an area emitter on a shape that cannot be sampled, or with a mesh attribute as radiance.
+
+    ``constant``: whether the radiance is constant.
+    """
+    if not _can_be_sampled(shape):
+        raise ValueError(
+            f'shape "{shape.id()}" ({shape.class_name()}): area emitters on this kind of shape are not supported, '
+            f"because Mitsuba cannot sample it; supported are meshes, {', '.join(SAMPLED_SHAPES)}"
+        )
+    if not constant and "MeshAttribute[" in str(shape.emitter()):
+        raise ValueError(
+            f'shape "{shape.id()}" ({shape.class_name()}): the emitted radiance is a mesh attribute, which is not '
+            "supported; supported are a constant and an image"
+        )
+
+
+def _surface_areas(scene, shape_index: np.ndarray, shapes: list[mi.Shape]):
+    """(Areas of the emitting shapes, (n,) float32, ``shapes`` of :class:`AreaEmitters`)."""
+    if not shapes:
+        return np.zeros(0, np.float32), None
+    all_shapes = scene.shapes()
+    by_pointer = _SHAPES_BY_POINTER * len(shapes) > len(all_shapes)
+    if by_pointer and all(_can_be_sampled(shape) for shape in all_shapes):
+        pointers = dr.reinterpret_array(mi.ShapePtr, upload(mi.UInt32, shape_index))
+        return download(pointers.surface_area()), None
+    row = dr.arange(mi.UInt32, len(shapes))
+    return download(dr.switch(row, [shape.surface_area for shape in shapes])), shapes
+
+
 def _sorted_rows(rows: list, columns: int) -> np.ndarray:
-    """Rows of numbers in an order that depends on nothing else; see :func:`_read_areas`."""
+    """Rows in lexicographic order, hence independent of Mitsuba's loading order."""
     array = np.array(rows, np.float64).reshape(-1, columns)
     return array[np.lexsort(array.T[::-1])]
 
 
 def _read_environment(scene):
-    """The environment, or None where there is none or it is one colour that is not usable, and how many were dropped.
+    """(Environment emitter or None, number of dropped environments); a constant with an invalid value is dropped.
 
-    Raises a ValueError that names a texel of an environment map that is not finite: Mitsuba cannot sample the map.
+    Raises a ValueError that names the first invalid texel of an environment map: Mitsuba cannot sample the map.
     """
     environment = scene.environment()
     if environment is None:
@@ -231,36 +245,36 @@ def _read_environment(scene):
     if environment.class_name() == "TimedSunskyEmitter":
         raise ValueError(
             f'the emitter "{environment.id()}" ({environment.class_name()}) is not supported: Mitsuba\'s compiled '
-            "variants cannot evaluate it; sunsky is"
+            "variants cannot evaluate it; use sunsky"
         )
     parameters = parameters_of(environment)
     radiance = _constant_rgb(parameters, "radiance")
     if radiance is not None and not usable(np.array(radiance)).all():
         return None, 1
     if "data" in parameters:
-        # Mitsuba puts a copy of the last column first.  Negative texels, which filters leave in maps, are black here
+        # Mitsuba puts a copy of the last column first.  Negative texels, which filters leave in maps, count as black
         texels = np.asarray(parameters["data"])[:, 1:]
         if not usable(max(-texels.min(), texels.max())):
             bad = np.argwhere(~usable(np.abs(texels)).all(-1))
             row, column = bad[0].tolist()
             raise ValueError(
                 f'the environment map "{environment.id()}" has {len(bad)} texel(s) that are not a number or above '
-                f"{LARGEST_VALUE:g}, such as that in row {row} and column {column}"
+                f"{LARGEST_VALUE:g}; the first is in row {row} and column {column}"
             )
     return environment, 0
 
 
 def _lights_nothing(emitter) -> bool:
-    """Whether no path of Mitsuba's ``path`` ends at an emitter, because none meets it by chance and none samples it."""
+    """Whether Mitsuba's ``path`` can neither hit nor sample an emitter."""
     is_delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
     return emitter.class_name() == "DirectionalArea" or (is_delta and emitter.sampling_weight() == 0)
 
 
 def read_emitters(scene) -> Emitters:
-    """Read all emitters of ``scene`` that light it in ``path``.
+    """Read the emitters of ``scene`` that contribute in Mitsuba's ``path``.
 
-    Lights with values that are not finite or negative are dropped, counted and reported; a ValueError names an
-    environment map with texels that are not finite, and emitters on shapes that cannot be sampled.
+    Emitters with negative or non-finite values are dropped, counted and logged.  Raises ValueError for environment maps
+    with invalid texels and for emitters on shapes that Mitsuba cannot sample.
     """
     points, spots, suns, others = [], [], [], []
     environment, dropped = _read_environment(scene)
@@ -291,7 +305,7 @@ def read_emitters(scene) -> Emitters:
         dropped += bad
         kept.append(lights)
     if dropped:
-        mi.Log(mi.LogLevel.Warn, f"{dropped} emitter(s) with values that are negative or not finite were dropped.")
+        mi.Log(mi.LogLevel.Warn, f"Dropped {dropped} emitter(s) with negative or non-finite values.")
     others += [row for row in others_on_shapes if not _lights_nothing(row[1])]
     others.sort(key=lambda row: (row[0], row[1].id(), str(row[1])))
     return Emitters(*kept, area, environment, others, dropped)

@@ -1,6 +1,6 @@
-"""Everything that a method needs to know about the lights of one render: virtual lights, their trees, the clamp.
+"""The lights of one render: virtual lights, light trees, and the clamping distance.
 
-Emitters that have an extent become virtual lights here where that is asked for, as in the papers.
+With ``direct="vpl"`` emitters with an extent become virtual lights, as in the papers.
 """
 
 from __future__ import annotations
@@ -21,16 +21,13 @@ from .emission import bounding_sphere
 from .emitters import Emitters
 from .focus import Focus, spacing
 from .light_tree import CONE_COS, DeviceTree, LightTree, build_light_tree
-from .tracing import PathLimits, TracedLights, trace_lights
+from .tracing import PathSettings, TracedLights, trace_lights
 from .virtual_lights import KINDS, DeviceLights, VirtualLights
 
 
 @dataclass(frozen=True)
 class LightOptions:
-    """What lights to make: see the integrators' manual for ``vpl_count``, ``direct_count``, ``clamping``, ``direct``.
-
-    ``deepest``: edges of the longest light path that may store a light; ``trees``: whether trees are needed.
-    """
+    """Settings of light generation, documented in the integrators' manual; ``trees``: whether to build light trees."""
 
     vpl_count: int
     direct_count: int
@@ -44,7 +41,7 @@ class LightOptions:
 
 @dataclass
 class LightGroup:
-    """Lights of one kind on the device, with their tree (None where the method asks for none)."""
+    """Lights of one kind on the device, with their tree (None if the method uses none)."""
 
     kind: str
     lights: DeviceLights
@@ -55,20 +52,19 @@ class LightGroup:
         return self.lights.count
 
     def pick(self, index):
-        """Lights by their index, each standing for itself: the candidates of
-        :func:`vpl.transport.evaluation.evaluate_one_of`.
-        """
+        """Lights by index with scale factor 1, for :func:`vpl.transport.evaluation.evaluate_one_of`."""
         return [(self.lights.gather(index), 1)]
 
     def representatives(self, nodes, second=False):
-        """The light that stands for each node, or its second one: see :meth:`standing_for`."""
+        """Representative light of each node, or the second one, with its scale factor; see :meth:`standing_for`."""
         return self.standing_for(self.tree.representative(nodes, second=second), self.tree.summed_intensity(nodes))
 
     def standing_for(self, index, intensity):
-        """Lights by their index, and the factors from their intensities to those of the clusters they stand for.
+        """Representative lights by index, and the factors from their intensities to the clusters' ``intensity``.
 
-        A representative is drawn with probability intensity / cluster intensity; dividing by it, rather than taking the
-        cluster's colour, keeps the estimate unbiased where colours differ.  ``intensity``: the mean over channels.
+        ``intensity``: of the clusters, the mean over channels.  A representative's probability is (its intensity) /
+        (cluster intensity).  Division by this probability, instead of use of the cluster's colour, keeps the estimate
+        unbiased if colours differ.
         """
         light = self.lights.gather(index)
         return light, intensity / channel_mean(light.intensity)
@@ -76,11 +72,12 @@ class LightGroup:
 
 @dataclass
 class LightSet:
-    """Groups that hold at least one light; ``smallest_distance``: the clamp on distances to oriented lights, ``clamp``:
-    the same on the device, where it is part of no kernel.
+    """Lights of one render.
 
-    ``max_depth``: edges of the longest path from camera to emitter; ``paths``: light paths emitted; ``dropped``: lights
-    with values that were not finite; ``seconds``: time by stage.
+    ``groups``: non-empty groups; ``smallest_distance``: clamping distance of oriented lights, world units; ``clamp``:
+    the same number on the device, opaque to kernels; ``max_depth``: edges of the longest path from camera to emitter;
+    ``paths``: number of emitted light paths; ``dropped``: number of lights with non-finite values; ``seconds``: time by
+    stage.
     """
 
     groups: list[LightGroup]
@@ -88,8 +85,8 @@ class LightSet:
     max_depth: float
     paths: int
     dropped: int
-    seconds: dict
-    clamp: object = field(init=False)
+    seconds: dict[Stage, float]
+    clamp: mi.Float = field(init=False)
 
     def __post_init__(self):
         self.clamp = dr.opaque(mi.Float, self.smallest_distance)
@@ -99,60 +96,62 @@ class LightSet:
         return sum(group.count for group in self.groups)
 
     @property
-    def counts(self) -> dict:
+    def counts(self) -> dict[str, int]:
         return {group.kind: group.count for group in self.groups}
 
     def allowed(self, point_depth, light_depth):
-        """Whether a path through a gather point and a light has no more edges than ``max_depth``."""
+        """Whether a path through a gather point and a light has at most ``max_depth`` edges."""
         if math.isinf(self.max_depth):
             return mi.Bool(True)
         return point_depth + light_depth + 1 <= mi.UInt32(self.max_depth)
 
     def edges_left(self, point_depth, light_depth):
-        """How many edges more an allowed path through a gather point and a light may have, UInt32."""
+        """Number of edges that a path through a gather point and a light may gain, UInt32."""
         if math.isinf(self.max_depth):
             return mi.UInt32(NO_LIMIT)
         return mi.UInt32(self.max_depth) - (point_depth + light_depth + 1)
 
 
 def _leaf_ranges(tree: LightTree) -> np.ndarray:
-    """For every node, the first and one past the last of its lights in ``tree.leaf_order``: (2n - 1, 2)."""
+    """Begin and end of every node's lights in ``tree.leaf_order``: (2n - 1, 2)."""
     node = np.arange(len(tree.records))
     leaves_before = np.concatenate([[0], np.cumsum(tree.escape == node + 1)])
     return np.stack([leaves_before[node], leaves_before[tree.escape]], axis=1)
 
 
 def _reduced_below(tree: LightTree, reduce: np.ufunc, values: np.ndarray, neutral: float) -> np.ndarray:
-    """For every node, the values of its lights reduced to one: (2n - 1, ...) from (n, ...) in the lights' own order."""
+    """Reduce ``values`` (n, ...) of the lights, in the caller's order, to every node: (2n - 1, ...)."""
     in_order = np.concatenate([values[tree.leaf_order], np.full((1, *values.shape[1:]), neutral)])
     return reduce.reduceat(in_order, _leaf_ranges(tree).reshape(-1))[::2]
 
 
 def largest_below(tree: LightTree, values: np.ndarray) -> np.ndarray:
-    """For every node, the largest of a value over its lights: (2n - 1,) from (n,) in the lights' own order."""
+    """Maximum over every node's lights of ``values`` (n,), in the caller's order: (2n - 1,)."""
     return _reduced_below(tree, np.maximum, values, -np.inf)
 
 
 def moments_below(tree: LightTree, position: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For every node, the weighted mean of the positions (n, 3) of its lights, (2n - 1, 3), and the mean of their
-    squared distance from there, (2n - 1,).  ``weight`` (n,): where all of a node are 0, they count alike."""
+    """(Weighted mean position (2n - 1, 3), mean squared distance from it (2n - 1,)) of every node's lights.
+
+    ``position`` (n, 3); ``weight`` (n,): a node with zero total weight uses equal weights.
+    """
     place, weight = position.astype(np.float64), weight.astype(np.float64)
     origin = place.mean(0)
-    # Relative to the middle of all, as the squares of large numbers have no digits left for small differences
+    # Relative to the mean of all lights: squares of large coordinates would lose the digits of small differences
     place = place - origin
     powers = np.concatenate([np.ones((len(place), 1)), place, (place**2).sum(1, keepdims=True)], axis=1)
-    weighted, alike = (_reduced_below(tree, np.add, x, 0.0) for x in (powers * weight[:, None], powers))
-    total = np.where(weighted[:, :1] > 0, weighted, alike)
+    weighted, unweighted = (_reduced_below(tree, np.add, x, 0.0) for x in (powers * weight[:, None], powers))
+    total = np.where(weighted[:, :1] > 0, weighted, unweighted)
     total = total[:, 1:] / total[:, :1]
     mean = total[:, :3]
     return mean + origin, np.maximum(total[:, 3] - (mean**2).sum(1), 0)
 
 
 def _second_representatives(tree: LightTree, intensity: np.ndarray, generator) -> np.ndarray:
-    """For every node, one of its lights, drawn by intensity and independently of all others: (2n - 1,).
+    """A second representative light of every node, drawn by intensity, independently for each node: (2n - 1,).
 
-    A threshold that was found with the same representatives that the final cut uses keeps bright ones and refines dark
-    ones, which biases the image upwards; estimates use these instead.
+    Radiance estimates for thresholds use second representatives.  With the final cut's representatives, thresholds
+    would keep bright representatives and refine dark ones, which biases the image upwards.
     """
     first, last = _leaf_ranges(tree).T
     cumulative = np.concatenate([[0.0], np.cumsum(intensity[tree.leaf_order].astype(np.float64))])
@@ -162,7 +161,7 @@ def _second_representatives(tree: LightTree, intensity: np.ndarray, generator) -
 
 
 def light_tree(lights: VirtualLights, seed: int) -> DeviceTree:
-    """The light tree of one kind."""
+    """Light tree over lights of one kind; ``seed``: of the representatives."""
     generator = np.random.default_rng(seed)
     tree = _tree_of(lights, generator)
     second = _second_representatives(tree, lights.intensity.mean(1), generator)
@@ -170,7 +169,7 @@ def light_tree(lights: VirtualLights, seed: int) -> DeviceTree:
 
 
 def _tree_of(lights: VirtualLights, generator) -> LightTree:
-    """The tree over lights of one kind; a spot tree's cones are widened by the cut-off angles below each node."""
+    """Tree over lights of one kind; cones of spot trees are widened by the largest cut-off angle below each node."""
     direction = None if lights.kind == "point" else lights.direction
     tree = build_light_tree(lights.position, direction, lights.intensity, generator)
     if lights.kind == "spot":
@@ -182,20 +181,20 @@ def _tree_of(lights: VirtualLights, generator) -> LightTree:
 
 @dataclass
 class ScatteredGroup(LightGroup):
-    """Lights whose clusters have no fixed representative: one is drawn whenever it is asked for.
+    """Lights whose clusters have no fixed representative: :meth:`draw` draws a new one at every call.
 
-    ``first``, ``last``: UInt32, of every node the range of its lights in ``order``; ``cumulative``: their summed
-    intensities in that order, in double precision.
+    ``first``, ``last``: per node, the range of its lights in ``order``; ``order``: lights in preorder; ``cumulative``:
+    running sums of their intensities, in double precision.
     """
 
-    first: object = None
-    last: object = None
-    order: object = None
-    cumulative: object = None
+    first: mi.UInt32
+    last: mi.UInt32
+    order: mi.UInt32
+    cumulative: mi.Float64
 
     @classmethod
     def of(cls, lights: VirtualLights, seed: int) -> ScatteredGroup:
-        """Lights of one kind, with their tree."""
+        """Group with a tree over lights of one kind; ``seed``: of the representatives."""
         tree = _tree_of(lights, np.random.default_rng(seed))
         first, last = (upload(mi.UInt32, column) for column in _leaf_ranges(tree).T)
         intensity = lights.intensity.mean(1, dtype=np.float64)
@@ -205,17 +204,18 @@ class ScatteredGroup(LightGroup):
         )  # fmt: skip
 
     def draw(self, nodes, sample):
-        """A light of each node by intensity, for a uniform number: (lights, factor on their intensities)."""
+        """Draw a light of each node by intensity with a uniform number: (lights, scale factors)."""
         first, last = dr.gather(mi.UInt32, self.first, nodes), dr.gather(mi.UInt32, self.last, nodes)
         index = dr.gather(mi.UInt32, self.order, find_interval(self.cumulative, first, last, sample))
         return self.standing_for(index, self.tree.summed_intensity(nodes))
 
 
 def prepare_lights(scene, emitters: Emitters, options: LightOptions, places: np.ndarray, seed: int) -> LightSet:
-    """Make the lights of one render: emitters that are points, extended emitters if asked, traced lights, trees.
+    """Lights and light trees of one render, from point-like emitters, traced light paths, and optionally from emitters
+    with an extent.
 
-    Nothing is traced for ``max_depth`` up to 2, where light cannot bounce.  ``places``: some that the camera sees,
-    (n, 3) world units.
+    For ``max_depth`` up to 2 no paths are traced, because light cannot bounce.  ``places``: some visible points, (n, 3)
+    world units.
     """
     tell(Stage.TRACE)
     start = perf_counter()
@@ -225,9 +225,9 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, places: np.
         if options.direct == "vpl":
             found += lights_of_emitters(scene, emitters, options.direct_count, derived_seed(seed, 20))
     if options.max_depth > 2:
-        limits = PathLimits(options.max_depth - 2, options.rr_depth, options.lobe_limit)
+        settings = PathSettings(options.max_depth - 2, options.rr_depth, options.lobe_limit)
         focus = Focus.of(places, bounding_sphere(scene))
-        traced = trace_lights(scene, emitters, options.vpl_count, derived_seed(seed, 21), limits, focus)
+        traced = trace_lights(scene, emitters, options.vpl_count, derived_seed(seed, 21), settings, focus)
         found.append(traced.lights)
     seconds = {Stage.TRACE: perf_counter() - start}
 
@@ -250,8 +250,7 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, places: np.
 
 
 def _spacing(found: list[VirtualLights], traced: TracedLights | None, places: np.ndarray) -> float:
-    """Typical distance between lights that stand for surfaces: of traced ones where the camera looks, or else of those
-    on area emitters."""
+    """Typical distance between lights on surfaces: traced lights around ``places``, or else lights on area emitters."""
     if traced and traced.lights.count:
         return spacing(traced.lights.position, places)
     on_emitters = [lights.position for lights in found if lights.kind == "oriented" and lights.count]
@@ -259,23 +258,22 @@ def _spacing(found: list[VirtualLights], traced: TracedLights | None, places: np
 
 
 def area_lights(emitters: Emitters, count: int, seed: int, weight: np.ndarray | None = None) -> VirtualLights:
-    """``count`` points on area emitters as oriented lights: emitters chosen by ``weight`` (None: by power), points by
-    area."""
+    """``count`` oriented lights on area emitters: emitters chosen by ``weight`` (None: by power), points by area."""
     area = emitters.area
     choice = Choice(area.power if weight is None else weight)
     sampler = independent_sampler(seed, count)
     row = choice.row(stratified(sampler, count, 0, count))
     ps = area.sample_position(row, mi.Float(0), sampler.next_2d(), mi.Bool(True))
     intensity = spectrum_to_rgb(area.emitted_in_front(row, ps)) / (ps.pdf * choice.probability(row))
-    # Divided on the device, where the number of lights is part of no kernel
+    # Opaque: the number of lights must not become a constant of the kernel
     intensity /= dr.opaque(mi.Float, float(count))
-    # By one kernel, which holds the code of all shapes
+    # One kernel, because it contains the code of every kind of shape
     dr.eval(ps.p, ps.n, intensity)
     return VirtualLights.of("oriented", download(ps.p), download(ps.n), download(intensity))
 
 
 def environment_lights(scene, emitters: Emitters, count: int, seed: int) -> VirtualLights:
-    """``count`` directions towards the environment as lights at infinity, by its own importance sampling."""
+    """``count`` lights at infinity, drawn by the environment emitter's importance sampling."""
     sampler = independent_sampler(seed, count)
     reference = dr.zeros(mi.Interaction3f, count)
     reference.p = mi.Point3f(bounding_sphere(scene).center)
@@ -285,9 +283,9 @@ def environment_lights(scene, emitters: Emitters, count: int, seed: int) -> Virt
 
 
 def lights_of_emitters(scene, emitters: Emitters, count: int, seed: int) -> list[VirtualLights]:
-    """Area emitters and the environment as ``count`` virtual lights each.
+    """``count`` virtual lights on area emitters, and ``count`` for the environment emitter.
 
-    Raises a ValueError naming the first emitter that has no such form.
+    Raises ValueError for emitters of any further class.
     """
     for name, _ in emitters.others:
         raise ValueError(f'emitter of type "{name}" cannot become virtual lights: use direct="nee" with this scene')

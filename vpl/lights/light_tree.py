@@ -1,22 +1,23 @@
-"""A binary tree over point-like lights, built bottom-up with NumPy and laid out for a walk without a stack.
+"""Light tree: a binary tree over point-like lights, built bottom-up with NumPy, in a layout for stackless traversal.
 
-Every node bounds its lights (box of positions, cone of directions), sums their flux and names one as representative
-[LC, section 3]. The tree is built by parallel locally-ordered clustering, which vpl/lights/clustering.py explains:
-every cluster looks for its cheapest partner within ``window`` neighbours to either side. A merge costs the cluster size
-[LC, section 5]
+Every node stores bounds of its lights (box of positions, cone of directions), their summed flux and a representative
+light [LC, section 3]. Parallel locally-ordered clustering (:mod:`vpl.lights.clustering`) builds the tree: every cluster
+searches its cheapest partner within ``window`` neighbours to either side. The merge cost is the cluster size [LC,
+section 5]
 
     intensity * (α² + c² (1 − cos β)²),     α: diagonal of the merged box, β: half-angle of the merged cone.
 
 Departures from the papers, measured on 60,000 lights (a room of boxes and spheres, the same room with bumpy normals,
 ellipsoids; see benchmarks/light_tree.py) by the mean size of a cut of 2% for a diffuse receiver:
 
-- While clustering, d² / 8 stands for 1 − cos β, d being the diagonal of the box of the directions. Both agree where
-  directions are close; at a hemisphere it is half. Cuts are 2 to 5% smaller than with cones joined pair by pair.
-- c is a quarter of the scene's diagonal (``angular_weight`` = 1/16; 1 is the paper's). The paper's weight lowers the
-  paper's cost by 20 to 30%, but makes cuts 21% larger on ellipsoids, 35% on bumpy walls and 2% on flat ones.
-- The Morton code holds no directions: with them, cuts shrank by 7% on flat walls and grew by 40% on bumpy ones.
+- The clustering replaces 1 − cos β by d² / 8, where d is the diagonal of the box of the directions. The two agree for
+  close directions; for a hemisphere the replacement is half. Cuts are 2 to 5% smaller than with cones joined pairwise.
+- c is a quarter of the scene's diagonal (``angular_weight`` = 1/16; the paper uses 1). The paper's weight lowers the
+  paper's cost by 20 to 30%, but makes cuts 21% larger on ellipsoids, 35% on bumpy walls and 2% on flat walls.
+- The Morton code contains no directions: with directions, cuts shrank by 7% on flat walls and grew by 40% on bumpy
+  walls.
 
-Kernels see the tree as :class:`DeviceTree`: packed records of which one gather fetches a node.
+Kernels use :class:`DeviceTree`: packed records, one per node.
 
 [LC] Walter et al. 2005, Lightcuts: a scalable approach to illumination.
 """
@@ -44,7 +45,7 @@ from .clustering import (
 
 # Factor of the squared angular term of the metric: a quarter of the scene's diagonal, squared
 ANGULAR_WEIGHT = 1 / 16
-# Columns of LightTree.records, and how many there are
+# Columns of LightTree.records, and their number
 BOX_MIN, BOX_MAX, CONE_AXIS, CONE_COS = slice(0, 3), slice(3, 6), slice(6, 9), 9
 INTENSITY, FLUX, ESCAPE, REPRESENTATIVE = 10, slice(11, 14), 14, 15
 COLUMNS = 16
@@ -54,13 +55,13 @@ COLUMNS = 16
 class LightTree:
     """A tree over n lights: 2n - 1 records in preorder.
 
-    The children of the inner node i are i + 1 and escape[i + 1]; for a leaf, escape[i] == i + 1. To walk it, start at
-    i = 0; refine by i = i + 1; take or skip a whole subtree by i = escape[i]; stop at 2n - 1.
+    The children of the inner node i are i + 1 and escape[i + 1]; for a leaf, escape[i] == i + 1. Traversal starts at
+    i = 0, refines a node by i = i + 1, accepts or skips a whole subtree by i = escape[i], and stops at 2n - 1.
 
     records: (2n - 1, 16) float32. BOX_MIN, BOX_MAX: exact bounds of the positions, world units (zeros for lights at
-      infinity). CONE_AXIS, CONE_COS: unit axis and cosine of the half-angle of a cone around all directions (+z and -1
-      for lights that radiate everywhere). INTENSITY, FLUX: summed flux, as the mean of the channels and per channel.
-      ESCAPE, REPRESENTATIVE: uint32 bit patterns, which the properties below read.
+      infinity). CONE_AXIS, CONE_COS: unit axis and cosine of the half-angle of a cone around the directions (+z and -1
+      for omnidirectional lights). INTENSITY, FLUX: summed flux, as the mean over channels and per channel. ESCAPE,
+      REPRESENTATIVE: uint32 bit patterns, see the properties.
     leaf_order: (n,) uint32, the caller's indices of the lights in preorder. A node's lights are a contiguous range.
     depth: edges from the root to the deepest leaf.
     """
@@ -71,26 +72,26 @@ class LightTree:
 
     @property
     def escape(self) -> np.ndarray:
-        """(2n - 1,) uint32 view: the node that follows this node's subtree."""
+        """(2n - 1,) uint32 view: first node after each node's subtree."""
         return self.records.view(np.uint32)[:, ESCAPE]
 
     @property
     def representative(self) -> np.ndarray:
-        """(2n - 1,) uint32 view: the light that stands for this node, an index into the caller's arrays."""
+        """(2n - 1,) uint32 view: representative light of each node, an index into the caller's arrays."""
         return self.records.view(np.uint32)[:, REPRESENTATIVE]
 
 
 def build_light_tree(position, direction, flux, rng, window=16, angular_weight=ANGULAR_WEIGHT) -> LightTree:
-    """Cluster lights into a binary tree; the module's docstring says how.
+    """Cluster lights into a binary tree by the method of the module's docstring.
 
-    position: (n, 3) float32, world units; None for lights at infinity, which cluster by direction alone.
-    direction: (n, 3) float32 unit vectors; None for lights that radiate everywhere, which cluster by position alone.
-    flux: (n, 3) float32, finite, not negative, any unit. Black lights must have been dropped.
-    rng: numpy.random.Generator that draws the representatives; the shape of the tree does not depend on it.
-    window: neighbours tried to either side, 1 to 1024; the time to cluster is proportional to it.
-    angular_weight: factor of the squared angular term of the metric, relative to that of the positions.
+    position: (n, 3) float32, world units; None for lights at infinity, which are clustered by direction alone.
+    direction: (n, 3) float32 unit vectors; None for omnidirectional lights, which are clustered by position alone.
+    flux: (n, 3) float32, finite, not negative, any unit, positive in at least one channel per light.
+    rng: numpy.random.Generator for the representatives; the tree's topology is independent of it.
+    window: neighbours tried to either side, 1 to 1024; clustering time is proportional to the window.
+    angular_weight: factor of the squared angular term of the metric, relative to the squared positional term.
 
-    Raises ValueError, naming the argument and the first bad light, where an input is not as described.
+    Raises ValueError with the argument's name and the first invalid light.
     """
     if not 1 <= window <= 1024:
         raise ValueError(f"window must be from 1 to 1024, got {window}")
@@ -106,7 +107,7 @@ def build_light_tree(position, direction, flux, rng, window=16, angular_weight=A
 def cluster_sizes(records: np.ndarray) -> np.ndarray:
     """Cluster size [LC, section 5] of every node of a tree, (m,) float64, from its records, (m, 16).
 
-    In units of the squared diagonal of all lights, or of angles where lights have no places.
+    Unit: intensity times the squared diagonal of the root's box; for lights without positions, intensity alone.
     """
     diagonal2 = np.square(records[:, BOX_MAX].astype(np.float64) - records[:, BOX_MIN]).sum(1)
     angular = np.square(1 - records[:, CONE_COS].astype(np.float64))
@@ -116,14 +117,14 @@ def cluster_sizes(records: np.ndarray) -> np.ndarray:
 
 
 def _validate(position, direction, flux):
-    """Return the inputs as float32 arrays or None; raise ValueError for what is not as build_light_tree asks."""
+    """Return the inputs as float32 arrays or None; raise ValueError if build_light_tree does not allow them."""
     if position is None and direction is None:
-        raise ValueError("position and direction are both None, which leaves nothing to cluster by")
+        raise ValueError("position and direction are both None: clustering needs at least one of them")
     arrays = {"flux": flux, "position": position, "direction": direction}
     for name, value in arrays.items():
         if value is None and name != "flux":
             continue
-        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is refused as such
+        with np.errstate(over="ignore"):  # overflow to infinity is rejected below
             array = arrays[name] = np.asarray(value, dtype=np.float32)
         if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
             raise ValueError(f"{name} must have the shape (n, 3) with n > 0, got {array.shape}")
@@ -142,19 +143,19 @@ def _validate(position, direction, flux):
 
 
 def _sort_lights(position, direction):
-    """Indices of the lights along a Morton curve, 21 bits an axis, (n,) int64."""
+    """Indices of the lights along a Morton curve with 21 bits per axis, (n,) int64."""
     by_direction = position is None or (direction is not None and (position == position[0]).all())
     return morton_order((direction if by_direction else position).astype(np.float64))
 
 
 def _start_clusters(position, direction, flux, order, angular_weight):
-    """Clusters of one light each, sorted: (2k + 1, n) float32, boxes and below them intensities.
+    """Clusters of one light each in ``order``: (2k + 1, n) float32, boxes and a last row of intensities.
 
-    The first k rows are negated lower corners, the next k upper ones, so that one maximum joins two boxes and one sum
-    gives extents; k is 3, or 6 with positions (in units of the scene's largest extent) before directions. Those are
-    scaled by s, such that the metric needs no factor: (s d)⁴ = angular_weight c² (d² / 8)², for c the whole diagonal.
+    The first k rows are negated lower corners, the next k upper corners: one maximum joins two boxes, and one sum gives
+    extents. k is 3, or 6 with positions (in units of the scene's largest extent) before directions. A factor s on
+    directions includes all factors of the metric: (s d)⁴ = angular_weight c² (d² / 8)², where c is the diagonal.
     """
-    corners, weight, diagonal = [], 1.0, 1.0  # as good as any others where directions alone decide
+    corners, weight, diagonal = [], 1.0, 1.0  # without positions any scale gives the same order of costs
     if position is not None:
         low = position.min(axis=0).astype(np.float64)
         extent = position.max(axis=0) - low
@@ -166,13 +167,13 @@ def _start_clusters(position, direction, flux, order, angular_weight):
         scale = np.float32(weight**0.25 * (diagonal / 8) ** 0.5)
         corners += [direction[:, axis][order] * scale for axis in range(3)]
     upper = np.stack(corners)
-    # The factor leaves most of float32's exponents to dim lights, and the sum of all lights finite.
+    # The factor reserves most float32 exponents for dim lights and keeps the sum of all lights finite
     mean = flux.mean(axis=1, dtype=np.float64)[order]
     return np.concatenate([-upper, upper, (mean / mean.max() * 2.0**64).astype(np.float32)[None]])
 
 
 def _cluster(clusters, window, has_position):
-    """Rounds of merges, as vpl/lights/clustering.py describes them, of clusters as from _start_clusters."""
+    """Rounds of merges (:mod:`vpl.lights.clustering`) of the clusters from _start_clusters."""
 
     def cost(first, second):
         return _merge_cost(first, second, has_position)
@@ -181,14 +182,14 @@ def _cluster(clusters, window, has_position):
 
 
 def _join(first, second):
-    """Merged clusters of pairs of them: all (2k + 1, r)."""
+    """Merge pairs of clusters: first, second and result are (2k + 1, r)."""
     joined = np.maximum(first, second)
     np.add(first[-1], second[-1], out=joined[-1])
     return joined
 
 
 def _merge_cost(first, second, has_position):
-    """Cluster size [LC, section 5] of joining pairs of clusters, (r,) float32."""
+    """Cluster size [LC, section 5] of merged pairs of clusters, (r,) float32."""
     half, joined = len(first) // 2, np.maximum(first[:-1], second[:-1])
     extent = np.square(np.add(joined[:half], joined[half:], out=joined[:half]), out=joined[:half])
     for axis in range(0, half, 3):
@@ -205,7 +206,7 @@ def _merge_cost(first, second, has_position):
 
 
 def _assemble(order, rounds, position, direction, flux, rng) -> LightTree:
-    """Lay a clustering of the lights in ``order`` out in preorder, with exact bounds and sums in float64."""
+    """Lay out a clustering of the lights in ``order`` in preorder, with exact bounds and float64 sums."""
     node_at, leaves, depth = layout(len(order), rounds)
     leaf_order = order[node_at[node_at < len(order)]]
 
@@ -229,10 +230,10 @@ def _assemble(order, rounds, position, direction, flux, rng) -> LightTree:
 
 
 def _draw_representatives(order, rounds, intensity, rng):
-    """One light per node: that of a child, drawn in proportion to the children's intensities, (2n - 1,) int64.
+    """Representative light of every node, (2n - 1,) int64: a child's, drawn in proportion to the children's intensity.
 
-    So a light stands for a node with the probability (its intensity) / (the node's) [LC, section 3.1]: cuts are
-    unbiased, and of a refined node, one child keeps the light whose ray is traced already.
+    A light represents a node with probability (light's intensity) / (node's intensity) [LC, section 3.1], therefore
+    cuts are unbiased. One child of every node has the same representative as the node.
     """
     representative = np.concatenate([order, np.empty(len(order) - 1, np.int64)])
     draw = np.concatenate([np.empty(len(order)), rng.random(len(order) - 1)])
@@ -243,10 +244,10 @@ def _draw_representatives(order, rounds, intensity, rng):
 
 
 def _cone_cosines(axis, directions, leaves, depth):
-    """Cosines of the half-angles of all nodes' cones, rounded to the wider side, (2n - 1,) float32.
+    """Cosines of the half-angles of the nodes' cones, rounded towards wider cones, (2n - 1,) float32.
 
-    All in preorder: axis (3, 2n - 1), directions (3, n), leaves and depth (2n - 1,). Unlike a union of the children's
-    cones, the least cosine over a node's lights is exact.
+    Arrays in preorder: axis (3, 2n - 1), directions (3, n), leaves and depth (2n - 1,). The least cosine over a node's
+    lights is exact; a union of the children's cones is not.
     """
 
     def product(node, direction):
@@ -259,14 +260,14 @@ def _cone_cosines(axis, directions, leaves, depth):
 
 @dataclass
 class Node:
-    """Nodes of a light tree in a kernel: one per lane."""
+    """Nodes of a light tree in a kernel: one per lane.  Fields as in the records of :class:`LightTree`."""
 
-    box_min: object
-    box_max: object
-    axis: object
-    cosine: object
-    intensity: object
-    escape: object
+    box_min: mi.Point3f
+    box_max: mi.Point3f
+    axis: mi.Vector3f
+    cosine: mi.Float
+    intensity: mi.Color3f
+    escape: mi.UInt32
 
     @property
     def center(self):
@@ -287,7 +288,7 @@ class Node:
 class DeviceTree:
     """A light tree's packed records on the device.
 
-    ``second_representative``: (2n - 1,) another light per node, drawn independently of the tree's own.
+    ``second_representative``: (2n - 1,), a light per node, drawn independently of the tree's representatives.
     """
 
     def __init__(self, kind: str, tree: LightTree, second_representative):
@@ -297,11 +298,11 @@ class DeviceTree:
         self._records = upload(mi.Float, tree.records)
 
     def records(self) -> np.ndarray:
-        """The records again, of NumPy: see :class:`vpl.lights.light_tree.LightTree`."""
+        """NumPy copy of the records, see :class:`LightTree`."""
         return download(self._records).reshape(self.count, -1)
 
     def gather(self, index, active=True) -> Node:
-        """Fetch one node per lane; see :class:`LightTree` for the layout of the record."""
+        """Fetch one node per lane."""
         a, b, c, d = (dr.gather(mi.Vector4f, self._records, index * 4 + k, active) for k in range(4))
         return Node(
             mi.Point3f(a.x, a.y, a.z),
@@ -316,15 +317,15 @@ class DeviceTree:
         return dr.gather(mi.Float, self._records, index * COLUMNS + column, active)
 
     def escape(self, index, active=True):
-        """The node that follows a node's subtree."""
+        """First node after a node's subtree."""
         return dr.reinterpret_array(mi.UInt32, self._column(ESCAPE, index, active))
 
     def summed_intensity(self, index, active=True):
-        """Scalar intensity of a node: the mean over channels of the sum over its lights."""
+        """Summed intensity of a node's lights, averaged over channels."""
         return self._column(INTENSITY, index, active)
 
     def representative(self, index, active=True, second=False):
-        """Index of a node's representative light, or of its second one."""
+        """Index of a node's representative light, or of its second representative."""
         if second:
             return dr.gather(mi.UInt32, self._second, index, active)
         return dr.reinterpret_array(mi.UInt32, self._column(REPRESENTATIVE, index, active))

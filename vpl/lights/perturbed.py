@@ -1,11 +1,11 @@
-"""Surfaces with bump or normal maps: which these are, and how light paths are scattered by them.
+"""Surfaces with bump or normal maps: their shapes, and the scattering of light paths at them.
 
-Such a material shades with a normal of its own, which nobody else gets to know; it turns the normal round where it
-would face away from the viewer, and dims light that arrives at grazing angles.  So it is not symmetric, neither Veach's
-correction for shading normals nor samples that are drawn from the light's side are enough, and the light that it sends
-on ends where that normal faces away.  Here the material is asked as a path from the camera asks it: what goes from the
-light to a viewer, of whom the direction is drawn.  The normal is told by three such questions and decides only where a
-light shines: the flux of lights is right whatever is found for it.
+A bump or normal map shades with a perturbed normal, which Mitsuba does not expose.  Mitsuba flips the normal if it
+faces away from the viewer, and attenuates light at grazing angles.  The BSDF is not symmetric: Veach's correction for
+shading normals and samples drawn from the light's side are both incorrect, and reflection stops at the horizon of the
+perturbed normal.  Therefore light paths evaluate the BSDF in the direction of camera paths: from the arriving light to
+a randomly drawn view direction.  Three BSDF evaluations estimate the perturbed normal, which restricts only the
+directions in which a virtual light emits.  The flux of the lights is correct for any estimate.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from ..core.arrays import channel_mean, finite_or_zero
 from ..core.registry import RegistryTable
 from .emitters import registered_shapes
 
-# As Mitsuba prints them
+# Class names in Mitsuba's printed form
 _MAPS = ("BumpMap[", "NormalMap[")
-# Share of directions that are drawn by the cosine: samples of the material do not reach where it turns its normal round
+# Fraction of cosine-distributed directions: BSDF samples do not cover directions for which Mitsuba flips the normal
 _COSINE_SHARE = 0.5
-# Largest density of a diffuse lobe, per steradian, beyond rounding
+# Largest density of a diffuse lobe, per steradian, with 0.1% for rounding
 _DIFFUSE_DENSITY = 1.001 / np.pi
 
 
-def perturbed_shapes(scene) -> tuple:
-    """Registry indices of the shapes of a scene whose material has such a map."""
+def perturbed_shapes(scene) -> tuple[int, ...]:
+    """Registry indices of the shapes with a bump or normal map."""
     return tuple(index for index, shape in registered_shapes(scene) if any(name in str(shape.bsdf()) for name in _MAPS))
 
 
 @dataclass(init=False)
 class Perturbed:
-    """Shapes whose material shades with a normal of its own.
+    """Shapes with a bump or normal map.
 
-    ``exist``: whether there are any; ``everywhere``: whether they cannot be told from others, as in shape groups.
-    The fields of a dataclass, unlike those of other classes, may be given to functions that Dr.Jit freezes.
+    ``exist``: whether the scene has any; ``everywhere``: whether every surface counts as perturbed, because shapes
+    inside shape groups cannot be distinguished.  A dataclass, because Dr.Jit's frozen functions require one.
     """
 
     exist: bool
@@ -53,7 +53,7 @@ class Perturbed:
         self._table = RegistryTable(shapes, 1) if shapes else None
 
     def at(self, si, active):
-        """Whether ``si`` lies on one of them."""
+        """Whether ``si`` lies on a shape with a bump or normal map."""
         if self.everywhere or self._table is None:
             return mi.Bool(self.everywhere)
         return self._table.at(si.shape, active) == 1
@@ -61,26 +61,26 @@ class Perturbed:
 
 @dataclass
 class Scattered:
-    """What becomes of light paths at surfaces, one per lane.
+    """Result of scattering light paths at surfaces, one per lane.
 
-    ``stored``: whether a light is left there, ``leaving``: its flux, ``normal``: unit vector, on the side to which it
-    shines, ``facing``: it shines to directions on the side of this vector only; ``goes_on``: whether the path does,
-    ``direction``: in which, unit vector in world space, ``following``: with what flux, ``delta``: whether by a lobe
-    without an extent.  Fluxes are spectra, relative to what the emitter gave.
+    ``stored``: whether to store a virtual light; ``leaving``: its flux; ``normal``: unit normal on its emitting side;
+    ``facing``: vector whose hemisphere bounds its emission; ``goes_on``: whether the path continues; ``direction``:
+    next direction, unit vector in world space; ``following``: flux of the continued path; ``delta``: whether a delta
+    lobe scattered the path.  Fluxes are spectra relative to the emitted flux.
     """
 
-    stored: object
-    leaving: object
-    normal: object
-    facing: object
-    goes_on: object
-    direction: object
-    following: object
-    delta: object
+    stored: mi.Bool
+    leaving: mi.UnpolarizedSpectrum
+    normal: mi.Normal3f
+    facing: mi.Normal3f | mi.Vector3f
+    goes_on: mi.Bool
+    direction: mi.Vector3f
+    following: mi.UnpolarizedSpectrum
+    delta: mi.Bool
 
 
 def scatter_perturbed(si, sampler, throughput, lobe_limit: float, active) -> Scattered:
-    """Scatter light paths at perturbed surfaces.  ``lobe_limit``: see :class:`vpl.lights.tracing.PathLimits`."""
+    """Scatter light paths at perturbed surfaces.  ``lobe_limit``: see :class:`vpl.lights.tracing.PathSettings`."""
     bsdf = si.bsdf()
     arrived = dr.dot(si.n, si.to_world(si.wi))
     active &= arrived * si.wi.z > 0
@@ -89,7 +89,7 @@ def scatter_perturbed(si, sampler, throughput, lobe_limit: float, active) -> Sca
     leaving, normal, facing = _light(si, bsdf, sampler, outward, lobe_limit, active)
     leaving = finite_or_zero(flux * leaving)
 
-    # ---------------------- Next direction: by the material, or by the cosine ----------------------
+    # ---- Next direction: BSDF sample or cosine-distributed
     context = mi.BSDFContext()
     smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     by_cosine = smooth & (sampler.next_1d() < _COSINE_SHARE)
@@ -102,10 +102,10 @@ def scatter_perturbed(si, sampler, throughput, lobe_limit: float, active) -> Sca
     density = bsdf.pdf(context, si, local, active & ~delta) * (1 - _COSINE_SHARE)
     density += dr.maximum(left, 0) * (dr.inv_pi * _COSINE_SHARE)
     following = flux * value * dr.abs(left) / density
-    # A mirror turns beams without making them wider
-    straight = mi.unpolarized_spectrum(weight) * throughput * dr.select(left > 0, left / dr.abs(arrived), 1)
-    straight /= dr.select(smooth, 1 - _COSINE_SHARE, 1)
-    following = finite_or_zero(dr.select(delta, straight, following))
+    # Reflection by a mirror leaves the beam's solid angle unchanged
+    mirrored = mi.unpolarized_spectrum(weight) * throughput * dr.select(left > 0, left / dr.abs(arrived), 1)
+    mirrored /= dr.select(smooth, 1 - _COSINE_SHARE, 1)
+    following = finite_or_zero(dr.select(delta, mirrored, following))
     goes_on = active & (dr.dot(si.n, direction) * local.z > 0) & dr.any(following > 0)
     return Scattered(
         active & dr.any(leaving > 0), leaving, normal, facing, goes_on, direction, following, delta
@@ -113,8 +113,7 @@ def scatter_perturbed(si, sampler, throughput, lobe_limit: float, active) -> Sca
 
 
 def _seen_from(si, bsdf, context, view, active):
-    """BSDF times the light's cosine for a viewer in a world space direction, and the density with which a path from
-    there goes to the light."""
+    """(BSDF times cosine of the light, density of sampling the light's direction) for a world space view direction."""
     viewed = mi.SurfaceInteraction3f(si)
     viewed.wi = si.to_local(view)
     value, density = bsdf.eval_pdf(context, viewed, si.wi, active)
@@ -128,10 +127,10 @@ def _diffuse_only() -> mi.BSDFContext:
 
 
 def _light(si, bsdf, sampler, outward, lobe_limit: float, active):
-    """What light is left at a surface: (flux per irradiance, normal, facing).
+    """Virtual light at a surface: (flux per irradiance, normal, facing).
 
-    It is seen alike from all directions on either side of the material's normal: one of these two regions is drawn by
-    the flux that goes there, with a direction in it for which the material is asked.
+    The perturbed normal divides the hemisphere into two regions, and a light emits diffusely into one of them.  A
+    cosine-distributed view direction selects the region, in proportion to its flux, and evaluates the BSDF.
     """
     normal_of_material = _normal(si, bsdf, outward, active)
     both = int(mi.BSDFFlags.DiffuseTransmission) | int(mi.BSDFFlags.GlossyTransmission)
@@ -144,14 +143,17 @@ def _light(si, bsdf, sampler, outward, lobe_limit: float, active):
     share = 0.5 * (1 + dr.dot(normal, facing))
     value, density = _seen_from(si, bsdf, mi.BSDFContext(), view, active)
     diffuse, of_diffuse = _seen_from(si, bsdf, _diffuse_only(), view, active)
-    # Materials that do not tell their lobes apart have too great a density where they are sharp
+    # Above the limit only the diffuse lobe counts. A BSDF that ignores the lobe mask exceeds a diffuse lobe's density
     value = dr.select(density <= lobe_limit, value, dr.select(of_diffuse <= _DIFFUSE_DENSITY, diffuse, 0))
     return value * dr.pi * dr.select(transmits, 2, 1) / share, normal, facing
 
 
 def _normal(si, bsdf, outward, active):
-    """The normal that a material shades with, from what of its diffuse reflection is seen from above if light comes
-    from three directions around: the brighter, the nearer.  Exact if none of them is below its horizon."""
+    """Perturbed normal of a material, in world space.
+
+    Photometric stereo: diffuse reflection towards the geometric normal under light from three directions.  Exact if
+    the three directions lie above the perturbed horizon.
+    """
     viewed, context = mi.SurfaceInteraction3f(si), _diffuse_only()
     side = dr.mulsign(mi.Float(1), si.wi.z)
     viewed.wi = mi.Vector3f(0, 0, side)

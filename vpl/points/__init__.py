@@ -1,21 +1,20 @@
-"""From camera rays to gather points, and the trees and slices that group these.
+"""From camera rays to gather points, and trees and slices of gather points.
 
-How data flows, which is also the order to read in::
+Data flow and reading order::
 
     camera rays -> camera_paths -> bsdf_proxies -> surfaces -> point_tree, gather_tree,  -> point_clusters
                                                                slices or slice_rows
 
-- ``camera_paths``: camera rays through mirrors, glass and masks to ``GatherPoints``; what a scene's surfaces can do
-  (``SceneTraits``); how rays lie in the image (``PixelGrid``)
-- ``bsdf_proxies``: an upper bound of each point's material, found by probing it; for bounds and nothing else
-- ``surfaces``: gather points as kernels shade them, a ``Batch`` of Lambertian ones and one of all others; ``Receiver``:
-  what bounds know of them
-- ``point_tree``: the binary tree over all gather points, ``PointTree`` [IC section 3]
-- ``gather_tree``: a tree for the points of each pixel, as branches of one [MDLC]
-- ``slices``: points in slices, by place and normal [LS]; ``slice_rows``: slices with a bounded number of rows, and the
-  curve and plane along which rows lie [MSR section 4.1]
-- ``point_clusters``: any of these trees on the device (``PointClusters``), with boxes, cones and largest values for
-  each node
+- ``camera_paths``: camera rays through mirrors, glass and masks to ``GatherPoints``; capabilities of a scene's surfaces
+  (``SceneTraits``); layout of camera rays in the image (``PixelGrid``)
+- ``bsdf_proxies``: upper bounds of materials, found by probing, for error bounds only
+- ``surfaces``: gather points for kernels, in a ``Batch`` of Lambertian points and a ``Batch`` of the remaining points;
+  ``Receiver``: points or nodes for error bounds
+- ``point_tree``: ``PointTree``, the binary tree over gather points [IC section 3]
+- ``gather_tree``: a tree over the points of every pixel, joined in one ``PointTree`` [MDLC]
+- ``slices``: groups of points by position and normal [LS]; ``slice_rows``: slices with a bounded number of rows, and
+  the order of rows along a curve in a plane [MSR section 4.1]
+- ``point_clusters``: ``PointClusters``, the device form of any of these trees, with boxes, cones and maxima of nodes
 
-The trees are built by NumPy from plain arrays, and tested without rendering anything.
+NumPy builds the trees from plain arrays; their tests render nothing.
 """

@@ -1,8 +1,8 @@
-"""From camera rays to gather points: through mirrors, glass and masks to the first surface that a light can reach.
+"""From camera rays to gather points: through mirrors, glass and masks to the first surface with a smooth BSDF lobe.
 
-Every camera ray ends in at most one gather point.  Where a surface has both a delta and a smooth lobe (plastic, masks)
-one of the two is followed, chosen by their reflectances, with the matching weight; at the last surface that can be
-gathered both are.
+Every camera ray has at most one gather point.  At a surface with delta and smooth lobes (plastic, masks) the path
+continues with one of the two, chosen in proportion to reflectance and weighted by the inverse probability.  At the last
+surface that may be gathered, it continues with both.
 """
 
 from __future__ import annotations
@@ -20,19 +20,20 @@ from ..core.sampling import derived_seed, independent_sampler
 from ..lights.emitters import Emitters, registered_shapes
 from ..lights.perturbed import perturbed_shapes
 
-# Neither side of a choice between a delta and a smooth lobe gets less than this unless it carries nothing.
+# Least probability of the delta and of the smooth lobes, unless their reflectance is zero
 _LEAST_PROBABILITY = 0.05
-# Cells along each axis of the curve that orders gather points, as a power of two
+# Bits per axis of the Morton codes that order gather points
 _CURVE_BITS = 10
 
 
 @dataclass(frozen=True)
 class SceneTraits:
-    """Abilities of the surfaces of a scene, found once, so that what no surface needs is left out of the kernels.
+    """Capabilities of a scene's surfaces: kernels omit code for absent ones.
 
-    ``perturbed``: registry indices of shapes whose material shades with a normal of its own (bump and normal maps);
-    ``open_shapes``: registry indices of shapes that light may pass unscattered, None for all;
-    ``open_scene``: a scene of those shapes alone, None where ``open_shapes`` is None or empty.
+    ``delta``, ``null``, ``smooth``, ``glossy``, ``transmissive``: whether any BSDF has such a lobe; ``perturbed``:
+    registry indices of shapes with bump or normal maps; ``open_shapes``: registry indices of shapes that transmit light
+    unscattered, None for every shape; ``open_scene``: a scene of the open shapes alone, None if ``open_shapes`` is None
+    or empty.
     """
 
     delta: bool
@@ -40,45 +41,45 @@ class SceneTraits:
     smooth: bool
     glossy: bool
     transmissive: bool
-    perturbed: tuple
-    open_shapes: tuple | None
-    open_scene: object | None
+    perturbed: tuple[int, ...]
+    open_shapes: tuple[int, ...] | None
+    open_scene: mi.Scene | None
 
     def is_null(self, shape):
-        """Whether light may pass a shape (a pointer array) unscattered."""
+        """Whether shapes (a pointer array) may transmit light unscattered."""
         return mi.Bool(True) if self.open_shapes is None else shape_in(shape, self.open_shapes)
 
 
-def shape_in(shape, indices: tuple):
-    """Whether shapes (a pointer array) are among those with the given registry indices."""
+def shape_in(shape, indices: tuple[int, ...]):
+    """Whether shapes (a pointer array) have one of the given registry indices."""
     return RegistryTable(indices, 1).at(shape) == 1
 
 
 @dataclass
 class GatherPoints:
-    """Points to be shaded, in Morton order of their positions or in the order of their camera rays.
+    """Points to shade, in Morton order of their positions or in the order of their camera rays.
 
-    ``si``: surface interactions (evaluated); ``ray``: index of the camera ray that each belongs to; ``weight``: what
-    radiance leaving the point contributes to that ray; ``depth``: edges from the camera to the point.
+    ``si``: surface interactions (evaluated); ``ray``: index of the camera ray; ``weight``: throughput from the point to
+    the camera; ``depth``: edges from the camera to the point.
     """
 
-    si: object
-    ray: object
-    weight: object
-    depth: object
+    si: mi.SurfaceInteraction3f
+    ray: mi.UInt32
+    weight: mi.UnpolarizedSpectrum
+    depth: mi.UInt32
 
     @property
     def count(self) -> int:
         return dr.width(self.ray)
 
     def places(self, most: int) -> np.ndarray:
-        """Positions of at most so many of them, evenly from first to last, (n, 3) float32."""
+        """Positions of at most ``most`` points at equal index steps, (n, 3) float32."""
         count = min(self.count, most)
         index = upload(mi.UInt32, np.arange(count, dtype=np.int64) * self.count // max(count, 1))
         return download(dr.gather(mi.Point3f, self.si.p, index))
 
     def select(self, index) -> GatherPoints:
-        """The points picked by an index array, as lazy gathers."""
+        """Points at the indices ``index``, as lazy gathers."""
         return GatherPoints(*(dr.gather(type(x), x, index) for x in (self.si, self.ray, self.weight, self.depth)))
 
 
@@ -86,16 +87,16 @@ class GatherPoints:
 class CameraPaths:
     """Result of following camera rays.
 
-    ``emission``, ``valid``: per camera ray, radiance of emitters seen directly and whether it met anything.
+    ``emission``: per camera ray, radiance of directly visible emitters; ``valid``: whether the ray hits a surface.
     """
 
-    emission: object
-    valid: object
+    emission: mi.UnpolarizedSpectrum
+    valid: mi.Bool
     points: GatherPoints
 
 
 def scene_traits(scene) -> SceneTraits:
-    """Union of the flags of all BSDFs; scenes with instances are taken to have all of them."""
+    """Union of the flags of a scene's BSDFs; scenes with instances have every flag, because Mitsuba hides theirs."""
     flags, open_shapes, instances = 0, {}, False
     for index, shape in registered_shapes(scene):
         bsdf = shape.bsdf()
@@ -118,7 +119,7 @@ def scene_traits(scene) -> SceneTraits:
 
 
 def refuse_media(scene) -> None:
-    """Raise a ValueError that names the first shape that bounds a participating medium."""
+    """Raise a ValueError with the name of the first shape that bounds a participating medium."""
     for number, shape in enumerate(scene.shapes()):
         if shape.is_medium_transition():
             raise ValueError(
@@ -128,15 +129,16 @@ def refuse_media(scene) -> None:
 
 
 def _follow_delta(si, bsdf, flags, both, sample1, sample2, choice):
-    """Choose between the delta and the smooth lobes of a surface, or take ``both``.
+    """Choose between the delta and the smooth lobes of a surface, or follow ``both``.
 
-    Returns (delta side taken, smooth side taken, direction, weight of the delta side, eta, weight of the smooth side).
+    Returns (whether delta lobes are followed, whether smooth lobes are followed, direction and weight of the delta
+    sample, relative index of refraction, weight of the smooth lobes).
     """
     context = mi.BSDFContext()
     context.type_mask = mi.BSDFFlags.Delta
     sample, weight = bsdf.sample(context, si, sample1, sample2)
     weight = finite_or_zero(mi.unpolarized_spectrum(weight))
-    # Materials that do not heed the mask sample any lobe: those samples are not delta and count for nothing here
+    # Materials that ignore the type mask may sample smooth lobes; those samples have no weight here
     weight &= mi.has_flag(flags, mi.BSDFFlags.Delta) & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     delta_level = channel_mean(weight)
     opaque = 1 - channel_mean(mi.unpolarized_spectrum(bsdf.eval_null_transmission(si)))
@@ -152,7 +154,7 @@ def _follow_delta(si, bsdf, flags, both, sample1, sample2, choice):
 
 
 def emitted_towards(emitters: Emitters, si, active=True):
-    """Radiance that emitters send from ``si`` back along the ray that found it: area emitters or the environment."""
+    """Radiance emitted from ``si`` against the ray's direction, by area emitters or the environment emitter."""
     emission = dr.zeros(mi.UnpolarizedSpectrum, dr.width(si.wi))
     if emitters.area.count:
         row = emitters.area.row(si, active & si.is_valid())
@@ -165,12 +167,13 @@ def emitted_towards(emitters: Emitters, si, active=True):
     return emission
 
 
-def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughput, depth, limits, skip, active):
-    """One edge of the camera paths: emission met, gather points found, rays that go on.  Evaluated in one kernel.
+def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughput, depth, path_settings, skip, active):
+    """One edge of the camera paths, evaluated in one kernel.
 
-    ``skip``: None, or a function that finds the first surface beyond all emitters, which then stay invisible.
+    ``skip``: None, or a function that intersects rays with non-emitting surfaces only (hidden emitters).  Returns
+    emission, hit mask, (gather mask, surface interaction, weight), (mask, ray, throughput) of continuing paths.
     """
-    max_depth, rr_depth = limits
+    max_depth, rr_depth = path_settings
     if skip is None:
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 1, active=active)
     else:
@@ -185,7 +188,7 @@ def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughpu
     goes_on, stays, smooth_weight = mi.Bool(False), mi.Bool(True), mi.Float(1)
     direction, following, eta = mi.Vector3f(0, 0, 1), mi.UnpolarizedSpectrum(0), mi.Float(1)
     if traits.delta:
-        # Where the next surface cannot be gathered any more, both sides are taken: neither costs a gather point more
+        # The next surface is too deep to gather, so following both costs no additional gather point
         both = depth + 1 == max_depth
         goes_on, stays, direction, following, eta, smooth_weight = _follow_delta(si, bsdf, flags, both, *random[:3])
     gathered = hit & mi.has_flag(flags, mi.BSDFFlags.Smooth) & stays & (depth < max_depth)
@@ -197,7 +200,7 @@ def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughpu
         goes_on &= hit & (depth < max_depth) & dr.any(following > 0) & (~roulette | (random[3] < survival))
         following = dr.select(roulette, following / survival, following)
     next_ray = si.spawn_ray(direction)
-    # Fields that are the same everywhere have one entry: widened, because points are gathered and scattered by index
+    # Widen uniform fields, which have a single entry, because points are gathered and scattered by index
     si = dr.select(gathered, si, dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d)))
     dr.eval(emission, hit, gathered, si, weight, goes_on, next_ray.o, next_ray.d, following)
     return emission, hit, (gathered, si, weight), (goes_on, next_ray, following)
@@ -206,26 +209,26 @@ def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughpu
 def follow_camera_rays(
     scene, emitters, traits, sampler, seed, ray, active, max_depth, rr_depth, skip=None, along_curve=True
 ):
-    """Trace camera rays to their gather points, which are returned along a Morton curve, or in the rays' order.
+    """Trace camera rays to their gather points: :class:`CameraPaths`.
 
-    ``ray``: a wavefront of camera rays, of which those not ``active`` give nothing; ``max_depth``, ``rr_depth`` as in
-    Mitsuba's ``path`` (math.inf: no limit); ``skip``: with ``hide_emitters``, the integrator's method that looks past
-    area emitters, applied to camera rays only.
+    ``ray``: a wavefront of camera rays; inactive rays return zero; ``max_depth``, ``rr_depth``: defined by Mitsuba's
+    ``path`` (math.inf: no limit); ``skip``: with ``hide_emitters``, Mitsuba's intersection method that skips area
+    emitters, for the first edge only; ``along_curve``: whether to sort points along a Morton curve instead of by ray.
     """
     count = dr.width(ray.d)
     ray.time += dr.zeros(mi.Float, count)
     ray.maxt += dr.zeros(mi.Float, count)
     lane = dr.arange(mi.UInt32, count)
     active = mi.Bool(active) & (lane < dr.opaque(mi.UInt32, count))
-    limits = (upload_limit(max_depth), dr.opaque(mi.UInt32, rr_depth))
+    path_settings = (upload_limit(max_depth), dr.opaque(mi.UInt32, rr_depth))
     throughput, depth = ones(count), 1
     found = None
     while True:
         random = (sampler.next_1d(), sampler.next_2d(), sampler.next_1d(), sampler.next_1d()) if traits.delta else None
-        # Opaque, so that the second wave, where there is one, is the same kernel as the first
+        # Opaque: the waves of all depths share one kernel
         dr.make_opaque(ray, active, throughput, random)
         emitted, hit, gathered, going = _wave(
-            scene, emitters, traits, random, ray, throughput, dr.opaque(mi.UInt32, depth), limits, skip, active
+            scene, emitters, traits, random, ray, throughput, dr.opaque(mi.UInt32, depth), path_settings, skip, active
         )
         skip = None
         if found is None:
@@ -235,7 +238,7 @@ def follow_camera_rays(
             dr.eval(found)
         else:
             add_at(emission, emitted, lane)
-            # Rays that went on beside a gather point find no other
+            # A ray that continued beside a gather point finds no second one
             for target, value in zip(found, (*gathered, mi.UInt32(depth)), strict=True):
                 dr.scatter(target, value, lane, gathered[0])
         if not traits.delta:
@@ -253,7 +256,7 @@ def follow_camera_rays(
 
 
 def _collect(mask, si, weight, depth, along_curve: bool) -> GatherPoints:
-    """Compact the lanes that hold a gather point, and put them in Morton order if that is asked for."""
+    """Compact the lanes with a gather point, in Morton order if ``along_curve``."""
     lanes = dr.compress(mask)
     if len(lanes) and along_curve:
         order = morton_order(download(dr.gather(mi.Point3f, si.p, lanes)), _CURVE_BITS)
@@ -266,9 +269,9 @@ def _collect(mask, si, weight, depth, along_curve: bool) -> GatherPoints:
 
 @dataclass
 class PixelGrid:
-    """Layout of camera rays in the image: ``samples`` of a pixel follow each other, ``width`` pixels make a row.
+    """Layout of camera rays in the image: rows of ``width`` pixels with ``samples`` consecutive rays each.
 
-    ``known``: whether that is so, or every ray counts as a pixel because nothing better is known.
+    ``known``: false if the layout is unknown and every ray counts as a pixel.
     """
 
     width: int

@@ -1,7 +1,6 @@
-"""Gather points in the order of their point tree, and the nodes of that tree as kernels see them.
+"""Gather points in the order of their point tree, and the tree's nodes for kernels.
 
-What nodes hold (boxes, cones, largest values) is found on the device: from points to leaves, then level by level to the
-root.
+The device computes the nodes' boxes, cones and maxima: from points to leaves, then level by level to the root.
 """
 
 from __future__ import annotations
@@ -20,18 +19,18 @@ from .bsdf_proxies import MaterialProxy
 from .point_tree import PointTree, build_point_tree
 from .surfaces import Batch, Receiver
 
-# Most points of a leaf: a few make a smaller tree at 1 to 3% more shadow rays, but lobes need points of their own
+# Most points of a leaf: larger leaves make a smaller tree for 1 to 3% more shadow rays, but lobes need single points
 _LAMBERTIAN_LEAF, _GLOSSY_LEAF = 4, 1
 
 
 @dataclass
 class PointNode:
-    """Nodes of a point tree in a kernel: one per lane.  ``child``: the first of two children, 0 for a leaf."""
+    """Nodes of a point tree in a kernel: one per lane.  Fields as in :class:`vpl.points.point_tree.PointTree`."""
 
     receiver: Receiver
-    first: object
-    count: object
-    child: object
+    first: mi.UInt32
+    count: mi.UInt32
+    child: mi.UInt32
 
     @property
     def radius(self):
@@ -40,10 +39,10 @@ class PointNode:
 
 
 class PointClusters:
-    """A batch of gather points along a tree over them, with the bounds of every node on the device [IC section 3].
+    """A batch of gather points in tree order, with the bounds of every node on the device [IC section 3].
 
-    ``build``: makes the tree of positions and normals, (n, 3) each; by default one over all points by place, normal and
-    material.  ``order``: row of the original batch that each point of ``batch`` is.
+    ``build``: function of positions and normals, (n, 3) each, that returns the tree; by default a tree by position,
+    normal and material.  ``batch``: the points in tree order; ``order``: their rows in the original batch.
     """
 
     def __init__(self, batch: Batch, build: Callable | None = None):
@@ -57,8 +56,8 @@ class PointClusters:
         self._lobes = _lobe_records(self.tree, bounds, proxy) if proxy.glossy else None
         self._no_cosine = None
         if proxy.without_cosines:
-            some = bounds.reduce(dr.select(proxy.no_cosine, mi.UInt32(1), 0), dr.maximum)
-            self._no_cosine = some == 1
+            any_point = bounds.reduce(dr.select(proxy.no_cosine, mi.UInt32(1), 0), dr.maximum)
+            self._no_cosine = any_point == 1
             dr.eval(self._no_cosine)
 
     @property
@@ -67,7 +66,7 @@ class PointClusters:
         return self.batch.count
 
     def in_batch_order(self, arrays: list) -> list:
-        """Put arrays of values along the tree back into the order of the batch, evaluated."""
+        """Reorder arrays of values from tree order to the order of the original batch, evaluated."""
         found = []
         for values in arrays:
             found.append(dr.empty(type(values), self.count))
@@ -76,7 +75,7 @@ class PointClusters:
         return found
 
     def ranges(self, index):
-        """(First point along the tree, number of points) of nodes."""
+        """(First point in tree order, number of points) of nodes."""
         d = dr.gather(mi.Vector4f, self._records, index * 4 + 3)
         return dr.reinterpret_array(mi.UInt32, d.y), dr.reinterpret_array(mi.UInt32, d.z)
 
@@ -104,13 +103,13 @@ def _tree_by_place(batch: Batch, position: np.ndarray, normal: np.ndarray) -> Po
 
 
 def unit_or_up(vectors):
-    """Unit vectors; those of broken meshes that are not become +z, so that they have a place."""
+    """Replace vectors without unit length, which broken meshes may have, by +z."""
     vectors = mi.Vector3f(vectors)
     return dr.select(dr.abs(dr.squared_norm(vectors) - 1) < 1e-3, vectors, mi.Vector3f(0, 0, 1))
 
 
 def _records(tree: PointTree, bounds: NodeBounds, position, normal, base):
-    """Per node: box, cone of normals, largest base, range of points, first child: 16 floats.  Values along the tree."""
+    """Per node: box, cone of normals, largest base, range of points, first child (16 floats), from values per point."""
     largest = bounds.reduce(mi.Vector3f(position), dr.maximum)
     least = bounds.reduce(mi.Vector3f(position), dr.minimum)
     axis, cosine = bounds.cones(normal)
@@ -120,14 +119,14 @@ def _records(tree: PointTree, bounds: NodeBounds, position, normal, base):
 
 
 def _lobe_records(tree: PointTree, bounds: NodeBounds, proxy: MaterialProxy):
-    """Per node: cone of the lobes' axes, largest peak, smallest exponent: 8 floats."""
+    """Per node: cone of the lobes' axes, largest peak, smallest exponent (8 floats)."""
     axis, cosine = bounds.cones(unit_or_up(proxy.axis))
     peak = bounds.reduce(mi.Vector3f(proxy.peak), dr.maximum)
     return _interleaved(tree.size, [*axis, cosine, *peak, bounds.reduce(proxy.exponent, dr.minimum)])
 
 
 def _interleaved(count: int, columns: list):
-    """One array of records from an array for each of their fields."""
+    """Array of records from one array per field."""
     records = dr.empty(mi.Float, count * len(columns))
     for k, column in enumerate(columns):
         dr.scatter(records, column, dr.arange(mi.UInt32, count) * len(columns) + k)
@@ -136,7 +135,7 @@ def _interleaved(count: int, columns: list):
 
 
 class NodeBounds:
-    """Combines values of the points along a tree for every node: arrays of n entries become arrays of ``tree.size``."""
+    """Reduces values of n points in tree order to arrays of ``tree.size`` node values."""
 
     def __init__(self, tree: PointTree):
         self._levels, self._size = tree.levels, tree.size
@@ -147,17 +146,18 @@ class NodeBounds:
         self._points = upload(mi.UInt32, tree.count)
 
     def reduce(self, values, join: Callable):
-        """Values of nodes from their points'.  ``join``: combines two arrays lane by lane, such as ``dr.maximum``."""
+        """Reduce values of points to nodes.  ``join``: elementwise function of two arrays, such as ``dr.maximum``."""
         at_leaves = _over_points(values, self._first, self._count, join)
         return self._towards_root(at_leaves, lambda first, second, node, child: join(first, second))
 
     def cones(self, directions):
-        """Cones that hold unit vectors: (axes, cosines of half-angles), single precision.
+        """Bounding cones of unit vectors: (axes, cosines of half-angles), single precision.
 
-        An inner node's axis is the mean direction, its half-angle the least that holds the cones of both children.
+        An inner node's axis is the mean direction, and its half-angle is the smallest that contains both children's
+        cones.
         """
         precise = dr.float64_array_t(type(directions))
-        # Unit in double precision too: near 1 the angle of a cosine magnifies what single precision left over
+        # Unit length in double precision: near 1, acos magnifies single precision errors
         directions = dr.normalize(precise(directions))
         dr.eval(directions)
         sums = self.reduce(directions, lambda first, second: first + second)
@@ -179,7 +179,10 @@ class NodeBounds:
         return mi.Vector3f(axes), mi.Float(dr.maximum(dr.cos(angles) - COSINE_ROUNDING, -1))
 
     def _towards_root(self, at_leaves, join: Callable):
-        """``join``: function of (values of the first children, of the second ones, nodes, their first children)."""
+        """Combine leaf values level by level, evaluated.
+
+        ``join``: function of (values of first children, values of second children, nodes, indices of first children).
+        """
         kind = type(at_leaves)
         values = dr.zeros(kind, self._size)
         dr.scatter(values, at_leaves, self._leaves)
@@ -190,7 +193,7 @@ class NodeBounds:
             inner = child > 0
             children = [dr.gather(kind, values, child + k, inner) for k in (0, 1)]
             joined = join(*children, node, child)
-            # Before it is written to: an array that is still to be read is copied first, as a whole
+            # Evaluate before the scatter: otherwise Dr.Jit copies the whole array, because a pending read needs it
             dr.eval(joined)
             dr.scatter(values, joined, node, inner)
             dr.eval(values)
@@ -199,6 +202,7 @@ class NodeBounds:
 
 @dr.syntax
 def _over_points(values, first, count, join):
+    """Reduce the values of each leaf's points, evaluated."""
     total, k = dr.gather(type(values), values, first), mi.UInt32(1)
     while dr.hint(k < count, exclude=[values, first, count]):
         total = join(total, dr.gather(type(values), values, first + k))
@@ -209,7 +213,7 @@ def _over_points(values, first, count, join):
 
 @dr.syntax
 def _least_cosine(directions, axis, first, count):
-    """Of each leaf, the least cosine between its axis and the direction of one of its points."""
+    """Least cosine between each leaf's axis and the directions of its points."""
     least, k = dr.ones(type(axis.x), dr.width(first)), mi.UInt32(0)
     while dr.hint(k < count, exclude=[directions, axis, first, count]):
         cosine = dr.dot(axis, dr.gather(type(directions), directions, first + k))

@@ -1,22 +1,20 @@
 """A tree over gather points: a compressed octree by normal, then by position (NumPy only) [IC section 3].
 
-Every point gets a code of 63 bits: its material, three octree levels of the cube of unit normals, then sixteen of the
-cube around all positions.  Sorted by code, points lie along a Morton curve, and every node of the octree is a
-contiguous range. Following [IC], an octant is reached by halving along one axis after the other, so the tree is
-binary: a range is split at the highest bit in which its first and last code differ, which leaves out every level that
-would not branch.
+Every point has a code of 63 bits: its material, three octree levels of the cube of unit normals, then sixteen levels of
+the cube around the positions.  Sorted codes form a Morton curve, and every octree node is a contiguous range.
+Following [IC], the tree is binary: an octant is halved along one axis after the other.  A range is split at the highest
+bit that differs between its first and last code, which omits levels without a branch.
 
-Departures from the paper, and why:
+Departures from the paper, with reasons:
 
-- The cube of normals has seven cells a side instead of eight, so that 0 lies inside a cell: the rounding of the normals
-  of a wall along an axis would otherwise scatter its points over four of them.
-- Materials are told apart first, where the caller asks for it ([IC] section 5 suggests as much): bounds of lobes are
-  tighter, and kernels work on packets of points that call one BSDF.
-- Far from the middle of the points, cells grow with the distance from it.  A few points at the horizon would otherwise
-  take all cells.
-- A leaf holds up to ``leaf_size`` points.  They are as near to each other as the image resolves, and kernels work on
-  packets of points.
-- Points with one and the same code (coincident ones, or nearer to each other than the finest cell) are split by count.
+- The cube of normals has seven cells per axis instead of eight: 0 lies inside a cell.  With eight, rounding of normals
+  would scatter the points of an axis-aligned wall over four cells.
+- On request, materials are distinguished first ([IC] section 5 suggests it): bounds of lobes are tighter, and packets
+  of points call a single BSDF.
+- Far from the median position, cells grow with the distance.  Otherwise a few points at the horizon would leave most
+  points in few cells.
+- A leaf holds up to ``leaf_size`` points: their distance is that of neighbouring pixels, and kernels work on packets.
+- Points with equal codes (coincident, or closer than the finest cell) are split by count.
 """
 
 from __future__ import annotations
@@ -28,22 +26,22 @@ import numpy as np
 
 from ..core.morton import interleave
 
+# Cells per axis of the cube of normals; bits per axis of its and of the positions' Morton codes; bits of the material
 _NORMAL_CELLS, _NORMAL_BITS, _POSITION_BITS, _MATERIAL_BITS = 7, 3, 16, 6
-# Points from which the extent of their middle is found
+# Points used to estimate percentiles of the positions
 _SAMPLE = 1 << 16
 
 
 @dataclass(frozen=True)
 class PointTree:
-    """A binary tree over n points; nodes are numbered breadth first, siblings next to each other.
+    """A binary tree over n points with m nodes, numbered breadth first with adjacent siblings.
 
-    ``order``: (n,) uint32, the caller's index of every point along the curve; a node's points are
-    ``order[first : first + count]``.
-    ``first``, ``count``: (m,) uint32.
-    ``child``: (m,) uint32, the first child, the second being the next node; 0 for a leaf.
+    ``order``: (n,) uint32, the caller's index of every point along the curve.
+    ``first``, ``count``: (m,) uint32; the points of a node are ``order[first : first + count]``.
+    ``child``: (m,) uint32, the first child, which the second child follows; 0 for a leaf.
     ``parent``: (m,) uint32, 0 for the root.
-    ``levels``: node at which each level begins, and m: ``levels[k]:levels[k + 1]`` are the nodes of level k.
-    ``leaf``: (n,) uint32, the leaf that holds each point along the curve.
+    ``levels``: first node of each level, then m: level k is ``levels[k]:levels[k + 1]``.
+    ``leaf``: (n,) uint32, the leaf of each point along the curve.
     """
 
     order: np.ndarray
@@ -61,14 +59,14 @@ class PointTree:
 
     @cached_property
     def leaves(self) -> np.ndarray:
-        """Leaves along the curve, so that their ranges follow each other: (l,) int64."""
+        """Leaves along the curve, with consecutive ranges of points: (l,) int64."""
         begins = np.concatenate([[True], self.leaf[1:] != self.leaf[:-1]])
         return self.leaf[begins].astype(np.int64)
 
     def reduce(self, values: np.ndarray, function: np.ufunc) -> np.ndarray:
-        """Combine a value of the points, (n, ...) in the caller's order, for every node, (m, ...).
+        """Reduce values of points, (n, ...) in the caller's order, to every node, (m, ...).
 
-        ``function``: np.minimum, np.maximum, np.add, np.logical_or ...
+        ``function``: a binary ufunc such as np.minimum, np.maximum, np.add or np.logical_or.
         """
         leaves, values = self.leaves, values[self.order]
         if len(leaves) < len(values):
@@ -76,7 +74,7 @@ class PointTree:
         return self.gather_up(values, leaves, function)
 
     def gather_up(self, at_leaves: np.ndarray, leaves: np.ndarray, function: np.ufunc) -> np.ndarray:
-        """Combine values of ``leaves`` for every node: a node's is ``function`` of its children's."""
+        """Reduce values of ``leaves`` to every node: ``function`` combines the values of both children."""
         result = np.zeros((self.size, *at_leaves.shape[1:]), at_leaves.dtype)
         result[leaves] = at_leaves
         for nodes, first, second in self._inner_from_below():
@@ -84,16 +82,16 @@ class PointTree:
         return result
 
     def push_down(self, values: np.ndarray) -> np.ndarray:
-        """Add to every node the values of all its ancestors: (m, ...) from (m, ...)."""
+        """Add the values of every node's ancestors to its own: (m, ...) from (m, ...)."""
         result = values.copy()
         for first, last in zip(self.levels[1:-1], self.levels[2:], strict=True):
             result[first:last] += result[self.parent[first:last]]
         return result
 
     def _inner_from_below(self):
-        """(Inner nodes, their first children, their second ones) level by level, the deepest level first.
+        """(Inner nodes, first children, second children) level by level from the deepest.
 
-        The children of a level's nodes are the next level, siblings next to each other, so slices pick them.
+        The children of a level form the next level, with adjacent siblings: they are slices.
         """
         for k in range(len(self.levels) - 3, -1, -1):
             first, last, end = self.levels[k : k + 3]
@@ -101,23 +99,23 @@ class PointTree:
 
 
 def _cells(position: np.ndarray) -> np.ndarray:
-    """Cells of positions in a cube of 2^_POSITION_BITS a side, (n, 3) float64: even in the middle, growing outwards."""
+    """Cells of positions, (n, 3) float64 from 0 to 2^_POSITION_BITS - 1: uniform near the median, growing outwards."""
     sample = position[:: max(len(position) // _SAMPLE, 1)].astype(np.float64)
     low, middle, high = np.percentile(sample, (10, 50, 90), axis=0)
     unit = (high - low).max() or np.abs(position - middle).max() or 1.0
-    # Linear up to about the unit, then logarithmic
+    # Nearly linear up to one unit, logarithmic beyond
     stretched = np.arcsinh((position - middle) / unit)
     stretched -= stretched.min(axis=0)
     return stretched * ((2**_POSITION_BITS - 1) / (stretched.max() or 1.0))
 
 
 def point_codes(position: np.ndarray, normal: np.ndarray, material: np.ndarray | None = None) -> np.ndarray:
-    """Codes of points, (n,) uint64: the material above where the normal points to above where the point is."""
+    """Codes of points, (n,) uint64: material, normal, position, from high to low bits."""
     by_normal = np.clip((normal + 1) * (0.5 * _NORMAL_CELLS), 0, _NORMAL_CELLS - 1)
     code = interleave(by_normal) << np.uint64(3 * _POSITION_BITS)
     code |= interleave(_cells(position))
     if material is not None:
-        # By first appearance among the points: the numbers themselves may differ from one load of a scene to the next
+        # Rank by first appearance among the points, because material numbers may differ between loads of a scene
         _, appearance, found = np.unique(material, return_index=True, return_inverse=True)
         rank = np.argsort(np.argsort(appearance))[found].astype(np.uint64) & np.uint64(2**_MATERIAL_BITS - 1)
         code |= rank << np.uint64(3 * (_POSITION_BITS + _NORMAL_BITS))
@@ -125,10 +123,10 @@ def point_codes(position: np.ndarray, normal: np.ndarray, material: np.ndarray |
 
 
 def _split(codes: np.ndarray, first: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Places at which the second half of each range of sorted codes begins."""
+    """First index of the second half of each range of sorted codes."""
     low, high = codes[first], codes[first + count - 1]
     differing = low ^ high
-    # Every bit below the highest one that differs, by filling downwards
+    # Set every bit below the highest differing bit
     for shift in (1, 2, 4, 8, 16, 32):
         differing |= differing >> np.uint64(shift)
     halves = np.searchsorted(codes, high & ~(differing >> np.uint64(1)))
@@ -139,10 +137,9 @@ def build_point_tree(position, normal, leaf_size: int = 1, material=None) -> Poi
     """Build the tree over points.
 
     position: (n, 3) float32, finite, world units, n > 0.  normal: (n, 3) float32 unit vectors.
-    leaf_size: most points of a leaf, at least 1.  material: None, or (n,) integers; different ones are kept apart as
-    far as 64 classes go.
+    leaf_size: most points of a leaf, at least 1.  material: None, or (n,) integers, distinguished modulo 64.
 
-    Raises ValueError, naming the argument, where an input is not as described.
+    Raises ValueError with the argument's name if an input is invalid.
     """
     if leaf_size < 1:
         raise ValueError(f"leaf_size must be at least 1, got {leaf_size}")
@@ -158,7 +155,7 @@ def build_point_tree(position, normal, leaf_size: int = 1, material=None) -> Poi
 
 
 def require_finite(**arrays: np.ndarray) -> None:
-    """Raise a ValueError that names the array, (n, k), and its first row that is not finite."""
+    """Raise a ValueError with the name of an array, (n, k), and its first non-finite row."""
     for name, values in arrays.items():
         if not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values).all(axis=1)))
@@ -166,9 +163,9 @@ def require_finite(**arrays: np.ndarray) -> None:
 
 
 def tree_over_codes(codes: np.ndarray, leaf_size: int, leaf_bits: int = 63) -> PointTree:
-    """The tree over points with the given codes, (n,) uint64: ranges split at the highest bit that differs in them.
+    """Tree over points with the given codes, (n,) uint64: ranges are split at their highest differing bit.
 
-    A leaf holds up to ``leaf_size`` points whose codes differ in their lowest ``leaf_bits`` bits only.
+    A leaf holds up to ``leaf_size`` points whose codes differ in the lowest ``leaf_bits`` bits only.
     """
     order = np.argsort(codes, kind="stable")
     codes = codes[order]

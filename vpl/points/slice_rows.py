@@ -1,9 +1,9 @@
-"""Slices of the light matrix with a bounded number of rows: points divided in 6-D at medians (NumPy only) [MSR 4.1].
+"""Slices of the light matrix with a bounded number of rows: points split in 6-D at medians (NumPy only) [MSR 4.1].
 
-A point is its position and its normal, as in :mod:`vpl.points.slices`.  All points are halved across the longest side
-of their box, then each half, until the points of a slice are in at most so many pixels.  The points of one pixel in one
-slice are a row of its matrix [MSR 7.2]: they share the visibility of lights.  Within a slice, rows follow a Morton
-curve over the plane that faces along its mean normal, so that what lies next to each other in the matrix does so in the
+A point is a 6-D vector of position and normal, see :mod:`vpl.points.slices`.  The points are halved across the longest
+side of their box, recursively, until every slice contains points of at most a given number of pixels.  The points of
+one pixel in a slice form a row of the slice's matrix [MSR 7.2] and share the visibility of lights.  Rows of a slice
+follow a Morton curve in the plane perpendicular to the slice's mean normal, therefore adjacent rows are close in the
 scene.
 """
 
@@ -15,16 +15,17 @@ from ..core.morton import interleave
 from .point_tree import PointTree, require_finite
 from .slices import six_dimensional
 
+# Bits per axis of the Morton codes that order rows
 _CURVE_BITS = 16
 
 
 def build_row_slices(pixel: np.ndarray, most: int, position: np.ndarray, normal: np.ndarray) -> PointTree:
-    """A tree over points whose leaves are slices, of at most ``most`` rows each; the points of a row follow each other.
+    """Tree over points with slices of at most ``most`` rows as leaves; the points of a row are consecutive.
 
     pixel: (n,) int64, of every point.  position: (n, 3) float32, world units, n > 0.  normal: (n, 3) float32 unit
     vectors.
 
-    Raises ValueError, naming the argument, where an input is not finite or ``most`` is less than 1.
+    Raises ValueError with the argument's name if an input is not finite or ``most`` is less than 1.
     """
     if most < 1:
         raise ValueError(f"most must be at least 1, got {most}")
@@ -56,31 +57,31 @@ def build_row_slices(pixel: np.ndarray, most: int, position: np.ndarray, normal:
 
 
 def rows_of(pixel: np.ndarray, leaf: np.ndarray) -> np.ndarray:
-    """Places where rows begin, and the number of points, (rows + 1,): from pixels and leaves of points along a tree."""
+    """First point of each row, then the number of points, (rows + 1,), from pixels and leaves in tree order."""
     begins = (pixel[1:] != pixel[:-1]) | (leaf[1:] != leaf[:-1])
     return np.concatenate([[0], np.flatnonzero(begins) + 1, [len(pixel)]])
 
 
 def _rows(pixel: np.ndarray, enough: int) -> int:
-    """Number of different pixels; at most the number of points, where that is enough to know."""
+    """Number of distinct pixels; without counting, the number of points if that is at most ``enough``."""
     return len(pixel) if len(pixel) <= enough else len(np.unique(pixel))
 
 
 def _halved(points: np.ndarray, part: np.ndarray, half: int) -> np.ndarray:
-    """Some points, those that lie lower along the longest side of their box first."""
+    """Partition the points ``part`` at the median along the longest side of their box, lower half first."""
     inside = points[part]
     axis = int((inside.max(0) - inside.min(0)).argmax())
     return part[np.argpartition(inside[:, axis], half)]
 
 
 def _along_curve(pixel, position, normal, order, leaf) -> np.ndarray:
-    """``order`` with the points of every leaf sorted: row after row along a curve."""
+    """``order`` with the rows of every leaf sorted along a Morton curve."""
     inside = np.concatenate([[True], leaf[1:] != leaf[:-1]])
     first, number = np.flatnonzero(inside), np.cumsum(inside) - 1
     x, y = tangent_places(position[order], normal[order], first, number)
     cells = np.stack([x, y, np.zeros_like(x)], axis=1) * (2**_CURVE_BITS - 1)
     code = interleave(cells)
-    # A row stands where the first of its points does
+    # The first point of a row determines the row's code
     rows = np.lexsort((pixel[order], number))
     starts = rows_of(pixel[order][rows], leaf[rows])
     row = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
@@ -89,13 +90,13 @@ def _along_curve(pixel, position, normal, order, leaf) -> np.ndarray:
 
 
 def tangent_places(position, normal, first: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Coordinates of points in the plane that faces along the mean normal of their group [MSR 5.1], (2, n), from 0 to 1
-    within the group; the longer side of its box counts for both.
+    """Coordinates of points in the plane perpendicular to their group's mean normal [MSR 5.1], (2, n), from 0 to 1.
 
-    position, normal: (n, 3), group after group; first: where each group begins; number: (n,), the group of each point.
+    The longer side of a group's box scales both coordinates.  position, normal: (n, 3), sorted by group; first: first
+    point of each group; number: (n,), group of each point.
     """
     axis = np.add.reduceat(normal.astype(np.float64), first)
-    # A plane that is seen from as far as can be from its edge: along the axis that the mean normal is farthest from
+    # The coordinate axis farthest from the mean normal gives the best conditioned cross product
     helper = np.eye(3)[np.abs(axis).argmin(1)]
     u = np.cross(axis, helper)
     u /= np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-300)
@@ -108,7 +109,7 @@ def tangent_places(position, normal, first: np.ndarray, number: np.ndarray) -> n
 
 
 def golden_steps(counts: np.ndarray) -> np.ndarray:
-    """For each count the number nearest below its golden section that has no divisor in common with it."""
+    """For each count, the largest coprime number up to the rounded golden section of the count, at least 1."""
     steps = np.maximum(np.round(counts * (0.5 * (5**0.5 - 1))).astype(np.int64), 1)
     while (common := np.gcd(steps, counts) > 1).any():
         steps[common] -= 1

@@ -1,12 +1,13 @@
-"""Slices: groups of gather points that are near to each other and face alike, by splitting 6-D boxes (NumPy only) [LS].
+"""Slices: groups of gather points with similar positions and normals, by splitting 6-D boxes (NumPy only) [LS].
 
-A point is its position and its normal, scaled by an eighth of the diagonal of all points. The box with the most points
-times its squared longest side is halved across that side, until there are as many boxes as wanted. A few dozen random
-points for each slice decide where; then all points go down the tree that resulted, whose leaves are the slices.
+A point is a 6-D vector of its position and its normal, times an eighth of the diagonal of the points' box. The box with
+the largest product of point count and squared longest side is halved across the longest side, until the number of
+boxes is reached. Random points, _SAMPLE per slice, determine the boxes. Finally every point descends the resulting
+tree, whose leaves are the slices.
 
-Departures from the paper: boxes are chosen by how far their points lie apart rather than by number alone, and halved in
-the middle rather than at the median, which at equal slices and columns gave three quarters of the error (cornell).
-A box whose middle divides nothing, for all its points coincide but for rounding, is divided above the lowest of them.
+Departures from the paper: boxes are chosen by their extent as well as by their number of points, and are halved at the
+midpoint rather than at the median. At equal numbers of slices and columns the error is three quarters (cornell). Points
+that coincide except for rounding, with an ineffective midpoint, are split above the lowest coordinate.
 
 [LS] Ou and Pellacini 2011, LightSlice: matrix slice sampling for the many-lights problem.
 """
@@ -19,14 +20,18 @@ import numpy as np
 
 from .point_tree import PointTree, require_finite
 
+# Weight of normals relative to positions in units of the diagonal
 _NORMAL_SCALE = 1 / 8
-# Random points that decide where boxes are split, for each slice
+# Random points per slice that determine the splits
 _SAMPLE = 64
 
 
 class _Splits:
-    """Boxes of a sample of points, (n, 6): of every box the axis and place of its split, and its first child (0: none;
-    the second is the next one)."""
+    """Boxes of a sample of points, (n, 6).
+
+    ``axis``, ``place``: axis and coordinate of every box's split; ``child``: first child, which the second child
+    follows; 0 for a leaf.
+    """
 
     def __init__(self, points: np.ndarray, wanted: int):
         self._points, self._waiting = points, []
@@ -43,13 +48,13 @@ class _Splits:
         self.axis.append(axis)
         self.place.append(0.0)
         self.child.append(0)
-        # Points that all coincide are one slice, however many they are
+        # Coincident points remain one slice
         if side[axis] > 0:
             heapq.heappush(self._waiting, (-len(inside) * side[axis] ** 2, len(self.child) - 1, inside))
 
     def _split(self, box: int, inside: np.ndarray) -> None:
         along = self._points[inside, self.axis[box]]
-        # Halved before they are added, so that nothing overflows; the largest value always lies above
+        # Half of each summand, against overflow; the largest value always lies above
         place = 0.5 * along.min() + 0.5 * along.max()
         if place >= along.max():
             place = along.min()
@@ -61,13 +66,12 @@ class _Splits:
 def build_slices(
     position: np.ndarray, normal: np.ndarray, slices: int, seed: int = 0, rank: np.ndarray | None = None
 ) -> PointTree:
-    """A tree over points whose leaves are at most ``slices`` slices, none of them empty.
+    """Tree over points with at most ``slices`` non-empty slices as leaves; fewer if there are fewer distinct points.
 
-    position: (n, 3) float32, world units, n > 0.  normal: (n, 3) float32 unit vectors.  There are fewer slices where
-    there are fewer points, or fewer different ones.  seed: of the choice of points that decide.  rank: None, or (n,)
-    numbers by which the points of a slice are sorted.
+    position: (n, 3) float32, world units, n > 0.  normal: (n, 3) float32 unit vectors.  seed: of the random points that
+    determine the splits.  rank: None, or (n,) sort keys of points within their slice.
 
-    Raises ValueError, naming the argument, where an input is not finite or ``slices`` is less than 1.
+    Raises ValueError with the argument's name if an input is not finite or ``slices`` is less than 1.
     """
     if slices < 1:
         raise ValueError(f"slices must be at least 1, got {slices}")
@@ -85,7 +89,7 @@ def six_dimensional(position: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def _tree_of(splits: _Splits, points: np.ndarray, rank: np.ndarray | None) -> PointTree:
-    """Lay the boxes out breadth first and sort all points into them."""
+    """Lay out the boxes breadth first and assign every point to a leaf."""
     split_child = np.array(splits.child)
     levels, boxes = [0], [np.zeros(1, np.int64)]
     while len(inner := boxes[-1][split_child[boxes[-1]] > 0]):
@@ -102,7 +106,7 @@ def _tree_of(splits: _Splits, points: np.ndarray, rank: np.ndarray | None) -> Po
 
     leaf = node[_descend(splits, points)]
     count, first = np.bincount(leaf, minlength=len(box)), np.zeros(len(box), np.int64)
-    # Children stand behind their parents
+    # Breadth first order: children follow their parents
     for k in inner[::-1]:
         count[k] = count[child[k]] + count[child[k] + 1]
     for k in inner:
@@ -113,7 +117,7 @@ def _tree_of(splits: _Splits, points: np.ndarray, rank: np.ndarray | None) -> Po
 
 
 def _descend(splits: _Splits, points: np.ndarray) -> np.ndarray:
-    """The box without a split that each point lies in, (n,) int64."""
+    """Leaf box of each point, (n,) int64."""
     axis, place, child = (np.array(column) for column in (splits.axis, splits.place, splits.child))
     box, walking = np.zeros(len(points), np.int64), np.arange(len(points) if child[0] else 0)
     while len(walking):

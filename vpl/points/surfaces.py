@@ -1,7 +1,7 @@
-"""Gather points as the evaluation sees them: where shadow rays start, and how light from a direction is reflected.
+"""Gather points for kernels: origins of shadow rays, and reflection of light.
 
-Points whose BSDF was found to be exactly Lambertian are kept as position, normal and albedo; all others keep the whole
-surface interaction and call the scene's BSDF.  The two lie in separate batches, so that no kernel pays for both.
+Points with an exactly Lambertian BSDF are stored as position, normal and albedo.  The remaining points store the whole
+surface interaction and call the scene's BSDF.  Separate batches keep BSDF calls out of Lambertian kernels.
 """
 
 from __future__ import annotations
@@ -15,31 +15,34 @@ from ..core.arrays import finite_or_zero, rgb_to_spectrum
 from .bsdf_proxies import MaterialProxy
 from .camera_paths import GatherPoints
 
-# Reflectance of a glossy lobe over a diffuse one: a dielectric's from above
+# Reflectance of a glossy lobe above a diffuse lobe: Fresnel reflectance of glass at normal incidence
 _GLOSS = 0.04
 
 
 @dataclass
 class Surface:
-    """Surfaces in a kernel, one per lane: ``interaction`` (position, geometric normal, time) and ``depth``."""
+    """Surfaces in a kernel, one per lane.
 
-    interaction: object
-    depth: object
+    ``interaction``: position, geometric normal and time; ``depth``: edges from the camera.
+    """
+
+    interaction: mi.Interaction3f
+    depth: mi.UInt32
 
 
 @dataclass
 class LambertianSurface(Surface):
     """Diffuse surfaces.  ``normal``: shading normal on the viewer's side; ``albedo``: reflectance / pi."""
 
-    normal: object
-    albedo: object
+    normal: mi.Normal3f
+    albedo: mi.Color3f
 
     def material(self):
-        """None: an albedo is all that tells one material from another."""
+        """None: only the albedo distinguishes materials."""
         return None
 
     def reflectance(self):
-        """Share of the light from all around that is reflected, exactly."""
+        """Exact hemispherical reflectance."""
         return rgb_to_spectrum(self.albedo * dr.pi)
 
     def reflected(self, to_light, active):
@@ -68,7 +71,7 @@ class ScatteringSurface(Surface):
         return dr.reinterpret_array(mi.UInt32, self.interaction.bsdf())
 
     def reflectance(self):
-        """Share of the light from all around that is reflected, roughly: as if only diffuse lobes had colours."""
+        """Approximate hemispherical reflectance: the diffuse lobe's plus a constant, or 1 without diffuse lobe."""
         bsdf = self.interaction.bsdf()
         diffuse = finite_or_zero(mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(self.interaction)))
         has_diffuse = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection)
@@ -88,7 +91,7 @@ class ScatteringSurface(Surface):
     def sample(self, sample1, sample2, active):
         """Draw a direction: (world space direction, BSDF times cosine over density, density per solid angle).
 
-        Samples of delta lobes have no weight and no density here.
+        Samples of delta lobes have zero weight and density.
         """
         si = self.interaction
         sample, value = si.bsdf().sample(mi.BSDFContext(), si, sample1, sample2, active)
@@ -99,14 +102,15 @@ class ScatteringSurface(Surface):
 
 @dataclass
 class Batch:
-    """Gather points of one sort, evaluated: ``index``, their rows among all gather points, and what bounds need.
+    """Gather points with one surface class, evaluated.
 
-    ``surfaces``: one of the surface classes; ``normal``: shading normal towards the viewer; ``proxy``: for the bounds.
+    ``index``: rows in :class:`vpl.points.camera_paths.GatherPoints`; ``surfaces``: for shading; ``normal``: shading
+    normal on the viewer's side; ``proxy``: upper bounds of the BSDFs.
     """
 
-    index: object
-    surfaces: Surface
-    normal: object
+    index: mi.UInt32
+    surfaces: LambertianSurface | ScatteringSurface
+    normal: mi.Normal3f
     proxy: MaterialProxy
 
     @property
@@ -119,15 +123,15 @@ class Batch:
 
     @property
     def receiver(self) -> Receiver:
-        """The points as bounds see them."""
+        """The points for error bounds."""
         return Receiver(self.position, self.normal, self.proxy)
 
     def surfaces_at(self, row, active=True):
-        """The surfaces of some rows of this batch, as lazy gathers."""
+        """Surfaces at the given rows of this batch, as lazy gathers."""
         return _gather(self.surfaces, row, active)
 
     def select(self, row) -> Batch:
-        """A batch of some of the rows, evaluated."""
+        """Batch of the given rows, evaluated."""
         part = Batch(
             dr.gather(mi.UInt32, self.index, row), _gather(self.surfaces, row, True),
             dr.gather(mi.Normal3f, self.normal, row), self.proxy.select(row),
@@ -141,7 +145,7 @@ def _gather(surfaces: Surface, row, active):
 
 
 def make_batches(points: GatherPoints, proxy: MaterialProxy) -> list[Batch]:
-    """Split gather points into Lambertian ones and all others; batches without a point are left out."""
+    """Split gather points into a Lambertian batch and a batch of the remaining points; empty batches are omitted."""
     batches = []
     for lambertian in (True, False):
         index = dr.compress(proxy.lambertian if lambertian else ~proxy.lambertian)
@@ -153,7 +157,7 @@ def make_batches(points: GatherPoints, proxy: MaterialProxy) -> list[Batch]:
         normal = part.si.sh_frame.n * dr.mulsign(mi.Float(1), mi.Frame3f.cos_theta(part.si.wi))
         if lambertian:
             interaction = dr.zeros(mi.Interaction3f, len(index))
-            # All that is gathered is an array: a literal here would make kernels of parts of the batch other ones
+            # Every field that kernels gather is an array: literals would give selected rows different kernels
             for name in ("p", "n", "t", "time"):
                 setattr(interaction, name, getattr(part.si, name))
             surfaces = LambertianSurface(interaction, part.depth, normal, part_proxy.base)
@@ -166,16 +170,16 @@ def make_batches(points: GatherPoints, proxy: MaterialProxy) -> list[Batch]:
 
 @dataclass
 class Receiver:
-    """Gather points, or boxes of them, in a kernel: one per lane.
+    """Gather points, or nodes of a point tree, in a kernel: one per lane.
 
-    ``position``: of a point, or the centre of a box of half extents ``extent`` (None for points); ``normal``: shading
-    normal on the side of the outgoing direction, or the axis of a cone around the normals of half-angle
-    acos(``normal_cosine``); ``mirror_cosine``: the same for the proxy's axis.
+    ``position``: of a point, or the centre of a node's box; ``normal``: shading normal on the viewer's side, or the
+    axis of a node's cone of normals; ``extent``: half extents of the box (None for points); ``normal_cosine``,
+    ``mirror_cosine``: cosines of the half-angles of the cones of normals and of proxy axes (None for points).
     """
 
-    position: object
-    normal: object
+    position: mi.Point3f
+    normal: mi.Normal3f | mi.Vector3f
     proxy: MaterialProxy
-    extent: object = None
-    normal_cosine: object = None
-    mirror_cosine: object = None
+    extent: mi.Point3f | None = None
+    normal_cosine: mi.Float | None = None
+    mirror_cosine: mi.Float | None = None

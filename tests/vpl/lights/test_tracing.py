@@ -12,15 +12,15 @@ from tests.support.scenes import area_light, closed_box, wall
 from vpl.core.arrays import download, upload
 from vpl.core.sampling import Choice, derived_seed
 from vpl.lights import tracing
-from vpl.lights.emission import bounding_box, emission_groups
+from vpl.lights.emission import bounding_box, emitter_samplers
 from vpl.lights.emitters import read_emitters
-from vpl.lights.tracing import PathLimits, trace_lights
+from vpl.lights.tracing import PathSettings, trace_lights
 
 
 def traced(scene, count=20_000, seed=0, deepest=math.inf, rr_depth=5, lobe_limit=1.0):
     """Lights of a scene dictionary."""
     scene = mi.load_dict(scene)
-    return trace_lights(scene, read_emitters(scene), count, seed, PathLimits(deepest, rr_depth, lobe_limit))
+    return trace_lights(scene, read_emitters(scene), count, seed, PathSettings(deepest, rr_depth, lobe_limit))
 
 
 @pytest.fixture
@@ -105,7 +105,7 @@ def test_same_seed_same_lights():
 def test_a_light_that_cannot_get_in_does_not_starve_the_emitter_inside():
     scene = closed_box({"lamp": area_light(), "sky": {"type": "constant", "radiance": 1000.0}})
     scene = mi.load_dict(scene)
-    lights = trace_lights(scene, read_emitters(scene), 5000, 0, PathLimits(3, 5, 1.0)).lights
+    lights = trace_lights(scene, read_emitters(scene), 5000, 0, PathSettings(3, 5, 1.0)).lights
     inside = np.abs(lights.position).max(1) < 1.001
     facing_in = np.sum(lights.direction * lights.position, axis=1) < 0
     assert (inside & facing_in).sum() > 100
@@ -139,8 +139,8 @@ def test_emitted_power_and_directions_equal_mitsubas(name):
         where = np.concatenate([np.broadcast_to(part, (count, part.shape[1])) for part in parts], axis=1)
         return (weight[:, :, None] * where[:, None, :]).mean(0)
 
-    (group,) = emission_groups(scene, read_emitters(scene))
-    ours = moments(group.sample)
+    (emitter_sampler,) = emitter_samplers(scene, read_emitters(scene))
+    ours = moments(emitter_sampler.sample)
     expected = moments(lambda a, b, c: scene.emitters()[0].sample_ray(0.0, a, b, c))
     # Position is compared through its mean weighted by power; directional rays may start on another plane
     columns = [0, 4, 5, 6] if name in ("directional", "constant") else slice(None)
@@ -157,10 +157,10 @@ def test_rays_from_infinity_fill_the_disk_that_the_scene_shows_to_them(kind):
         "directional": {"type": "directional", "direction": [0.3, 0.1, -1]},
     }[kind]
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "center": [3, 1, 2]}, "sky": emitter})
-    (group,) = emission_groups(scene, read_emitters(scene))
+    (emitter_sampler,) = emitter_samplers(scene, read_emitters(scene))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, 50_000)
-    ray, _ = group.sample(sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
+    ray, _ = emitter_sampler.sample(sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
     sphere = scene.bbox().bounding_sphere()
     offset = download(ray.o) - np.array(sphere.center).reshape(3)
     direction, radius = download(ray.d), float(sphere.radius)
