@@ -7,17 +7,16 @@ relative to the scene are laid out as they are for the client; those with an abs
 
 import hashlib
 import os
-import re
 import shutil
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from xml.etree import ElementTree
 
 import mitsuba as mi
 
 from ..images import replacing
 from ..scene_files import SceneFile
+from .scene_names import named_files
 
 
 class FilesMissing(Exception):
@@ -57,34 +56,15 @@ class SceneBundle:
 
 def bundle(scene_file):
     """Return the `SceneBundle` of a `SceneFile`."""
-    main = scene_file.path.absolute()
-    named = scene_file.files() | _included(main, scene_file.defines)
-    relative = {os.path.normpath(main.parent / name) for name in named if not os.path.isabs(name)} | {str(main)}
-    absolute = {os.path.normpath(name) for name in named if os.path.isabs(name)}
-    folder = os.path.commonpath([os.path.dirname(file) for file in relative])
-    files = [TravellingFile(file, os.path.relpath(file, folder), _hash(file)) for file in sorted(relative)]
-    files += [TravellingFile(file, None, _hash(file)) for file in sorted(absolute)]
-    files.sort(key=lambda file: file.path != str(main))
+    main = os.path.abspath(scene_file.path)
+    named = named_files(main, scene_file.defines) | {main: True}
+    folder = os.path.commonpath([os.path.dirname(file) for file, is_relative in named.items() if is_relative])
+    files = [
+        TravellingFile(file, os.path.relpath(file, folder) if is_relative else None, _hash(file))
+        for file, is_relative in named.items()
+    ]
+    files.sort(key=lambda file: (file.path != main, file.relative is None, file.path))
     return SceneBundle(tuple(files), scene_file.defines, tuple(scene_file.changes), mi.variant())
-
-
-def _included(xml, defines):
-    """Return the files that attributes of an XML file name, as `SceneFile.files`: what the parser reads itself, such as
-    other XML files, whose own are among them, and spectra."""
-    found, known, waiting = {}, dict(defines), [xml]
-    while waiting:
-        # Mitsuba reads comments with two hyphens, which XML does not allow
-        text = re.sub(rb"<!--.*?-->", b"", waiting.pop().read_bytes(), flags=re.DOTALL)
-        for element in ElementTree.fromstring(text).iter():
-            if element.tag == "default":
-                known.setdefault(element.get("name"), element.get("value"))
-            for value in element.attrib.values():
-                name = re.sub(r"\$(\w+)", lambda match: known.get(match[1], match[0]), value)
-                file = xml.parent / name
-                if name and name not in found and len(name) < 1024 and file.is_file():
-                    found[name] = file
-                    waiting += [file] if element.tag == "include" else []
-    return found
 
 
 class Store:
