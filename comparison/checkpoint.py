@@ -3,8 +3,10 @@
 They hold sums in double precision, so that a render which was interrupted ends with the image of one that was not.
 """
 
+import hashlib
 import json
 import zipfile
+import zlib
 from dataclasses import asdict
 from pathlib import Path
 
@@ -18,6 +20,10 @@ from .rendering import Pass
 SUFFIX = ".checkpoint.npz"
 CHECKPOINT_SECONDS = 10.0
 _ESTIMATE = "estimate."
+# Exceptions of NumPy, zipfile and zlib for a file that is damaged, or is no archive of arrays
+_UNREADABLE = (
+    OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 
 
 def file_of(image):
@@ -36,22 +42,16 @@ class Checkpoint:
         self._writer = OccasionalWriter("The checkpoint", self.save, CHECKPOINT_SECONDS)
 
     def restore(self, passes):
-        """Give the passes of the file, if there is one, to `Passes`, which have none; return the seconds that they
-        took. Raises ValueError for a file that is no checkpoint, and for one of another render."""
+        """Add the passes of the file, if it exists, to the empty `Passes`; return the seconds that they took. Raises
+        ValueError, with the name of the file, for a file that is no complete and unaltered checkpoint, and for the
+        checkpoint of another render."""
         self._passes = passes
         if not self.path.is_file():
             return 0.0
         if not self._resume:
             mi.Log(mi.LogLevel.Warn, f"'{self.path}', which --resume would go on from, is going to be replaced.")
             return 0.0
-        try:
-            with open(self.path, "rb") as opened, np.load(opened) as file:
-                arrays = {name: file[name] if file[name].ndim else file[name].item() for name in file.files}
-            described = json.loads(arrays["described"])
-        except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(
-                f"'{self.path}' is no checkpoint that can be read ({error}); delete it to begin anew"
-            ) from None
+        described, arrays = self._read()
         other = [name for name in self._made_by if described["made_by"].get(name) != self._made_by[name]]
         if other:
             raise ValueError(f"'{self.path}' is of a render with another {other[0]}; delete it to begin anew")
@@ -60,6 +60,21 @@ class Checkpoint:
         estimate = (name for name in arrays if name.startswith(_ESTIMATE))
         passes.estimate.state = {name.removeprefix(_ESTIMATE): arrays[name] for name in estimate}
         return described["seconds"]
+
+    def _read(self):
+        """Return the description and the arrays of the file."""
+        try:
+            with open(self.path, "rb") as opened, np.load(opened) as file:
+                arrays = {name: file[name] for name in file.files}
+            text, digest = arrays.pop("described").item(), arrays.pop("digest").item()
+            if digest != _digest(text, arrays):
+                raise ValueError("its content has been altered")
+            return json.loads(text), {name: array if array.ndim else array.item() for name, array in arrays.items()}
+        except _UNREADABLE as error:
+            reason = f"it has no entry {error}" if isinstance(error, KeyError) else error
+            raise ValueError(
+                f"'{self.path}' is no checkpoint that can be read ({reason}); delete it to begin anew"
+            ) from None
 
     def keep(self, seconds):
         """There is a pass more, after `seconds` in all: write the file now and then."""
@@ -84,7 +99,7 @@ class Checkpoint:
         described, arrays = kept
         text = json.dumps(described, default=_plain)
         with images.replacing(self.path) as temporary:
-            np.savez(temporary, described=np.array(text), **arrays)
+            np.savez(temporary, described=np.array(text), digest=np.array(_digest(text, arrays)), **arrays)
         self._saved = kept
 
     def leave(self):
@@ -98,6 +113,15 @@ class Checkpoint:
             self.path.unlink(missing_ok=True)
         except OSError as error:
             mi.Log(mi.LogLevel.Warn, f"The checkpoint could not be removed: {error}")
+
+
+def _digest(text, arrays):
+    """Return the SHA-256 (hexadecimal) of the description, and of names, types, shapes and values of the arrays."""
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
 
 
 def _plain(value):

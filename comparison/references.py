@@ -129,7 +129,7 @@ def path_traced(scene_file, spp, cache):
     file.parent.mkdir(parents=True, exist_ok=True)
     with locked(file.with_suffix(".lock")):
         images.remove_abandoned(file.parent, file.stem)
-        batches = _read_batches(file)
+        batches = _read_batches(file, scene_file.sampling(0)[0])
         if batches.spp < spp or batches.count < 2:
             described = {"integrator": "path", "scene": scene_file.name, "seed": SEED, **parameters}
             described["mitsuba"] = mi.__version__
@@ -137,11 +137,15 @@ def path_traced(scene_file, spp, cache):
     return read(file)
 
 
-def _read_batches(file):
+def _read_batches(file, pixels):
+    """Return the batches of a kept reference of so many pixels, none if there is no file."""
     if not file.is_file():
         return Batches()
     try:
-        return Batches.read(file)
+        batches = Batches.read(file)
+        if batches.mean[..., 0].size != pixels:
+            raise ValueError(f"it has {batches.mean[..., 0].size} pixels instead of {pixels}")
+        return batches
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"the kept reference '{file}' cannot be read ({error}); delete it to make it anew") from error
 
@@ -198,6 +202,10 @@ class Batches:
         image, channels, metadata = images.read_exr(path)
         mean, error = images.colour(image, channels), images.colour(image, channels, "se.")
         spp, count = metadata["spp"], metadata["batches"]
+        if not (isinstance(spp, int) and isinstance(count, int) and spp >= count >= 2):
+            raise ValueError(f"spp must be a whole number of at least batches, and batches of 2, got {spp} and {count}")
+        if not (np.isfinite(mean).all() and np.isfinite(error).all() and (error >= 0).all()):
+            raise ValueError("its mean and its standard error must be finite, and the latter at least 0")
         return cls(spp, count, mean.astype(np.float64), np.square(error, dtype=np.float64) * spp * (count - 1))
 
 
