@@ -117,9 +117,10 @@ class GatheringIntegrator(mi.SamplingIntegrator):
 
     def __init__(self, props):
         if mi.variant() not in VARIANTS:
+            available = ", ".join(variant for variant in VARIANTS if variant in mi.variants())
             raise RuntimeError(
                 f'the integrator "{props.plugin_name()}" does not support the variant "{mi.variant()}": choose one of '
-                f"{', '.join(VARIANTS)}"
+                f"{available}, or an integrator of Mitsuba, such as path"
             )
         super().__init__(props)
         read_knobs(self, props)
@@ -134,6 +135,10 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         All per gather point; a channel that nobody offers is not shown.
         """
         raise NotImplementedError
+
+    def check_scene(self, scene):
+        """Raise ValueError for a scene with a participating medium."""
+        refuse_media(scene)
 
     def aov_names(self):
         """Channels that ``sample`` returns besides the radiance."""
@@ -162,7 +167,12 @@ class GatheringIntegrator(mi.SamplingIntegrator):
                     raise ValueError(
                         "the camera is inside a participating medium; many-light integrators support surfaces only"
                     )
-                refuse_media(scene)
+                if dr.flag(dr.JitFlag.FreezingScope):
+                    raise RuntimeError(
+                        f"{type(self).__name__} cannot be recorded by dr.freeze, as it reads results of kernels while "
+                        "it renders: call mi.render outside of frozen functions"
+                    )
+                self.check_scene(scene)
                 share_code(scene)
                 return self._sample(scene, sampler, mi.Ray3f(ray), active)
             except Exception as error:
