@@ -143,7 +143,7 @@ def chosen_integrator(asked, file):
     if asked not in (None, OWN):
         return asked
     replaceable = own is None or (own in SAME_IMAGE and not file.has_media)
-    if asked is None and replaceable and command_line.is_supported(mi.variant()):
+    if asked is None and replaceable:
         return DEFAULT
     if own is None:
         raise UsageError(f"{file.path} has no integrator; choose one with --integrator")

@@ -78,7 +78,15 @@ def set_variant(name):
     """Select a variant and register this project's integrators for it."""
     if name not in mi.variants():
         raise UsageError(f"unknown variant '{name}'; there are {', '.join(mi.variants())}")
-    mi.set_variant(name)
+    try:
+        mi.set_variant(name)
+    except ImportError as error:  # of Dr.Jit, which finds no driver
+        if not name.startswith("cuda_"):
+            raise
+        raise UsageError(
+            f"the variant '{name}' needs an NVIDIA GPU and its driver, which Dr.Jit does not find; without them choose "
+            f"a variant llvm_*, such as llvm_ad_rgb ({error})"
+        ) from None
     import integrators  # noqa: F401 (registers plugins; needs a variant)
 
 
@@ -87,13 +95,6 @@ def own_integrators():
     import integrators
 
     return integrators.PLUGINS
-
-
-def is_supported(variant):
-    """Return whether this project's integrators exist for a variant."""
-    import integrators
-
-    return variant in integrators.VARIANTS
 
 
 def check_integrator(name):

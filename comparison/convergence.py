@@ -7,6 +7,7 @@ them says how far their average is from that expectation.
 
 from itertools import accumulate
 
+import mitsuba as mi
 import numpy as np
 
 SHARE = 0.95  # of the pixels whose error is to be below the one that is asked for
@@ -125,6 +126,15 @@ class ErrorGoal:
         """Return about how many samples per pixel there will be at the look that ends the render, if there are `spp` at
         the last one, with an error `found`."""
         return max(self._next, spp * (found / self.error) ** 2)
+
+    def warn_if_missed(self, found, limit):
+        """Log a warning if a `limit` ("spp" or "time") ended the render at an estimated error that is too high, or not
+        known."""
+        if not self.is_reached(found):
+            ended = "an unknown error, as there is one pass" if found is None else f"an error of {found:.2%}"
+            mi.Log(
+                mi.LogLevel.Warn, f"The error of {self.error:.2%} was not reached: {limit} ended the render at {ended}."
+            )
 
     def is_reached(self, found):
         """Is an estimated error (None: it is not known) low enough?"""

@@ -88,9 +88,17 @@ class Image:
         if took.ended_by == "interruption":
             return output.end_early()
         output.write()
-        error = "" if took.error is None else f", error {took.error:.2%}"
-        print(f"{self.path}: {self._name}, {took.spp} samples per pixel, {took.seconds:.2f} s{error}")
+        print(
+            f"{self.path}: {self._name}, {took.spp} samples per pixel, {took.seconds:.2f} s{self._error(took)}, ended "
+            f"by {took.ended_by}"
+        )
         return 0
+
+    def _error(self, took):
+        """Return the words for the estimated error, none if it is neither known nor asked for."""
+        if took.error is None:
+            return ", error unknown (one pass)" if self._options.error else ""
+        return f", error {took.error:.2%}"
 
     def _limits(self):
         return {name: getattr(self._options, name) for name in ("error", "time", "spp", "seed", "pass_spp")}

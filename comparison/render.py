@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time as clock
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -22,6 +23,9 @@ from .ending import Ending
 from .interruption import Interruption
 from .pass_sizes import PassSizes
 from .rendering import Progressive, TotalStatistics
+from .scene_files import SceneFile
+
+LIMITS = ("spp", "time")  # that end a render whether or not it has the error asked for
 
 
 @dataclass
@@ -54,7 +58,7 @@ class Took:
 
 
 def render(
-    scene: mi.Scene,
+    scene: mi.Scene | str | os.PathLike[str],
     integrator: mi.Integrator | str | None = None,
     sensor: int | str = 0,
     *,
@@ -68,26 +72,28 @@ def render(
     checkpoint: Checkpoint | None = None,
 ) -> tuple[mi.TensorXf, Took]:
     """Render a scene in passes of about two seconds, or ten with `manylights`; return the image, a `mi.TensorXf` of
-    shape (height, width, channels) as of `mi.render`, and what it took (`Took`).
+    shape (height, width, channels) as of `mi.render`, and the cost (`Took`).
 
-    `integrator`: a `mi.Integrator` or the name of one, by default the scene's; `sensor`: its index, or "all" for a list
-    of what is returned for each sensor, one after the other. The render ends as soon as one of these is reached, of
-    which any may be given: `error`, the relative standard error that 95% of the pixels are to be below; `time`, in
-    seconds, compilation included; `spp`, samples per pixel (if none is given, the scene's). There is always one pass.
-    `seed`: of the first pass; the others have hashes of it. `denoise`: return the denoised image, see denoising.py.
-    `progress`: called after each pass with what it took so far and the image so far, and, by the integrators of this
-    project, whenever a stage of a pass begins, with None for an image; if it returns False, no other pass begins, and
-    what it raises ends the render at once. `pass_spp`: samples per pixel of a pass, instead of some seconds.
-    `checkpoint`: a `checkpoint.Checkpoint` that the render of one sensor goes on from, counting its samples and
-    seconds; it is kept for another one to go on from, unless this one ends by what was asked for.
+    `scene`: a `mi.Scene`, or the path of a scene file. `integrator`: a `mi.Integrator` or the name of a plugin, by
+    default the scene's. `sensor`: an index, or "all" for a list of (image, cost) over all sensors. The first limit that
+    is reached ends the render: `error`, the relative standard error that 95% of the pixels do not exceed; `time`, in
+    seconds, compilation included; `spp`, samples per pixel. The default is the scene's samples per pixel. There
+    is at least one pass. The log has a warning if `spp` or `time` ends a render above its `error`. `seed`: of the first
+    pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py).
+    `progress`: called after each pass with the cost and the image so far; integrators of this project also call it at
+    the start of each stage of a pass, with None for the image. If it returns False, no other pass begins; an exception
+    ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a `checkpoint.Checkpoint` of the
+    same render with one sensor, whose samples and seconds count; it is kept unless a limit ends the render.
 
-    After Ctrl-C, or `cancel()` of the integrator, the image of the finished passes is returned. Where there are none,
-    KeyboardInterrupt is raised, or RuntimeError after `cancel()`; and KeyboardInterrupt by a second Ctrl-C.
+    Ctrl-C, or `cancel()` of the integrator, returns the image of the finished passes. Without a finished pass Ctrl-C
+    raises KeyboardInterrupt and `cancel()` RuntimeError. A second Ctrl-C raises KeyboardInterrupt.
 
-    Raises ValueError for values that are not positive, for a sensor that does not exist, and for a scene without an
-    integrator if none is given; ModuleNotFoundError for `denoise` without the package that it needs; RuntimeError where
-    another thread renders with the same sensor.
+    Raises ValueError for limits that are not positive, for a sensor that does not exist, for a scene without an
+    integrator, and for a participating medium that the integrator does not support; FileNotFoundError for a missing
+    scene file; ModuleNotFoundError if the package for `denoise` is missing; RuntimeError if another thread renders with
+    the same sensor, or if no variant is set.
     """
+    scene = _scene(scene)
     integrator = _integrator(scene, integrator)
     if sensor == ALL:
         if checkpoint:
@@ -151,15 +157,31 @@ def check(**values):
             raise ValueError(f"{name} must be a positive {'whole ' if whole else ''}number, got {value!r}")
 
 
+def _scene(scene):
+    """Return a `mi.Scene`, which is loaded if `scene` is the path of a scene file."""
+    if mi.variant() is None:
+        raise RuntimeError('no variant is set: call mi.set_variant("llvm_ad_rgb"), or with another variant, first')
+    if isinstance(scene, mi.Scene):
+        return scene
+    if not isinstance(scene, str | os.PathLike):
+        raise TypeError(f"scene must be a mi.Scene or the path of a scene file, got {scene!r}")
+    if not os.path.isfile(scene):
+        raise FileNotFoundError(f"no scene file '{os.fspath(scene)}'")
+    return SceneFile(scene).load()
+
+
 def _integrator(scene, integrator):
-    """Return the integrator of that name, or the one given, or the scene's."""
+    """Return the integrator of a name, or the given one, or by default the scene's. Raises ValueError where there is
+    none, or where it cannot render the scene."""
     if isinstance(integrator, str):
         import integrators  # noqa: F401 (registers plugins; needs a variant)
 
-        return mi.load_dict({"type": integrator})
+        integrator = mi.load_dict({"type": integrator})
     integrator = integrator or scene.integrator()
     if integrator is None:
         raise ValueError("the scene has no integrator; give one")
+    if hasattr(integrator, "check_scene"):
+        integrator.check_scene(scene)
     return integrator
 
 
@@ -179,7 +201,7 @@ class _Render:
         try:
             self._run(sizes, interruption)
         finally:
-            if self._checkpoint and self._ended_by in ("spp", "time", "error"):
+            if self._checkpoint and self._ended_by in (*LIMITS, "error"):
                 self._checkpoint.remove()
             elif self._checkpoint:
                 self._checkpoint.leave()
@@ -252,6 +274,8 @@ class _Render:
         """Return the image and what it took."""
         if self._ended_by != "error":
             self._error = self.progressive.estimate.relative()
+        if self._ended_by in LIMITS and self._ending.goal:
+            self._ending.goal.warn_if_missed(self._error, self._ended_by)
         image, took = self._image(), self._took()
         if denoiser:
             image, took.raw = denoiser.denoise(image, took.channels), image
