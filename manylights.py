@@ -56,11 +56,15 @@ from comparison import batch, command_line
 from comparison.cluster.connection import connected, workers
 from comparison.command_line import UsageError, parameter, positive
 from comparison.denoising import import_oidn
+from comparison.images import check_extension, write
 from comparison.one_image import INTERRUPTED, Failed, Image, LazyScene
 from comparison.render import Took, render
 from comparison.scene_files import SceneFile
+from comparison.threads import avoid_single_thread
 
-__all__ = ["Took", "main", "render"]
+avoid_single_thread()
+
+__all__ = ["Took", "main", "render", "write"]
 DEFAULT, OWN = "manylights", "scene"  # the integrator to render with, and what stands for the scene's own
 SAME_IMAGE = ("path", "prb", "volpath", "volpathmis")  # without participating media, all of them estimate what it does
 
@@ -107,8 +111,11 @@ def parse(arguments):
         help="scale PNG images by 2^STOPS (default: bring the 95th percentile of the brightness to 0.8)")  # fmt: skip
     command_line.add_common_options(parser)
     options = parser.parse_args(arguments)
-    if options.output and not options.output.is_dir() and options.output.suffix not in (".exr", ".png"):
-        parser.error(f"cannot write '{options.output}': the output must be an .exr or a .png file")
+    if options.output and not options.output.is_dir():
+        try:
+            check_extension(options.output)
+        except ValueError as error:
+            parser.error(str(error))
     return options
 
 

@@ -3,23 +3,30 @@
 EXR files are OpenEXR's matter rather than Mitsuba's, whose writer waits for ever where Dr.Jit has a single thread.
 """
 
+from __future__ import annotations
+
 import json
 import math
 import os
 import re
 import threading
+from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import OpenEXR
+from numpy.typing import ArrayLike
 
 # Lightness (CIE L*) rises by about 20 from each to the next: black, indigo, magenta, orange, yellow, pale yellow.
 FALSE_COLOURS = np.array([(0, 0, 4), (60, 15, 112), (158, 44, 120), (236, 105, 60), (252, 190, 60), (252, 253, 200)])
 ERROR_RANGE = (0.01, 1.0)  # relative errors at the two ends of the false colours, which are logarithmic
 # Of the positive values of an AOV: pixels that the film's filter just grazes must not add decades to its scale.
 AOV_PERCENTILES = (1, 99.9)
+EXTENSIONS = (".exr", ".png")  # of images that `write` writes
+CHANNELS = {1: "Y", 2: "YA", 3: "RGB", 4: "RGBA"}  # by their number
 
 
 @contextmanager
@@ -153,6 +160,40 @@ def logarithmic_ends(planes):
         return 1.0, 2.0
     low, high = (float(f"{end:.2g}") for end in (min(low for low, _ in found), max(high for _, high in found)))
     return min(low, high / 2), high
+
+
+def write(
+    path: str | os.PathLike[str],
+    image: ArrayLike | mi.TensorXf,
+    channels: Sequence[str] | None = None,
+    metadata: dict[str, Any] | None = None,
+    exposure: float | None = None,
+) -> None:
+    """Write an image (height, width, channels) to the file `path`: with all channels to .exr, tone-mapped to .png.
+
+    `image`: linear values, such as `mi.render` and `manylights.render` return. `channels`: their names; by default Y,
+    YA, RGB or RGBA by their number. `metadata`: a dict, of an .exr file. `exposure`: a .png file is scaled by
+    2^exposure, by default so that the 95th percentile of the brightness is 0.8. Unlike `mi.util.write_bitmap`, it
+    works with a single thread. Raises ValueError for another extension, and for names that do not fit the channels.
+    """
+    planes = np.atleast_3d(np.asarray(image, np.float32))
+    names = list(channels or CHANNELS.get(planes.shape[-1], ()))
+    check_extension(path)
+    if planes.ndim != 3 or len(names) != planes.shape[-1]:
+        raise ValueError(
+            f"channels must name the channels of an image of shape {planes.shape}, got {', '.join(names) or 'none'}"
+        )
+    if Path(path).suffix == ".exr":
+        write_exr(path, planes, names, metadata)
+        return
+    rgb = colour(planes, names)
+    write_png(path, tone_map(rgb, automatic_exposure(rgb) if exposure is None else 2.0**exposure))
+
+
+def check_extension(path):
+    """Raise ValueError for a path that is of none of the kinds of files that `write` writes."""
+    if Path(path).suffix not in EXTENSIONS:
+        raise ValueError(f"cannot write '{path}': the output must be an .exr or a .png file")
 
 
 def read_png(path):

@@ -164,9 +164,7 @@ class Output:
         """Write the last image that was taken."""
         took, image = self._took, self._image
         if self.path.suffix == ".png":
-            rgb = images.colour(image, took.channels)
-            exposure = images.automatic_exposure(rgb) if self._exposure is None else 2.0**self._exposure
-            images.write_png(self.path, images.tone_map(rgb, exposure))
+            images.write(self.path, image, took.channels, exposure=self._exposure)
             return
         metadata = self.metadata | {
             "spp": took.spp,
@@ -178,6 +176,6 @@ class Output:
         }
         if took.raw is not None:
             described = metadata | {"denoise_seconds": took.denoise_seconds}
-            images.write_exr(self.path.with_suffix(".denoised.exr"), image, took.channels, described)
+            images.write(self.path.with_suffix(".denoised.exr"), image, took.channels, described)
             image = np.array(took.raw)
-        images.write_exr(self.path, image, took.channels, metadata)
+        images.write(self.path, image, took.channels, metadata)
