@@ -1,6 +1,6 @@
-"""Checkpoints: the passes of a render that is not finished, in a file that another process goes on from.
+"""Checkpoints: files with the passes of an unfinished render, from which another process continues.
 
-They hold sums in double precision, so that a render which was interrupted ends with the image of one that was not.
+Sums are in double precision: an interruption does not change the final image.
 """
 
 import hashlib
@@ -32,9 +32,8 @@ def file_of(image):
 
 
 class Checkpoint:
-    """The file that a render goes on from, if `resume`, and that it keeps for another one to go on from. `made_by` is
-    all that the image depends on besides number and sizes of its passes (a dict for JSON): the file of another render
-    is refused."""
+    """Checkpoint file of a render, which continues from it if `resume`. `made_by`: everything that the image depends on
+    except the number and sizes of passes, a dict for JSON. The checkpoint of another render is refused."""
 
     def __init__(self, path, made_by, resume=True):
         self.path, self._made_by, self._resume = Path(path), made_by, resume
@@ -42,14 +41,13 @@ class Checkpoint:
         self._writer = OccasionalWriter("The checkpoint", self.save, CHECKPOINT_SECONDS)
 
     def restore(self, passes):
-        """Add the passes of the file, if it exists, to the empty `Passes`; return the seconds that they took. Raises
-        ValueError, with the name of the file, for a file that is no complete and unaltered checkpoint, and for the
-        checkpoint of another render."""
+        """Add the passes of the file, if it exists, to the empty `Passes`; return their seconds. Raises ValueError with
+        the name of the file for a damaged or altered checkpoint, and for the checkpoint of another render."""
         self._passes = passes
         if not self.path.is_file():
             return 0.0
         if not self._resume:
-            mi.Log(mi.LogLevel.Warn, f"'{self.path}', which --resume would go on from, is going to be replaced.")
+            mi.Log(mi.LogLevel.Warn, f"'{self.path}', which --resume continues from, will be replaced.")
             return 0.0
         described, arrays = self._read()
         other = [name for name in self._made_by if described["made_by"].get(name) != self._made_by[name]]
@@ -77,9 +75,9 @@ class Checkpoint:
             ) from None
 
     def keep(self, seconds):
-        """There is a pass more, after `seconds` in all: write the file now and then."""
+        """Take the state after a pass, `seconds` after the start; write the file from time to time."""
         passes = self._passes
-        # All of it now: another thread may save it while the next pass is added
+        # A snapshot, as another thread may save it while a pass is added
         described = {
             "made_by": self._made_by,
             "seconds": seconds,
@@ -91,8 +89,8 @@ class Checkpoint:
         self._writer.offer()
 
     def save(self):
-        """Write the file, unless there is no pass more. Raises OSError with its name if it cannot be written; the one
-        that was there before is then as it was."""
+        """Write the file if there are new passes. Raises OSError with the name of the file if that fails; an earlier
+        file is then unchanged."""
         kept = self._kept
         if kept is self._saved:
             return
@@ -103,12 +101,12 @@ class Checkpoint:
         self._saved = kept
 
     def leave(self):
-        """Write the file for another render to go on from; return whether that was possible. The image of this one is
-        not lost where it is not."""
+        """Write the file at the end of an unfinished render; return whether that succeeded. A failure is logged, as the
+        image is not lost."""
         return self._writer.write()
 
     def remove(self):
-        """Remove the file: the render is finished, and its image is not lost where that is not possible."""
+        """Remove the file of a finished render. A failure is logged, as the image is not lost."""
         try:
             self.path.unlink(missing_ok=True)
         except OSError as error:
@@ -125,5 +123,5 @@ def _digest(text, arrays):
 
 
 def _plain(value):
-    """Return what JSON knows of a `Pass`, or of a number of NumPy's."""
+    """Return a `Pass` or a number of NumPy in a type that JSON has."""
     return asdict(value) if isinstance(value, Pass) else value.item()

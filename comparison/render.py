@@ -1,4 +1,4 @@
-"""`manylights.render`: an image that ends by itself, when it has the samples, the seconds or the error asked for."""
+"""`manylights.render`: renders in passes until a limit of samples, seconds or error is reached."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from .pass_sizes import PassSizes
 from .rendering import Progressive, TotalStatistics
 from .scene_files import SceneFile
 
-LIMITS = ("spp", "time")  # that end a render whether or not it has the error asked for
+LIMITS = ("spp", "time")  # end a render regardless of its error
 
 
 @dataclass
 class Took:
     """Cost of an image.
 
-    `spp`: samples per pixel; `passes`: how many, each with a seed of its own; `seconds`: wall-clock time of the call,
-    with compilation and denoising; `error`: the relative standard error that 95% of the pixels do not exceed, as
-    estimated (see convergence.py), of the image before it was denoised, None if there were fewer than two passes;
-    `statistics`: the integrator's counters, added up over passes; `ended_by`: "spp", "time" or "error", whichever was
-    reached, "interruption" (Ctrl-C, or the integrator's `cancel`) or "progress"; None while it goes on; `channels`:
-    names of the image's channels; `denoise_seconds`: those of `seconds` that denoising took; `raw`: the image before it
-    was denoised (`mi.TensorXf`), None if it was not.
+    `spp`: samples per pixel; `passes`: number of passes, each with its own seed; `seconds`: wall-clock time of the
+    call, including compilation and denoising; `error`: estimated relative standard error that 95% of the pixels do not
+    exceed (see convergence.py), before denoising, None for fewer than two passes; `statistics`: counters of the
+    integrator, summed over passes; `ended_by`: the limit that was reached ("spp", "time" or "error"), "interruption"
+    (Ctrl-C, or `cancel` of the integrator) or "progress", None during the render; `channels`: names of the channels;
+    `denoise_seconds`: the part of `seconds` for denoising; `raw`: the image before denoising (`mi.TensorXf`), None
+    without denoising.
 
-    Of a render that goes on: `stage`, that which a pass is in, as `statistics["seconds"]` has it, None between passes;
-    `seconds_left` until the end, as expected of the passes so far, None where that is not known.
+    During a render: `stage`: current stage of the pass, a key of `statistics["seconds"]`, None between passes;
+    `seconds_left`: expected seconds until the end, None if unknown.
     """
 
     spp: int
@@ -123,7 +123,7 @@ def render(
 
 
 def _render_all(scene, integrator, **limits):
-    """Return what `render` returns for each sensor; none follows one that somebody ended early."""
+    """Return a list of the results of `render` for each sensor, up to the first that was ended early."""
     found = []
     for sensor in range(len(scene.sensors())):
         found.append(render(scene, integrator, sensor, **limits))
@@ -133,11 +133,11 @@ def _render_all(scene, integrator, **limits):
 
 
 def render_passes(progressive, sizes, ending, begin, progress=None, denoiser=None, checkpoint=None):
-    """Render passes until something ends it; return the image and what it took, as `render`.
+    """Render passes until the end of the render; return the image and the cost, as `render` does.
 
-    `progressive` makes and adds up the passes (`rendering.Progressive`, or `cluster.passes.DistributedPasses`), and may
-    have some from the checkpoint; `sizes` says how large they are (`PassSizes`), `ending` what ends them (`Ending`);
-    `begin` is when the render began (of `perf_counter`), earlier by what the passes of the checkpoint took.
+    `progressive`: renders and adds passes (`rendering.Progressive` or `cluster.passes.DistributedPasses`), and may have
+    passes of the checkpoint; `sizes`: the `PassSizes`; `ending`: the limits (`Ending`); `begin`: start of the render by
+    `perf_counter`, less the seconds of the checkpoint.
     """
     running = _Render(progressive, ending, begin, progress, checkpoint)
     with Interruption() as interruption:
@@ -148,7 +148,7 @@ def render_passes(progressive, sizes, ending, begin, progress=None, denoiser=Non
 
 
 def check(**values):
-    """Raise ValueError for limits of a render, given by name (None: not given), that are not positive."""
+    """Raise ValueError for limits of a render, by name, that are neither positive nor None."""
     for name, value in values.items():
         if value is None:
             continue
@@ -171,8 +171,8 @@ def _scene(scene):
 
 
 def _integrator(scene, integrator):
-    """Return the integrator of a name, or the given one, or by default the scene's. Raises ValueError where there is
-    none, or where it cannot render the scene."""
+    """Return the given integrator, the plugin of the given name, or by default the scene's integrator. Raises
+    ValueError if there is none, and for a scene that the integrator does not support."""
     if isinstance(integrator, str):
         import integrators  # noqa: F401 (registers plugins; needs a variant)
 
@@ -186,7 +186,7 @@ def _integrator(scene, integrator):
 
 
 class _Render:
-    """A render that began at a time (of `perf_counter`): its passes, and what ended it."""
+    """A render that began at the time `begin` (of `perf_counter`): passes, and the reason for the end."""
 
     def __init__(self, progressive, ending, begin, progress, checkpoint):
         self.progressive, self._ending, self._begin, self._progress = progressive, ending, begin, progress
@@ -197,7 +197,7 @@ class _Render:
             ending.goal.resume(progressive.passes)
 
     def run(self, sizes, interruption):
-        """Render passes until something ends it; leave a checkpoint unless nothing is missing."""
+        """Render passes until the end; leave a checkpoint of an unfinished render."""
         try:
             self._run(sizes, interruption)
         finally:
@@ -224,20 +224,20 @@ class _Render:
                 self._ended_by = "time" if self.progressive.is_late() else "interruption"
 
     def _pass(self, size, interrupted):
-        """Render a pass and return it, None if it is not to be counted."""
+        """Render a pass and return it, None after an interruption."""
         try:
             with listening(self._listener()) if self._progress else nullcontext():
-                # Mitsuba, too, hears Ctrl-C, and stops: then the pass may be unfinished.
+                # Ctrl-C also stops Mitsuba, so that the pass may be unfinished
                 return self.progressive.render(size, accept=lambda: not interrupted())
         except BaseException as error:
-            # Mitsuba and Dr.Jit make other errors of what is raised below them
+            # Mitsuba and Dr.Jit replace exceptions that they pass on
             if self._raised is not None:
                 raise self._raised from None
             if not isinstance(error, KeyboardInterrupt):
                 raise
 
     def _listener(self):
-        """Return what is to be called with the stages of the next pass."""
+        """Return the listener for the stages of the next pass."""
         before = self._took()
 
         def begins(stage):
@@ -252,12 +252,12 @@ class _Render:
         return begins
 
     def _tell(self, took, image):
-        """Tell how far it is."""
+        """Call `progress`, which may end the render."""
         if self._progress(took, image) is False:
             self._ended_by = self._ended_by or "progress"
 
     def _look(self):
-        """See whether the last pass was enough, and tell how far it is."""
+        """Estimate the error after a pass if an estimate is due, and call `progress`."""
         spp, goal = self.progressive.spp, self._ending.goal
         self._ending.mark(spp, self._elapsed())
         if self._checkpoint:
@@ -271,7 +271,7 @@ class _Render:
             self._tell(self._took(), self._image())
 
     def result(self, denoiser):
-        """Return the image and what it took."""
+        """Return the image and the cost; warn if the error was not reached."""
         if self._ended_by != "error":
             self._error = self.progressive.estimate.relative()
         if self._ended_by in LIMITS and self._ending.goal:
@@ -299,4 +299,4 @@ class _Render:
 
 
 class _Refused(BaseException):
-    """Goes in the place of what a callback raised, past all that tells of an `Exception` on its way."""
+    """Replaces the exception of a callback on the way through code that would log an `Exception`."""

@@ -1,8 +1,8 @@
-"""Dr.Jit's threads, where there would be a single one.
+"""Number of Dr.Jit's threads, at least two.
 
-Mitsuba hands the reading and writing of EXR files to Dr.Jit's thread pool, and waits. Of a pool of one thread nobody
-else does the work, so `mi.Bitmap(file)`, `mi.util.write_bitmap` and `mi.load_file` of a scene with an EXR texture wait
-for ever.
+Mitsuba gives the reading and writing of EXR files to Dr.Jit's thread pool, and waits for the result. In a pool of one
+thread no other thread does the work, so `mi.Bitmap(file)`, `mi.util.write_bitmap` and `mi.load_file` of a scene with an
+EXR texture wait for ever.
 """
 
 import drjit as dr
@@ -12,8 +12,8 @@ from .machine import cores
 
 
 def avoid_single_thread():
-    """Give Dr.Jit two threads if it has one because there is one core; log a warning in any case where it has one. A
-    number that the caller has set stays."""
+    """Set two threads on a machine of one core, and log a warning if Dr.Jit had a single one. A number of threads that
+    the caller has set does not change."""
     if dr.thread_count() > 1:
         return
     waits = "with one thread Mitsuba waits for ever when it reads or writes EXR files"

@@ -1,4 +1,4 @@
-"""Passes on workers: the image is that of one process, bit by bit, whatever becomes of the workers."""
+"""Passes on workers: the image is equal to the image of one process, bit by bit, also after the loss of workers."""
 
 import json
 import os
@@ -147,7 +147,7 @@ def test_images_that_wait_for_another_one_have_bounded_memory(monkeypatch):
 
 
 def kill_a_worker(address):
-    """Kill a worker that renders; another one takes its place after a while."""
+    """Kill a rendering worker; Dask starts a replacement."""
     with distributed.Client(address) as client:
         os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
 
@@ -176,7 +176,7 @@ def test_a_worker_that_is_killed_during_a_pass_changes_nothing(two):
 
 
 def test_passes_that_a_worker_takes_with_it_are_rendered_again(two):
-    """It has finished them, and is killed before it hands them over."""
+    """The worker is killed between the end of a pass and the transfer of the image."""
     np.testing.assert_array_equal(rendered_with_a_worker_killed(two, pause=1.0), in_one_process())
 
 
@@ -333,7 +333,7 @@ def pass_of(value):
 
 
 def test_a_checkpoint_that_is_saved_while_a_pass_is_added_is_of_those_before(tmp_path, monkeypatch):
-    """After Ctrl-C another thread saves it where the main one does not come to an end."""
+    """After Ctrl-C another thread saves the checkpoint if the main thread does not end."""
     kept, restored = rendering.Passes(0), rendering.Passes(0)
     file = checkpoint.Checkpoint(tmp_path / "a.checkpoint.npz", {})
     file.restore(kept)
@@ -375,7 +375,7 @@ OBJ = "v 0 0 9\nv 1 0 9\nv 0 1 9\nf 1 2 3\n"
 
 
 def scene_with_files(folder, mesh="meshes/a.obj"):
-    """A scene that includes another file, which names a mesh."""
+    """A scene with an included file that names a mesh."""
     for name in ("scene", "scene/meshes", "parts"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     (folder / "scene/meshes/a.obj").write_text(OBJ)
@@ -407,7 +407,7 @@ def test_a_worker_gets_the_files_that_it_lacks(tmp_path):
 
 
 def test_two_hyphens_in_a_comment_do_not_keep_a_scene_from_travelling(tmp_path):
-    """As in the hall, which says by what command it was made."""
+    """The hall has a comment with the command that made it."""
     scene = scene_with_files(tmp_path / "client")
     before = [file.relative for file in scene_travel.bundle(SceneFile(scene)).files]
     scene.write_text(f"<!-- Made by: hall.py --lights 2\n -->\n{scene.read_text()}")

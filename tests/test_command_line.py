@@ -194,7 +194,7 @@ def test_log_says_what_replaced_what(tmp_path):
     with process(CORNELL, *TINY, "-o", tmp_path / "a.exr", "--spp", 1, "-v") as verbose:
         said = "".join(verbose.communicate(timeout=60))
     assert verbose.returncode == 0
-    assert "The integrator is manylights in place of path; with -i scene it would be the scene's." in said
+    assert "The integrator is manylights in place of path; -i scene would keep the scene's." in said
 
 
 def test_exr_file_says_what_was_chosen(tmp_path):
@@ -271,7 +271,7 @@ def test_message_of_an_integrator_is_not_hidden(capsys):
 
 @pytest.fixture
 def interruptible():
-    """Ctrl-C is heard, also where the tests were started in the background of a script, which has it ignored."""
+    """Restore the handler of Ctrl-C, which background jobs of a script ignore."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -307,7 +307,7 @@ def test_image_ends_by_itself(tmp_path, capsys):
     assert metadata["ended_by"] == "error" and 0 < metadata["estimated_error"] <= 0.3 and metadata["passes"] >= 8
     assert f"error {metadata['estimated_error']:.2%}" in capsys.readouterr().out
     assert run(CORNELL, *TINY, "-o", output, "--time", "1e-6") == 0
-    # What was there before has no part in it
+    # The existing file does not contribute
     metadata = images.read_exr(output)[2]
     assert (metadata["ended_by"], metadata["passes"], metadata["spp"]) == ("time", 1, 4)
 
@@ -328,7 +328,7 @@ def test_image_is_written_while_it_is_rendered(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("passes", "disk"), [(0, "free"), (3, "free"), (3, "full")])
 def test_interruption_does_not_wait_for_a_pass(tmp_path, passes, disk):
-    """Of an integrator that hears nothing for as long as it renders."""
+    """The integrator ignores signals during a render."""
     output = tmp_path / "a.exr"
     script = f"""
 import sys, time
@@ -369,6 +369,6 @@ def test_interruption_reaches_a_process(tmp_path):
         time.sleep(3)
         rendering.send_signal(signal.SIGINT)
         _, said = rendering.communicate(timeout=60)
-    assert rendering.returncode in (130, -signal.SIGINT)  # the latter where it had not even begun
+    assert rendering.returncode in (130, -signal.SIGINT)  # the signal's status if the signal came before the start
     assert rendering.returncode < 0 or "interrupted" in said
     assert all(file.name == "a.exr" for file in tmp_path.iterdir())

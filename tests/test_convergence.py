@@ -1,4 +1,4 @@
-"""The estimated error of an image: is it what it is called, also where a render ends by it?"""
+"""The estimated error of an image agrees with the true error, also for a render that ends by its error."""
 
 from itertools import pairwise
 from types import SimpleNamespace
@@ -29,7 +29,7 @@ def of_the_whole_image(rng, spp):
 
 
 def of_lights(rng, spp):
-    """As of virtual lights, which each pass has anew, however many samples it has."""
+    """As by virtual lights of each pass, for any number of samples."""
     return 0.3 * rng.normal(size=X.shape)
 
 

@@ -1,4 +1,4 @@
-"""References: batches and their standard errors, kept and continued; the one that is shipped."""
+"""References: batches and standard errors, cached and continued references, the shipped reference."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""`manylights.render`: what ends a render, and what it returns."""
+"""`manylights.render`: limits, results, errors."""
 
 import itertools
 import re
@@ -29,7 +29,7 @@ def scene():
 
 
 def clock(monkeypatch, seconds):
-    """A clock that goes on by some seconds whenever it is looked at."""
+    """Replace the clock by a clock that advances by some seconds at each call."""
     ticks = itertools.count()
     monkeypatch.setattr(render_module.clock, "perf_counter", lambda: next(ticks) * seconds)
 

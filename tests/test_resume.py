@@ -99,7 +99,7 @@ def test_killed_comparison_goes_on_where_it_stopped(tmp_path, monkeypatch):
     assert compare.main([*command(tmp_path), "--resume", "--max-depth", "2", "--seeds", "1"]) == 0
     assert len(made) == 2  # other parameters, other runs
     assert compare.main([*command(tmp_path), "--resume", "--seeds", "1"]) == 0
-    assert len(made) == 4  # whose images had taken the place of these
+    assert len(made) == 4  # the images of the former had replaced these
 
 
 def test_two_comparisons_do_not_share_a_folder(tmp_path, capsys):

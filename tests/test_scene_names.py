@@ -1,4 +1,4 @@
-"""Files that a scene names: the same that Mitsuba reads, whatever XML its parser accepts."""
+"""Files that a scene names: the files that Mitsuba reads, for all XML that Mitsuba accepts."""
 
 import pytest
 
@@ -30,7 +30,8 @@ def write(file, content, head=""):
 
 
 def travelling(folder, content, head="", defines=None):
-    """The files that travel with a scene, which Mitsuba loads: below the folder, without the scene itself."""
+    """Return the files that travel with a scene, relative to the folder, without the scene file; Mitsuba must load
+    it."""
     scene = SceneFile(write(folder / "scene/main.xml", CAMERA + content, head), defines)
     found = scene_travel.bundle(scene)
     scene.load()
@@ -110,7 +111,7 @@ def test_an_escaped_dollar_is_a_dollar(folder):
 
 
 def test_identifiers_and_other_attributes_are_no_files(folder):
-    """Nor is a string that no plugin opens."""
+    """Strings that no plugin opens are no files either."""
     other = '<shape type="sphere" id="secret.txt"><bsdf type="diffuse" id="/etc/hostname" name="secret.txt"/></shape>'
     other += '<default name="secret.txt" value="secret.txt"/>'
     assert travelling(folder, other) == set()

@@ -1,4 +1,4 @@
-"""Two threads that render at once: with one sensor the later one is told, with one each both images are right."""
+"""Two threads that render at the same time: a shared sensor is refused, separate sensors give correct images."""
 
 import threading
 
@@ -19,7 +19,7 @@ def box():
 
 
 class Waiting:
-    """A thread that calls a function, which in turn calls ``pause``: then the block runs, and after it the rest."""
+    """Thread of a function that calls ``pause``; the function continues after the block."""
 
     def __init__(self, function):
         self._reached, self._go_on, self.result = threading.Event(), threading.Event(), None

@@ -1,8 +1,7 @@
-"""Files that a scene names, found by reading its XML as Mitsuba's parser (pugixml) does.
+"""Files that a scene names, by a reader of XML with the rules of Mitsuba's parser (pugixml).
 
-Mitsuba reports the XML files that it has read only if they contain objects, and spectra without the files that they
-come from. Python's XML parser refuses documents that pugixml accepts: an `&` that begins no entity, undeclared
-entities, two hyphens in a comment.
+Mitsuba's parser reports neither included files without objects nor the files of spectra. Python's XML parser refuses
+documents that pugixml accepts: with a bare `&`, undeclared entities, or two hyphens in a comment.
 """
 
 import os
@@ -22,11 +21,11 @@ _NAMED_ENTITIES = {"amp": "&", "lt": "<", "gt": ">", "quot": '"', "apos": "'"}
 
 
 def named_files(path, defines):
-    """Return the files that the scene file at `path` names, with `defines` for its parameters: a dict from the absolute
-    path (str) to whether the scene names the file by a relative path. Names without a file are left out.
+    """Return the files that a scene file names, with the parameters `defines`: a dict from the absolute path (str) to
+    whether the scene names the file by a relative path. Missing files are ignored.
 
-    Files are named by `<include filename>`, `<spectrum filename>` and `<string>` elements that have a name of
-    `FILE_PROPERTIES`. Other attributes, such as identifiers, name no files.
+    Files are named by `<include filename>`, by `<spectrum filename>`, and by `<string>` properties in
+    `FILE_PROPERTIES`. Identifiers and the remaining attributes name no files.
     """
     main = Path(os.path.abspath(path))
     reader = _Reader(main.parent, dict(defines))
@@ -35,15 +34,16 @@ def named_files(path, defines):
 
 
 class _Reader:
-    """Elements of a scene in document order, includes among them; `found` as `named_files` returns it."""
+    """Reads elements in document order, with included files in place; `found` is the result of `named_files`."""
 
     def __init__(self, folder, parameters):
         self.found, self._folder, self._parameters = {}, folder, parameters
-        self._added = []  # (folder of a <path> element, whether it has a relative path), the last one first
+        self._added = []  # (folder of a <path> element, whether its path is relative), latest first
 
     def read(self, file, outer):
-        """Read an XML file; `outer` are the folders of the files that include it. Mitsuba looks for included files
-        beside the file that includes them, then beside the outer ones, for others only beside the main file."""
+        """Read an XML file; `outer`: folders of the including files. Mitsuba searches an included file beside the
+        including file, then in `outer`; other files beside the main file; all files finally in the folders of <path>
+        elements."""
         beside = [(file.parent, True), *outer]
         for tag, attributes in _elements(file):
             attributes = {name: substitute(value, self._parameters) for name, value in attributes.items()}
@@ -60,7 +60,7 @@ class _Reader:
                 self._find(attributes.get("value"), [(self._folder, True)])
 
     def _find(self, name, folders):
-        """Add the file of a name and return its path; None if no folder has it."""
+        """Add the first file of a given name in `folders` and return its path, None if there is none."""
         for folder, relative in [*folders, *self._added] if name else []:
             file = os.path.normpath(folder / name)
             if os.path.isfile(file):
@@ -70,7 +70,7 @@ class _Reader:
 
 
 def _elements(file):
-    """Yield the tag and the attributes (a dict) of all elements of an XML file."""
+    """Yield tag and attributes (a dict) of each element of an XML file."""
     for match in _MARKUP.finditer(_decode(file.read_bytes())):
         if match["tag"]:
             found = _ATTRIBUTE.findall(match["attributes"])
@@ -82,7 +82,7 @@ def _decode(content):
         return content.decode("utf-16", "replace")
     if re.match(rb"<\?xml[^>]*encoding\s*=\s*[\"'](iso-8859-1|latin1)", content, re.IGNORECASE):
         return content.decode("latin-1")
-    return content.decode("utf-8-sig", "surrogateescape")  # as names of files are
+    return content.decode("utf-8-sig", "surrogateescape")  # the encoding of file names
 
 
 def _character(entity):
@@ -91,8 +91,8 @@ def _character(entity):
 
 
 def substitute(text, parameters):
-    r"""Replace `$name` in a text by the values of `parameters`, the longest names first, wherever the name stands:
-    `$p_a` has the parameter `p` unless there is one called `p_a`. `\$` stands for a dollar sign."""
+    r"""Replace each `$name` in a text by the value of the parameter, longest names first. A name may end within a word:
+    `$p_a` contains the parameter `p` unless `p_a` is defined. `\$` is a dollar sign."""
     if "$" not in text:
         return text
     for name in sorted(parameters, key=len, reverse=True):
