@@ -1,4 +1,4 @@
-"""Compare integrators on scenes: same scene, same seeds, same reference, each run in a process of its own.
+"""Compare integrators on scenes with equal seeds and references; each run has its own process.
 
     python compare.py scenes/hall.xml --integrators path,manylights --time 20 --reference path:4096
     python compare.py scenes/cornell.xml --integrators path,lightcuts,illuminationcut --reference path:auto --sweep
@@ -6,22 +6,22 @@
         --param coarse.error=0.02 --param fine.error=0.005 --spp 4 --reference vpl
     python compare.py --demo
 
-Prints tables and writes to the output folder `report.html` (one file, with all pictures), `results.json` (documented in
-comparison/results.schema.json), and for each scene and setting the image (`SCENE.SETTING.exr`, with how it was made,
-and `.png`), its error (`SCENE.SETTING.error.png`) and with `--aovs` its other channels in false colours.
+Prints tables and writes to the output folder `report.html` (self-contained), `results.json` (documented in
+comparison/results.schema.json), and for each scene and setting the image (`SCENE.SETTING.exr`, with metadata, and
+`.png`), the error map (`SCENE.SETTING.error.png`), and with `--aovs` further channels in false colours.
 
-With --sweep every integrator is rendered with several values of its quality parameter, and with several seeds: the
-report then has curves of error against time and against shadow rays, and what the same error costs.
+--sweep renders each integrator with several values of its quality parameter and several seeds. The report then contains
+curves of error against time and against shadow rays, and costs at equal error.
 
-Times are wall-clock seconds of rendering alone. Passes that compile kernels are in no image, small ones first. The
-first of all of an integrator begins with an empty kernel cache: it is the cold one, and reported apart. With --cold all
-begin with an empty one, and their times include compilation. Runs of integrators take turns.
+Times are wall-clock seconds of rendering. Warm-up passes compile the kernels and are not part of an image. The first
+pass of an integrator starts with an empty kernel cache; its cold time is reported separately. With --cold each image
+starts with an empty kernel cache and includes compilation. Runs of the integrators are interleaved.
 comparison/metrics.py defines the errors.
 
-Ctrl-C leaves a report of what was finished; --resume goes on from there, also after a crash.
+Ctrl-C writes a report of the finished runs; --resume continues, also after a crash.
 
-Exit status: 0; 1 if anything failed (what did not is reported all the same); 2 for a command that makes no sense; 3 if
---check found that a speed-up fell; 130 after Ctrl-C.
+Exit status: 0: success; 1: a run failed (the report covers the others); 2: invalid command line; 3: --check found a
+lower speed-up; 130: Ctrl-C.
 """
 
 import argparse
@@ -46,9 +46,9 @@ except ModuleNotFoundError as missing:
     sys.exit(f"compare: the package '{missing.name}' is missing; pip install 'manylights[compare]' brings it")
 
 ROOT = Path(__file__).resolve().parent
-PACKAGED = ROOT / "comparison" / "scenes"  # where a wheel has those of the demo
+PACKAGED = ROOT / "comparison" / "scenes"  # location of the demo scenes in a wheel
 SCENES = PACKAGED if PACKAGED.is_dir() else ROOT / "scenes"
-SWEEP_SEEDS = 3  # the fewest that say something about their spread
+SWEEP_SEEDS = 3  # minimum for a useful confidence interval
 DEMO = [
     str(SCENES / "hall.xml"), "--integrators", "path,manylights", "--time", "30",
     "--reference", str(SCENES / "hall_reference.exr"),
@@ -56,23 +56,23 @@ DEMO = [
 
 
 def _name() -> str:
-    """What this command was called by."""
+    """Name of this command as invoked."""
     called = Path(sys.argv[0]).stem
     return called if called == "manylights-compare" else "compare.py"
 
 
 def parse(arguments):
-    """Parse the command line; return its options. Exits with status 2 and a message if it makes no sense."""
+    """Parse the command line; return its options. Exits with status 2 and a message if it is invalid."""
     parser = argparse.ArgumentParser(
         prog=_name(), description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
     add("scenes", nargs="*", metavar="SCENE", help="scene files (XML)")
     add("-i", "--integrators", default="path,manylights", metavar="NAME,...",
-        help="integrators, each NAME or LABEL=NAME to have one twice (default: path,manylights); the others "
-             "are compared with the first")  # fmt: skip
+        help="integrators, each NAME, or LABEL=NAME to use a plugin twice (default: path,manylights); the first "
+             "is the base of comparisons")  # fmt: skip
     add("-p", "--param", action="append", type=parameter, default=[], metavar="LABEL.KEY=VALUE",
-        help="parameter of an integrator, such as lightcuts.error=0.02; repeat for more")  # fmt: skip
+        help="parameter of an integrator, such as lightcuts.error=0.02; repeatable")  # fmt: skip
     _add_effort(parser)
     _add_reference(parser)
     _add_scene(parser)
@@ -95,67 +95,66 @@ def parse(arguments):
 def _add_effort(parser):
     effort = parser.add_mutually_exclusive_group()
     effort.add_argument("--time", type=positive(float), metavar="SECONDS",
-                        help="time budget of each image, which a shorter last pass fills (default: 20, unless "
+                        help="time budget of each image, met by a shorter last pass (default: 20, except with "
                              "--sweep)")  # fmt: skip
     effort.add_argument("--spp", type=positive(int), metavar="N",
-                        help="samples per pixel of each image (default of sweeps over other parameters: "
+                        help="samples per pixel of each image (default for sweeps of other parameters: "
                              f"{sweeps.DEFAULT_SPP})")  # fmt: skip
     add = parser.add_argument
     add("--pass-spp", type=positive(int), metavar="N",
-        help="samples per pixel of one pass, which has VPLs of its own (default: chosen)")  # fmt: skip
+        help="samples per pixel of a pass; each pass has new VPLs (default: automatic)")  # fmt: skip
     add("--cold", action="store_true",
-        help="begin every image with an empty kernel cache, and count compilation as part of its time")  # fmt: skip
+        help="start each image with an empty kernel cache and include compilation in its time")  # fmt: skip
     add("--sweep", action="append", type=sweeps.sweep, nargs="?", const=("all", None, ()), default=[],
         metavar="LABEL:KEY=VALUE,...",
-        help="render with each of several values of a parameter, or of spp or time, such as "
-             "lightcuts:error=0.04,0.02,0.01 or path:spp=4,16,64; repeat for others; several parameters of a label "
-             "make a grid. Alone or as 'all', and for labels without one: over what trades error for time")  # fmt: skip
+        help="sweep a parameter, spp or time, e.g. lightcuts:error=0.04,0.02,0.01 or path:spp=4,16,64; repeatable; "
+             "several parameters of a label form a grid. Without argument, with 'all', and for labels without a "
+             "sweep: the parameter that trades error for time")  # fmt: skip
     add("--denoise", action="store_true",
-        help="show each image denoised by Open Image Denoise, too, and count the time of that (pip install "
+        help="also denoise each image by Open Image Denoise, and measure the time (pip install "
              "'manylights[denoise]')")  # fmt: skip
     add("--seeds", type=positive(int), metavar="N",
-        help=f"how many seeds, beginning with --seed (default: 1, with --sweep {SWEEP_SEEDS})")  # fmt: skip
+        help=f"number of seeds, from --seed on (default: 1, with --sweep {SWEEP_SEEDS})")  # fmt: skip
     add("--seed", type=command_line.seed, default=0, metavar="N", help="first seed (default: 0)")
 
 
 def _add_reference(parser):
     add = parser.add_argument
     add("-r", "--reference", type=references.wanted, default="path:1024",
-        help="an EXR file, or a folder that holds SCENE.exr, which also gives the width; path:SPP (path traced, kept, "
-             "continued); path:auto or path:auto:FRACTION (continued until its noise is at most that fraction of the "
-             f"smallest error that is measured, {references.AUTOMATIC_FRACTION:g}); vpl (each image by all of its own "
-             "VPLs) (default: path:1024)")  # fmt: skip
+        help="an EXR file, or a folder with SCENE.exr, which also defines the width; path:SPP (path traced, cached, "
+             "continued); path:auto or path:auto:FRACTION (continued until its noise is at most this fraction, by "
+             f"default {references.AUTOMATIC_FRACTION:g}, of the smallest measured error); vpl (for each image, the "
+             "sum of all its VPLs) (default: path:1024)")  # fmt: skip
     add("--reference-limit", type=positive(int), default=2**17, metavar="SPP",
-        help="most samples per pixel of path:auto (default: 131072)")  # fmt: skip
+        help="maximum samples per pixel of path:auto (default: 131072)")  # fmt: skip
     add("--cache", type=Path, default=references.default_cache(), metavar="FOLDER",
-        help="where path-traced references are kept (default: ~/.cache/manylights)")  # fmt: skip
+        help="cache of path-traced references (default: ~/.cache/manylights)")  # fmt: skip
     add("--metric", choices=metrics.NAMES, default="relmse_trimmed",
-        help="error of the curves, of path:auto and of --check (default: relmse_trimmed)")  # fmt: skip
+        help="error metric of curves, path:auto and --check (default: relmse_trimmed)")  # fmt: skip
 
 
 def _add_scene(parser):
     add = parser.add_argument
-    add("--max-depth", type=int, metavar="N", help="longest paths (default: the scene's)")
-    add("--width", type=positive(int), metavar="N", help="width of the images (default: the scene's)")
+    add("--max-depth", type=int, metavar="N", help="maximum path depth (default: of the scene)")
+    add("--width", type=positive(int), metavar="N", help="width of the images (default: of the scene)")
     add("--aovs", type=_names, default=[], metavar="NAME,...",
-        help="channels to show in false colours, asked of the integrators that know them: shadow_rays, upper_bounds, "
-             "cut_size, phase_one (see their docstrings)")  # fmt: skip
+        help="AOVs to show in false colours, for integrators that support them: shadow_rays, upper_bounds, cut_size, "
+             "phase_one (see the integrators' docstrings)")  # fmt: skip
 
 
 def _add_output(parser):
     add = parser.add_argument
     add("-o", "--out", type=Path, metavar="FOLDER", help="output folder (default: output, or output/demo)")
     add("--resume", action="store_true",
-        help="do not repeat runs that are finished in the output folder, if parameters, scene, software and machine "
-             "are the same")  # fmt: skip
+        help="reuse finished runs in the output folder with the same parameters, scene, software and "
+             "machine")  # fmt: skip
     add("--check", type=Path, metavar="BASELINE",
-        help="a results.json: fail if a speed-up at equal error has fallen since, and say which")  # fmt: skip
+        help="an earlier results.json; fail if a speed-up at equal error has fallen since")  # fmt: skip
     add("--check-share", type=_share, default=0.2, metavar="FRACTION",
-        help="by how much a speed-up may fall (default: 0.2)")  # fmt: skip
+        help="tolerated fall of a speed-up (default: 0.2)")  # fmt: skip
     add("--workers", type=workers, metavar="N|ADDRESS",
-        help="make the runs on N processes, or on the workers of the Dask scheduler at an address such as "
-             "tcp://HOST:8786: errors are what they are elsewhere, times of different machines are not to be compared "
-             "(docs/cluster.md)")  # fmt: skip
+        help="distribute runs to N processes, or to the workers of a Dask scheduler, e.g. tcp://HOST:8786; errors do "
+             "not change, times of different machines are not comparable (docs/cluster.md)")  # fmt: skip
     add("--demo", action="store_true", help="path and manylights on scenes/hall.xml, in less than three minutes")
 
 
@@ -176,14 +175,14 @@ def _share(text):
 
 
 def chosen_integrators(options):
-    """Return a dict from label to name and parameters; raises UsageError for what does not exist or fit together."""
+    """Return label -> (name, parameters); raises UsageError for unknown, ambiguous or incompatible options."""
     chosen = {}
     for entry in options.integrators.split(","):
         label, _, name = entry.strip().rpartition("=")
         label = label or name
         if not re.fullmatch(r"[\w-]+", label) or label in (*chosen, REFERENCE):
             raise UsageError(
-                f"--integrators: '{entry}' is no name of its own; two of a kind are a=lightcuts,b=lightcuts"
+                f"--integrators: '{entry}' has no unique label; to use a plugin twice write a=lightcuts,b=lightcuts"
             )
         command_line.check_integrator(name)
         chosen[label] = (name, {})
@@ -193,46 +192,46 @@ def chosen_integrators(options):
             raise UsageError(f"--param {key}: not of the form LABEL.KEY=VALUE, where LABEL is {' or '.join(chosen)}")
         chosen[label][1][name] = value
     for aov in options.aovs:
-        _ask_for(aov, chosen)
+        _request_aov(aov, chosen)
     return chosen
 
 
-def _ask_for(aov, chosen):
-    """Add an AOV to the parameters of those chosen integrators that know it; raises UsageError if none does."""
-    able = command_line.integrators_with_aovs()
-    own = [choice for choice in chosen.values() if choice[0] in able]
-    if not own:
-        raise UsageError(f"--aovs: only {', '.join(able)} have AOVs")
-    refusals = [command_line.aov_refusal(name, aov) for name, _ in own]
+def _request_aov(aov, chosen):
+    """Add an AOV to the parameters of all integrators that support it; raises UsageError if none does."""
+    supporting = command_line.integrators_with_aovs()
+    choices = [choice for choice in chosen.values() if choice[0] in supporting]
+    if not choices:
+        raise UsageError(f"--aovs: supported only by {', '.join(supporting)}")
+    refusals = [command_line.aov_refusal(name, aov) for name, _ in choices]
     if all(refusals):
         raise UsageError(f"--aovs {aov}: {'; '.join(dict.fromkeys(refusals))}")
-    for (_, parameters), refusal in zip(own, refusals, strict=True):
+    for (_, parameters), refusal in zip(choices, refusals, strict=True):
         if not refusal:
             given = _names(str(parameters.get("aovs", "")))
             parameters["aovs"] = ",".join(dict.fromkeys([*given, aov]))
 
 
 def chosen_settings(options):
-    """Return all settings, label -> list; raises UsageError for those that their integrators refuse."""
-    # What `vpl` makes of the same lights and camera rays has no noise of its own that more samples would take away.
+    """Return all settings, label -> list; raises UsageError for parameters that an integrator rejects."""
+    # A reference by `vpl` uses the same lights and camera rays, so that errors do not depend on the number of samples
     samples = options.reference.kind != "vpl"
     settings = sweeps.settings(chosen_integrators(options), options.sweep, options.spp, options.time, samples)
-    for of in settings.values():
-        for setting in of:
+    for group in settings.values():
+        for setting in group:
             command_line.check_parameters(setting.title, setting.integrator, setting.parameters)
     return settings
 
 
 def check_scenes(paths, reference):
-    """Raise UsageError for scenes or references that are not there or not enough, and for two scenes of one name."""
+    """Raise UsageError for missing scenes or references, and for two scenes with the same name."""
     names = {}
     if len(paths) > 1 and reference.kind == "file" and not reference.file.is_dir():
-        raise UsageError(f"--reference: '{reference.file}' is of one scene; for several give a folder")
+        raise UsageError(f"--reference: '{reference.file}' is a single image; for several scenes give a folder")
     for path in paths:
         command_line.check_scene(path)
         name = short_name(path)
         if name in names:
-            raise UsageError(f"'{names[name]}' and '{path}' would have files of the same name, '{name}'")
+            raise UsageError(f"'{names[name]}' and '{path}' would have output files of the same name, '{name}'")
         names[name] = path
         file = reference.file_of(name)
         if file and not file.is_file():
@@ -247,7 +246,9 @@ def run(options, command):
     settings = chosen_settings(options)
     check_scenes(options.scenes, options.reference)
     if options.workers and options.reference.kind == "vpl":
-        raise UsageError("--reference vpl shares files between runs, which --workers cannot; choose another reference")
+        raise UsageError(
+            "--reference vpl shares files between runs and is incompatible with --workers; choose another reference"
+        )
     names = map(short_name, options.scenes)
     earlier = baseline.read(options.check, options.metric, names) if options.check else None
     command_line.make_folder(options.out)
@@ -267,7 +268,7 @@ def run(options, command):
 
 @contextmanager
 def _runner(options):
-    """Give what makes the runs in the block: processes of this machine, or workers."""
+    """Yield the runner of the block: processes of this machine, or distributed workers."""
     if not options.workers:
         yield worker
         return
@@ -278,7 +279,7 @@ def _runner(options):
 
 
 def _compare(options, settings, command, runner):
-    """Make all runs, and write the report after each scene; return the content of `results.json`."""
+    """Make all runs and write the report after each scene; return the content of `results.json`."""
     made_by = {"versions": machine.versions(), "machine": machine.identity()}
     store = Runs(options.out, made_by | ({"workers": True} if options.workers else {}))
     progress = Progress(options.scenes, sweeps.order(settings, options.seeds))
@@ -288,23 +289,23 @@ def _compare(options, settings, command, runner):
         for comparison in comparisons:
             complete = False
             try:
-                # Workers go on with the next scenes while the last runs on one are made
+                # Announce all scenes at the start, so that no worker is idle during the last runs of a scene
                 for one in comparisons if options.workers and not done else [comparison]:
                     one.prepare()
                 comparison.run()
                 complete = len(done) + 1 == len(options.scenes)
-            finally:  # an interruption, too, leaves a report of what there is
+            finally:  # after an interruption, report the finished runs
                 progress.skip(comparison.path)
-                store.forget_kernels()  # of this scene; room for pictures and report
+                store.remove_kernels()  # of this scene, to free disk space for pictures and report
                 comparison.finish()
                 done.append(comparison)
-                progress.write(report.text(comparison.result) + "\n")  # first, as it needs no disk
+                progress.write(report.text(comparison.result) + "\n")  # first, because a full disk cannot prevent it
                 results = report.describe(command, options, [one.result for one in done], complete)
                 report.write(options.out, results, [one.pictures for one in done])
         return results
     finally:
         progress.close()
-        store.forget_kernels()
+        store.remove_kernels()
 
 
 def main(arguments=None):
@@ -315,13 +316,13 @@ def main(arguments=None):
     return command_line.exit_status(
         "compare",
         lambda: run(options, command),
-        f"what was finished is in {options.out}; --resume goes on",
+        f"finished runs are in {options.out}; --resume continues",
         options.verbose,
     )
 
 
 def start():
-    """Run the command as the process that it has to itself: SIGTERM ends it as Ctrl-C does."""
+    """Entry point of the process: run the command, and treat SIGTERM as Ctrl-C."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(main())
 

@@ -1,1 +1,1 @@
-"""Measurements that print ratios from one run.  They are not tests: nothing here passes or fails by the clock."""
+"""Benchmarks, which print ratios from single runs. They are not tests and do not fail by timing."""

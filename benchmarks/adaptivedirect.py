@@ -2,18 +2,18 @@
 
     ./run -- python benchmarks/adaptivedirect.py [--scenes NAME ...] [--parts table paper lights cold]
 
-table   direct light (``max_depth`` 2) of each scene at the same convergence rule: seconds, shadow rays per pixel and
-        relMSE of ``adaptivedirect`` and ``unoccludeddirect``; and how long that one, ``lights="all"``, ``direct`` and
-        ``path`` would take for the same relMSE.
-paper   the same with the method as the paper prints it (benchmarks/printed_passes.py).
-lights  the hall with 100 to 100 000 lights: seconds to the same error.
-cold    first render in a fresh process with an empty kernel cache.
+table   direct light (``max_depth`` 2) of each scene with equal stopping rules: seconds, shadow rays per pixel and
+        relMSE of ``adaptivedirect`` and ``unoccludeddirect``; time at equal relMSE of the latter, ``lights="all"``,
+        ``direct`` and ``path``.
+paper   the same for the method as printed in the paper (benchmarks/printed_passes.py).
+lights  the hall with 100 to 100 000 lights: seconds to equal error.
+cold    first render in a new process with an empty kernel cache.
 
 Images are rendered with 64 camera rays a pixel (256 by ``direct`` and ``path``) from a multijitter sampler, and
 compared, where they see no emitter, with the mean of four renders by ``adaptivedirect`` at 1.5%, whose own noise is
 taken off: path-traced references of these scenes are noisier than what they would judge (10% a pixel after 2048 samples
-in the kitchen). That its mean is that of ``direct`` is tested (tests/test_adaptivedirect.py). Variance falls as
-1 / time, so a method's time for another error is its own time, scaled; ``all`` is stopped after 15 seconds.
+in the kitchen). That its mean is that of ``direct`` is tested (tests/integrators/test_adaptivedirect.py). Variance
+falls as 1 / time, so a method's time for another error is its own time, scaled; ``all`` is stopped after 15 seconds.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
-from benchmarks import scenes  # noqa: E402
+from benchmarks import results, scenes  # noqa: E402
 from benchmarks.printed_passes import as_printed  # noqa: E402
 from comparison import references  # noqa: E402
 from comparison.metrics import compare  # noqa: E402
@@ -49,7 +49,7 @@ PRINTED = "adaptivedirect, printed"
 
 
 class Problem:
-    """A scene with its reference, and renders of it with their times and errors."""
+    """Scene with its reference; renders with times and errors."""
 
     def __init__(self, name: str, width: int):
         path, height = str(scenes.scene_file(name)), scenes.height(name, width)
@@ -62,12 +62,12 @@ class Problem:
         if not cached.exists():
             self._make_reference(cached)
         self.reference = references.read(cached)
-        # The edges of emitters, a thousand times brighter than what is around them, would drown all other errors
+        # Exclude emitters: errors at their edges, a thousand times brighter than the surroundings, dominate otherwise
         shown = np.array(mi.render(self.scene, integrator=plugin("path", max_depth=1), spp=256, seed=0))
         self.lit = shown[..., :3].max(-1) == 0
 
     def _make_reference(self, file: Path) -> None:
-        """The mean of independent renders, and its standard error."""
+        """Write the mean of independent renders and its standard error."""
         batches, fine = references.Batches(), plugin("adaptivedirect", error=REFERENCE_ERROR, max_passes=30)
         for seed in range(1000, 1000 + REFERENCE_RENDERS):
             image = np.array(mi.render(self.scene, integrator=fine, spp=RAYS, seed=seed), np.float64)
@@ -76,18 +76,18 @@ class Problem:
         batches.write(file, {"integrator": "adaptivedirect", "error": REFERENCE_ERROR})
 
     def error(self, image) -> float:
-        """relMSE over pixels without emitters, the largest 0.1% left out and the reference's noise taken off."""
+        """relMSE over pixels without emitters, without the largest 0.1%, corrected for the reference's noise."""
         known = self.reference
         parts = (x[self.lit][None] for x in (np.array(image, np.float64)[..., :3], known.image, known.standard_error))
         return compare(*parts)["relmse_trimmed"]
 
     def race(self, ours: str, methods: dict) -> dict:
-        """Render with {label: (plugin, its properties, samples)}: ``ours`` now and then, and at the end.
+        """Render with {label: (plugin, properties, samples)}; runs of ``ours`` are interleaved and come last.
 
-        Returns {label: (median of the seconds, mean relMSE, mean rays per pixel)}.
+        Returns {label: (median seconds, mean relMSE, mean rays per pixel)}.
         """
         for kind, more, samples in methods.values():
-            # The kernels of Mitsuba's integrators contain the number of samples
+            # Kernels of Mitsuba's integrators depend on the number of samples
             few = samples if kind in ("direct", "path") else 2
             usual = plugin(kind, **{k: v for k, v in more.items() if k != "error"})
             with method(kind):
@@ -111,17 +111,18 @@ class Problem:
 
 
 def plugin(name: str, **more):
-    """An integrator for direct light."""
+    """Integrator for direct light."""
     return mi.load_dict({"type": name.split(",")[0], **more})
 
 
 def method(name: str):
-    """Context in which the plugin of that name renders by the method that is meant."""
+    """Context in which the plugin of this name renders by the intended method."""
     return as_printed() if name == PRINTED else nullcontext()
 
 
-def table(names, options) -> None:
+def table(names, options) -> dict:
     """Part "table"."""
+    rows: dict = {}
     print(f"\n## at the same rule, error {100 * options.error:g}%, {RAYS} camera rays, width {options.width}, warm")
     print(
         "scene | adaptive: s, rays/px, relMSE | unoccluded: s, rays/px, relMSE | faster | fewer rays | at equal relMSE:"
@@ -142,6 +143,9 @@ def table(names, options) -> None:
         slower = {label: one[0] * one[1] / (seconds * error) for label, one in found.items()}
         if "unoccluded" in found:
             slower |= {"faster": found["unoccluded"][0] / seconds, "fewer": found["unoccluded"][2] / rays}
+        rows[name] = {label: _numbers(one) | {"speedup": slower[label]} for label, one in found.items()}
+        if "unoccluded" in found:
+            rows[name]["same rule"] = {"speedup": slower["faster"], "fewer_rays": slower["fewer"]}
         for label in ratios.keys() & slower.keys():
             ratios[label].append(slower[label])
         columns = [
@@ -152,10 +156,17 @@ def table(names, options) -> None:
         print(f"{name} | {' | '.join(columns)}", flush=True)
     means = {label: f"{scenes.geometric_mean(values):.1f}" for label, values in ratios.items() if values}
     print("geometric means:", ", ".join(f"{label} {value}" for label, value in means.items()))
+    return rows
 
 
-def departures(names, options) -> None:
+def _numbers(found: tuple) -> dict:
+    """Quantities of a race, for a result file."""
+    return dict(zip(("seconds", "relmse", "rays"), found, strict=True))
+
+
+def departures(names, options) -> dict:
     """Part "paper": what the departures from the paper bring."""
+    rows: dict = {}
     print("\n## the method as printed, and with what was changed, at the same rule")
     print("scene | ours: s, rays/px, relMSE, bias | as printed: s, rays/px, relMSE, bias | ours at equal relMSE: times")
     for name in names:
@@ -177,11 +188,15 @@ def departures(names, options) -> None:
             for label in ("ours", "printed")
         ]  # fmt: skip
         ratio = found["printed"][0] * found["printed"][1] / (found["ours"][0] * found["ours"][1])
+        rows[name] = {label: _numbers(one) | {"bias": bias[label] / 100} for label, one in found.items()}
+        rows[name]["speedup"] = ratio
         print(f"{name} | {columns[0]} | {columns[1]} | {ratio:.1f}", flush=True)
+    return rows
 
 
-def number_of_lights(options) -> None:
+def number_of_lights(options) -> dict:
     """Part "lights"."""
+    rows: dict = {}
     print(f"\n## the hall with N lights: error {100 * options.error:g}% (compared with renders of 1% and 64 rays)")
     print("lights | load s | auto: s, rays/px, relMSE | all: s, rays/px, relMSE | time to equal relMSE, all / auto")
     for count in (100, 1000, 10_000, 100_000):
@@ -193,7 +208,7 @@ def number_of_lights(options) -> None:
         fine = plugin("adaptivedirect", error=0.01, max_passes=40)
         exact = np.mean([np.array(mi.render(scene, integrator=fine, spp=64, seed=k), np.float64) for k in (8, 9)], 0)
         pixels = exact.shape[0] * exact.shape[1]
-        results = {}
+        found = {}
         for lights in ("auto", "all"):
             if lights == "all" and count > 10_000:
                 continue
@@ -201,12 +216,16 @@ def number_of_lights(options) -> None:
             mi.render(scene, integrator=integrator, spp=RAYS, seed=1)
             image, seconds = scenes.timed(lambda: mi.render(scene, integrator=integrator, spp=RAYS, seed=0))  # noqa: B023
             rays = integrator.statistics["shadow_rays"] / pixels
-            results[lights] = seconds, rays, compare(np.array(image, np.float64), exact)["relmse_trimmed"]
-        shown = [", ".join(f"{x:.3g}" for x in results[k]) if k in results else "-" for k in ("auto", "all")]
+            found[lights] = seconds, rays, compare(np.array(image, np.float64), exact)["relmse_trimmed"]
+        shown = [", ".join(f"{x:.3g}" for x in found[k]) if k in found else "-" for k in ("auto", "all")]
         ratio = "-"
-        if "all" in results:
-            ratio = f"{results['all'][0] * results['all'][2] / (results['auto'][0] * results['auto'][2]):.2f}"
+        rows[count] = {"load_seconds": load}
+        rows[count] |= {k: dict(zip(("seconds", "rays", "relmse"), one, strict=True)) for k, one in found.items()}
+        if "all" in found:
+            rows[count]["speedup"] = found["all"][0] * found["all"][2] / (found["auto"][0] * found["auto"][2])
+            ratio = f"{rows[count]['speedup']:.2f}"
         print(f"{count} | {load:.1f} | {shown[0]} | {shown[1]} | {ratio}", flush=True)
+    return rows
 
 
 _COLD = """
@@ -223,8 +242,9 @@ print(scenes.timed(lambda: mi.render(scene, integrator=integrator, spp=1, seed=1
 """
 
 
-def cold_starts(options) -> None:
+def cold_starts(options) -> dict:
     """Part "cold"."""
+    rows: dict = {}
     print("\n## first render in a fresh process with an empty kernel cache, and the second (1 sample a pixel)")
     print("scene | adaptivedirect: first s, second s | path: first s, second s")
     with tempfile.TemporaryDirectory() as folder:
@@ -245,8 +265,11 @@ def cold_starts(options) -> None:
                     done = subprocess.run(
                         [sys.executable, "-c", code], env=environment, check=True, capture_output=True, text=True
                     )
-                shown.append(", ".join(f"{float(line):.1f}" for line in done.stdout.split()[-2:]))
+                first, second = map(float, done.stdout.split()[-2:])
+                shown.append(f"{first:.1f}, {second:.1f}")
+                rows.setdefault(name, {})[kind] = {"seconds": first, "second_seconds": second}
             print(f"{name} | {shown[0]} | {shown[1]}", flush=True)
+    return rows
 
 
 def main() -> None:
@@ -258,16 +281,21 @@ def main() -> None:
     parser.add_argument("--error", type=float, default=0.03, help="the rule of parts table and paper (default: 0.03)")
     parser.add_argument("--width", type=int, default=128, help="pixels (default: 128)")
     parser.add_argument("--spp", type=int, default=256, help="samples a pixel of direct and path (default: 256)")
+    results.add_json_option(parser)
     options = parser.parse_args()
+    results.check_json_option(parser, options)
     names = scenes.available(options.scenes)
-    if "table" in options.parts:
-        table(names, options)
-    if "paper" in options.parts:
-        departures(names, options)
-    if "lights" in options.parts:
-        number_of_lights(options)
-    if "cold" in options.parts:
-        cold_starts(options)
+    parts = {
+        "table": lambda: table(names, options),
+        "paper": lambda: departures(names, options),
+        "lights": lambda: number_of_lights(options),
+        "cold": lambda: cold_starts(options),
+    }
+    settings = {"error": options.error, "width": options.width, "camera_rays": RAYS, "samples": options.spp}
+    for part in options.parts:
+        rows = parts[part]()
+        if options.json:
+            results.write_results(options.json, part, settings, rows)
 
 
 if __name__ == "__main__":

@@ -2,16 +2,16 @@
 
     ./run -- python benchmarks/baselines.py [--scenes NAME ...] [--parts curve samples slices growth memory]
 
-curve    the error of all against the sum of all lights as their parameter goes on, with 1 and 9 samples a pixel.
-samples  16 samples a pixel: ``lightcuts`` at 1% on every sample, and the others with the parameter that gives the same
-         mean absolute error of pixels, found by trying; where none does, with what comes nearest.
-slices   the same for ``lightslice`` with 1 sample a pixel, four times as wide: as many gather points.
-growth   ``mdlightcuts`` at one ``error`` with 1, 4, 16 and 64 samples a pixel.
+curve    errors against the sum of all lights for a range of quality parameters, with 1 and 9 samples per pixel.
+samples  16 samples per pixel: ``lightcuts`` at 1% on every sample, and the further methods with the parameter of equal
+         mean absolute pixel error, found by search (the closest one if none matches).
+slices   the same for ``lightslice`` with 1 sample per pixel at four times the width: an equal number of gather points.
+growth   ``mdlightcuts`` at a fixed ``error`` with 1, 4, 16 and 64 samples per pixel.
 memory   peak memory of ``lightslice`` at 1600×1200 with 600,000 VPLs and 800 columns, above that of the loaded scene.
 
-Errors are those of whole pixels, against the sum of all lights at all samples of a random subset of them. Same lights,
-same gather points, warm, 256 wide; times are medians of three interleaved runs of what a method does after lights,
-their trees and gather points are there, which all methods share ("shared"); those of part curve are second runs.
+Errors are pixel errors against the sum of all lights at all samples of a random subset of pixels. Methods share lights
+and gather points; warm, 256 wide. Times are medians of three interleaved runs (curve: second runs) and start after the
+shared work ("shared"): lights, light trees and gather points.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
-from benchmarks import scenes  # noqa: E402
+from benchmarks import results, scenes  # noqa: E402
 from vpl.core.arrays import download, upload  # noqa: E402
 from vpl.transport.evaluation import sum_all_lights  # noqa: E402
 
 DEPTH, VPLS, RUNS = 6, 200_000, 3
-# How often, and how closely, the parameter that gives a wanted error is tried for
+# Maximum number of search steps for an error, and relative tolerance
 _TRIES, _NEAR = 5, 0.03
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Property that decides how good a method is, with a first guess and its limits; the error goes as about its
+    """Quality parameter of a method with a first guess and limits; the error is roughly proportional to its
     ``power``-th power."""
 
     name: str
@@ -51,11 +51,11 @@ class Quality:
     power: float
 
     def show(self, value: float) -> str:
-        """A value as tables show it."""
+        """Format a value for tables."""
         return f"{self.name} {value:.2g}" if self.name == "error" else f"{self.name} {value}"
 
     def rounded(self, value: float):
-        """A value within the limits, of the property's type."""
+        """Clip a value to the limits and convert it to the property's type."""
         value = min(max(value, self.least), self.most)
         return value if self.name == "error" else round(value)
 
@@ -69,8 +69,8 @@ QUALITY = {
 
 @dataclass
 class Found:
-    """One run: seconds of ``shade``; of pixels, relative to the image's mean: RMSE and mean absolute error; shadow rays
-    and clusters or pairs per pixel; what the method counted."""
+    """Result of a run: seconds of ``shade``; pixel RMSE and mean absolute error relative to the image mean; shadow rays
+    and clusters or pairs per pixel; stages and counters of the method."""
 
     seconds: float
     rmse: float
@@ -82,9 +82,9 @@ class Found:
 
 
 class Problem:
-    """Lights and gather points of a scene, and the exact light of as many of its pixels as have ``points`` samples.
+    """Lights and gather points of a scene, and exact radiance of a subset of pixels with ``points`` samples in total.
 
-    ``scene``: already loaded, or None for that of the name.
+    ``scene``: a loaded scene; by default the scene is loaded by its name.
     """
 
     def __init__(self, name: str, samples: int, width: int, points: int, max_depth: int = DEPTH, scene=None):
@@ -106,7 +106,7 @@ class Problem:
         self.mean = float((self._exact + direct).mean())
 
     def plugin(self, kind: str, **more):
-        """A plugin with the settings that all methods share."""
+        """Plugin with the settings shared by all methods."""
         return mi.load_dict({"type": kind, **self.settings, **more})
 
     def _rows_of(self, job):
@@ -114,14 +114,14 @@ class Problem:
         return job, rows, job.batch.select(upload(mi.UInt32, rows))
 
     def _of_pixels(self, job, rows, radiance) -> np.ndarray:
-        """Sum what some points add to the pixels that are compared, (pixels, 3)."""
+        """Sum the contributions of points to the compared pixels, (pixels, 3)."""
         place = self._place[download(job.ray)[rows] // self.samples]
         total = np.zeros((self._place.max() + 1, 3))
         np.add.at(total, place, radiance.astype(np.float64) * download(job.weight)[rows] / self.samples)
         return total
 
     def shade(self, plugin) -> Found:
-        """Shade all points with a plugin and compare the chosen pixels."""
+        """Shade all points with a plugin and compare the selected pixels."""
         shaded, seconds = scenes.timed(lambda: [plugin.shade(job) for job in self.prepared.jobs])
         values, rays, cut, stages, counts = 0, 0.0, 0.0, {}, {}
         for (job, rows, _), part in zip(self._chosen, shaded, strict=True):
@@ -136,10 +136,10 @@ class Problem:
         return Found(seconds, rmse / self.mean, absolute / self.mean, rays, cut, stages, counts)
 
     def quality_for(self, method: str, wanted: float, measure: str = "absolute", **more):
-        """The value of a method's parameter that came nearest to a mean absolute error, or to so many ``rays``, and the
-        run with it.
+        """Search the parameter of a method for a mean absolute error or a number of ``rays``; return the closest value
+        and its run.
 
-        ``more``: other properties.
+        ``more``: further properties.
         """
         quality = QUALITY[method]
         power = quality.power if measure == "absolute" else -np.sign(quality.power)
@@ -157,7 +157,7 @@ class Problem:
         return min(tried, key=lambda one: one[:2])[1:]
 
     def interleaved(self, plugins: dict) -> dict:
-        """The median run of each plugin; they take turns, warm."""
+        """Median run of each plugin, interleaved and warm."""
         runs: dict = {name: [] for name in plugins}
         for _ in range(RUNS):
             for name, plugin in plugins.items():
@@ -169,8 +169,9 @@ def _median(runs: list[Found]) -> Found:
     return sorted(runs, key=lambda one: one.seconds)[len(runs) // 2]
 
 
-def curves(names, options) -> None:
+def curves(names, options) -> dict:
     """Part "curve"."""
+    rows = {}
     print(
         f"\n## error against the sum of all lights (width {options.width}, {VPLS} VPLs, max_depth {DEPTH}, no max_cut)"
     )
@@ -185,28 +186,39 @@ def curves(names, options) -> None:
                     plugin = problem.plugin(method, **{quality.name: value}, **more)
                     problem.shade(plugin)
                     found = problem.shade(plugin)
+                    rows[f"{name}, {samples} samples, {method}, {quality.show(value)}"] = _numbers(found)
                     shown.append(
                         f"{quality.show(value)}: {found.rmse:.4f}, {100 * found.absolute:.2f}%, {found.rays:.0f}, "
                         f"{found.seconds:.2f}"
                     )
                 print(f"{name} | {samples} | {method} | {' | '.join(shown)}", flush=True)
+    return rows
 
 
-def equal_errors(names, width: int, samples: int, points: int, methods) -> None:
+def _numbers(found: Found) -> dict:
+    """Quantities of a run, for a result file."""
+    names = ("seconds", "rmse", "absolute", "rays", "cut")
+    return {name: float(getattr(found, name)) for name in names}
+
+
+def equal_errors(names, width: int, samples: int, points: int, methods) -> dict:
     """A table of ``lightcuts`` at 1% and of other methods at its mean absolute error."""
     print(f"\n## {samples} samples a pixel, equal mean absolute error (width {width}, {VPLS} VPLs, warm)")
     print(
         "scene | shared s | method | render s | rays/px | lights, clusters or pairs/px | RMSE | mean absolute | speedup"
     )
     speedups: dict = {method: [] for method in methods}
+    rows: dict = {}
     for name in names:
         problem = Problem(name, samples, width, points)
         target = problem.shade(problem.plugin("lightcuts")).absolute
         chosen = {"lightcuts": 0.01} | {method: problem.quality_for(method, target)[0] for method in methods}
         plugins = {one: problem.plugin(one, **{QUALITY[one].name: value}) for one, value in chosen.items()}
         middle = problem.interleaved(plugins)
+        rows[name] = {"shared_seconds": problem.shared}
         for one, found in middle.items():
             speedup = middle["lightcuts"].seconds / found.seconds
+            rows[name][one] = _numbers(found) | {QUALITY[one].name: chosen[one], "speedup": speedup}
             print(
                 f"{name} | {problem.shared:.2f} | {one}, {QUALITY[one].show(chosen[one])} | {found.seconds:.2f} | "
                 f"{found.rays:.0f} | {found.cut:.0f} | {found.rmse:.4f} | {100 * found.absolute:.2f}% | {speedup:.1f}",
@@ -219,20 +231,22 @@ def equal_errors(names, width: int, samples: int, points: int, methods) -> None:
                 )
     for method, found in speedups.items():
         print(f"geometric mean of the speedups of {method}: {scenes.geometric_mean(found):.2f}")
+    return rows
 
 
-def many_samples(names, options) -> None:
+def many_samples(names, options) -> dict:
     """Part "samples"."""
-    equal_errors(names, options.width, options.samples, options.points, ("mdlightcuts", "lightslice"))
+    return equal_errors(names, options.width, options.samples, options.points, ("mdlightcuts", "lightslice"))
 
 
-def slices(names, options) -> None:
+def slices(names, options) -> dict:
     """Part "slices"."""
-    equal_errors(names, 4 * options.width, 1, options.points, ("lightslice",))
+    return equal_errors(names, 4 * options.width, 1, options.points, ("lightslice",))
 
 
-def growth(names, options) -> None:
+def growth(names, options) -> dict:
     """Part "growth"."""
+    rows: dict = {}
     print(f"\n## mdlightcuts at 1% with more samples a pixel (width {options.width}, {VPLS} VPLs, warm)")
     print("scene | 1 sample: s, rays/px | 4: times as long, rays/px | 16 | 64")
     for name in names:
@@ -243,24 +257,31 @@ def growth(names, options) -> None:
             problem.shade(plugin)
             found = _median([problem.shade(plugin) for _ in range(RUNS)])
             base = base or found.seconds
+            rows[f"{name}, {samples}"] = {
+                "seconds": found.seconds, "slowdown": found.seconds / base, "rays": found.rays,
+            }  # fmt: skip
             time = f"{found.seconds:.2f}" if samples == 1 else f"{found.seconds / base:.1f}"
             shown.append(f"{time}, {found.rays:.0f}")
         print(f"{name} | {' | '.join(shown)}", flush=True)
+    return rows
 
 
-def memory(names, options) -> None:
+def memory(names, options) -> dict:
     """Part "memory": every scene in a process of its own, which tells the most memory that it ever had."""
+    rows = {}
     print("\n## lightslice at 1600×1200, 600 000 VPLs, 800 columns")
     print("scene | peak above the loaded scene, GiB | peak, GiB | render s")
     for name in names:
         context = multiprocessing.get_context("spawn")
         with context.Pool(1) as pool:
             before, after, seconds = pool.apply(_render_large, (name,))
+        rows[name] = {"memory": (after - before) / 2**20, "seconds": seconds}
         print(f"{name} | {(after - before) / 2**20:.2f} | {after / 2**20:.2f} | {seconds:.1f}", flush=True)
+    return rows
 
 
 def _render_large(name: str):
-    """(Peak memory after loading, peak memory after rendering, both in KiB, seconds)."""
+    """(peak memory after loading, peak memory after rendering, both in KiB, seconds)"""
     scene = mi.load_file(str(scenes.scene_file(name)), resx=1600, resy=1200)
     plugin = mi.load_dict({"type": "lightslice", "max_depth": DEPTH, "vpl_count": 600_000, "columns": 800})
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -276,11 +297,16 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=256, help="pixels (default: 256)")
     parser.add_argument("--samples", type=int, default=16, help="samples a pixel of part samples (default: 16)")
     parser.add_argument("--points", type=int, default=8000, help="where all lights are summed (default: 8000)")
+    results.add_json_option(parser)
     options = parser.parse_args()
+    results.check_json_option(parser, options)
     names = scenes.available(options.scenes)
     parts = {"curve": curves, "samples": many_samples, "slices": slices, "growth": growth, "memory": memory}
+    settings = {"max_depth": DEPTH, "vpl_count": VPLS, "width": options.width, "points": options.points, "runs": RUNS}
     for part in options.parts:
-        parts[part](names, options)
+        rows = parts[part](names, options)
+        if options.json:
+            results.write_results(options.json, part, settings, rows)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,10 @@
-"""What passes on workers cost: against one process at equal passes, for each pass, and by how many workers are kept
-busy.
+"""Overhead of passes on workers: against a single process, per pass, and as idle time of the workers.
 
     python benchmarks/cluster.py --parts speed,overhead,busy
 
-`speed`: seconds of an image by one process with two threads, and by two workers with one thread each, compiled kernels.
-`overhead`: seconds of a pass that takes no time, with and without the transfer of its image.
-`busy`: share of the time that simulated workers, whose passes sleep, are at work.
+`speed`: seconds of an image by a process with two threads, and by two workers with one thread each; compiled kernels.
+`overhead`: seconds of an empty pass, with and without the transfer of an image.
+`busy`: fraction of the time during which simulated workers, whose passes sleep, are busy.
 """
 
 import argparse
@@ -31,17 +30,17 @@ from comparison.scene_files import SceneFile
 
 ROOT = Path(__file__).resolve().parent.parent
 PARTS = ("speed", "overhead", "busy")
-SECONDS, PASSES = 0.5, 20  # of a pass that sleeps; of each worker
+SECONDS, PASSES = 0.5, 20  # per sleeping pass; per worker
 
 
 def sleeping_pass(shape, seconds, spp, seed):
-    """A pass that takes some seconds and has an image of that shape, in the place of `worker.render_pass`."""
+    """Replacement of `worker.render_pass` that sleeps for some seconds and returns a black image of this shape."""
     time.sleep(seconds)
     return PassImage(np.zeros(shape, np.float32), ["R", "G", "B"], Pass(seed, spp, seconds))
 
 
 class Sleeping(passes.DistributedPasses):
-    """Passes that sleep, of an image of a shape (height, width, channels)."""
+    """Sleeping passes of an image of this shape (height, width, channels)."""
 
     def __init__(self, pool, shape, seconds, count):
         sampler = mi.load_dict({"type": "independent"})
@@ -50,13 +49,13 @@ class Sleeping(passes.DistributedPasses):
         self._function.__name__ = "sleep"
 
     def next_task(self, queued):
-        """As of `DistributedPasses`, with the other function."""
+        """Return the task of `DistributedPasses` with the sleeping function."""
         task = super().next_task(queued)
         return task and Task(self, task.name, self._function, task.arguments[2:])
 
 
 def run(pool, shape, seconds, count):
-    """Return the seconds that so many passes took on the workers of a pool, and those of this process's processor."""
+    """Return the wall-clock seconds of passes on the workers of a pool, and the CPU seconds of this process."""
     sleeping = Sleeping(pool, shape, seconds, count)
     sleeping.start()
     begin, used = time.perf_counter(), time.process_time()
@@ -67,7 +66,7 @@ def run(pool, shape, seconds, count):
 
 
 def speed(options):
-    """Print what two workers with a thread each take, against one process with two."""
+    """Print times of two workers with a thread each, and of a process with two threads."""
     for name in options.scenes:
         print(f"{Path(name).stem}, {options.integrator}, {options.passes} passes of {options.spp} samples per pixel")
 
@@ -82,7 +81,7 @@ def speed(options):
             for repetition in range(options.repetitions + 1):
                 here = manylights.render(scene, **samples)[1].seconds
                 there = DistributedRender(pool, LazyScene(prepared()), **samples).render()[1].seconds
-                if repetition:  # the first compiles
+                if repetition:  # the first one compiles
                     times["one process"].append(here)
                     times["two workers"].append(there)
         here, there = map(statistics.median, times.values())
@@ -90,18 +89,16 @@ def speed(options):
 
 
 def overhead(_):
-    """Print what a pass costs beyond what it takes to render."""
+    """Print the overhead of a pass beyond rendering."""
     with connected(1, 1) as pool:
         run(pool, (1, 1, 3), 0, 10)
         for shape in ((1, 1, 3), (512, 512, 3), (1080, 1920, 3)):
             taken, used = (1000 * seconds / 40 for seconds in run(pool, shape, 0, 40))
-            print(
-                f"  image {shape[1]} × {shape[0]}: {taken:.1f} ms a pass, {used:.1f} ms of them the client's processor"
-            )
+            print(f"  image {shape[1]} × {shape[0]}: {taken:.1f} ms per pass, of which {used:.1f} ms client CPU")
 
 
 def busy(_):
-    """Print how busy workers are that sleep."""
+    """Print the busy fraction of sleeping workers."""
     for count in (2, 8, 16):
         with connected(count, count) as pool:
             run(pool, (1, 1, 3), 0, count * TASKS_PER_WORKER)
@@ -115,10 +112,10 @@ def main():
     parser.add_argument("--parts", default=",".join(PARTS), help="default: all")
     parser.add_argument("--scenes", nargs="+", default=[str(ROOT / "scenes" / "hall.xml")])
     parser.add_argument("--integrator", default="manylights")
-    parser.add_argument("--width", type=int, help="width and height (default: the scene's)")
+    parser.add_argument("--width", type=int, help="width and height (default: of the scene)")
     parser.add_argument("--spp", type=int, default=16, help="samples per pixel of a pass (default: 16)")
     parser.add_argument("--passes", type=int, default=8, help="default: 8")
-    parser.add_argument("--repetitions", type=int, default=3, help="default: 3, and one that compiles")
+    parser.add_argument("--repetitions", type=int, default=3, help="default: 3, after a warm-up run")
     options = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     for part in options.parts.split(","):

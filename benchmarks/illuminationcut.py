@@ -1,17 +1,17 @@
-"""IlluminationCut against ``lightcuts``, and against shadow rays alone: the tables of [IC] section 4 for our scenes.
+"""IlluminationCut against ``lightcuts`` and against shadow rays alone: the tables of [IC] section 4 for our scenes.
 
     ./run -- python benchmarks/illuminationcut.py [--scenes NAME ...] [--parts table tight samples lights rays public]
 
-table    [IC] table 1: ``lightcuts`` at 1%, and both forms of ``illuminationcut`` with the ``error`` that gives the same
-         RMSE, found by trying; same VPLs, same clamping, warm, 512 wide, 1 sample a pixel.
-tight    [IC] table 3: the same at the RMSE of ``lightcuts`` at 0.1%, without a limit to cuts.
-samples  [IC] table 6: the same with 9 samples a pixel.
+table    [IC] table 1: ``lightcuts`` at 1%, and both forms of ``illuminationcut`` with the ``error`` of equal RMSE,
+         found by search; same VPLs, same clamping, warm, 512 wide, 1 sample per pixel.
+tight    [IC] table 3: the same at the RMSE of ``lightcuts`` at 0.1%, with unlimited cuts.
+samples  [IC] table 6: the same with 9 samples per pixel.
 lights   [IC] figure 5 and table 5: render time from 50 k to 1.2 M VPLs, and peak memory at 1600×1200.
-rays     shadow rays per second of all of ``shade``, against the same rays traced alone in one batch.
-public   the settings of the public C++ code in the Cornell box, in CPU seconds of all threads.
+rays     shadow rays per second of ``shade``, against the same rays traced alone in a batch.
+public   settings of the public C++ code in the Cornell box, in CPU seconds of all threads.
 
-Errors are against the sum of all lights at a random subset of points.  Times are medians of three interleaved runs;
-"render" is what a method does after lights, their trees and gather points are there, which all methods share.
+Errors are relative to the sum of all lights at a random subset of points. Times are medians of three interleaved runs.
+"render" starts after the shared work: lights, light trees and gather points.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
-from benchmarks import scenes  # noqa: E402
+from benchmarks import results, scenes  # noqa: E402
 from vpl.core.arrays import download, upload  # noqa: E402
 from vpl.core.stages import Stage  # noqa: E402
 from vpl.cuts.product_cuts import BoundCounter, Pairs, find_pairs  # noqa: E402
@@ -42,13 +42,13 @@ from vpl.transport.evaluation import sum_all_lights  # noqa: E402
 
 NAMES = (*scenes.NAMES, "glossy")
 DEPTH, VPLS, WIDTH, SUBSET, RUNS = 6, 200_000, 512, 4000, 3
-# How often, and how closely, the error that gives a wanted RMSE is tried for
+# Maximum number of search steps for an RMSE, and relative tolerance
 _TRIES, _NEAR = 4, 0.03
 
 
 @dataclass
 class Found:
-    """One render: seconds of ``shade``, and per pixel: normalised RMSE, relative L1, rays, bounds."""
+    """Result of a render: seconds of ``shade``; per pixel: normalised RMSE, relative L1, rays, bounds."""
 
     seconds: float
     rmse: float
@@ -59,7 +59,7 @@ class Found:
 
 
 class Problem:
-    """Lights, gather points and, at a random subset of points, the exact light of a scene."""
+    """Lights and gather points of a scene, and exact radiance at a random subset of points."""
 
     def __init__(self, name: str, samples: int = 1, **settings):
         self.settings = {"max_depth": DEPTH, "vpl_count": VPLS} | settings
@@ -78,7 +78,7 @@ class Problem:
             self.mean += float((exact + direct).mean()) * job.batch.count / self.points
 
     def plugin(self, kind: str, **more):
-        """A plugin with the settings that all methods share."""
+        """Plugin with the settings shared by all methods."""
         return mi.load_dict({"type": kind, **self.settings, **more})
 
     def shade(self, plugin) -> Found:
@@ -99,21 +99,22 @@ class Problem:
         return Found(seconds, rmse, absolute / self.mean, rays / self.points, bounds / self.points, stages)
 
     def error_for(self, rmse: float, error: float, **more) -> float:
-        """The ``error`` at which ``illuminationcut`` has a given RMSE, to some percent; ``error``: a first guess."""
+        """Search the ``error`` of ``illuminationcut`` for an RMSE, to a few percent; ``error``: first guess."""
         for _ in range(_TRIES):
             reached = self.shade(self.plugin("illuminationcut", error=error, **more)).rmse
             if abs(reached / rmse - 1) < _NEAR:
                 break
-            # The RMSE grows as about the 0.6th power of the error
+            # The RMSE is roughly proportional to the 0.6th power of the error
             error *= float(np.clip((rmse / reached) ** (1 / 0.6), 0.2, 5))
         return error
 
 
-def equal_quality(title: str, names, samples: int, lightcuts_error: float, **settings) -> None:
+def equal_quality(title: str, names, samples: int, lightcuts_error: float, **settings) -> dict:
     """Print the table of ``lightcuts`` and both forms of ``illuminationcut`` at its RMSE."""
-    print(f"\n## {title} (width {WIDTH}, {samples} sample(s) a pixel, {VPLS} VPLs, max_depth {DEPTH}, warm)")
+    print(f"\n## {title} (width {WIDTH}, {samples} sample(s) per pixel, {VPLS} VPLs, max_depth {DEPTH}, warm)")
     print("scene | method | error | preprocessing s | render s | rays/px | RMSE | relative L1 | bounds/px | speedup")
     speedups: dict = {"all": [], "adaptive": []}
+    rows: dict = {}
     for name in names:
         problem = Problem(name, samples, **settings)
         methods = {"lightcuts": problem.plugin("lightcuts", error=lightcuts_error)}
@@ -127,8 +128,13 @@ def equal_quality(title: str, names, samples: int, lightcuts_error: float, **set
             for label, plugin in methods.items():
                 runs[label].append(problem.shade(plugin))
         middle = {label: sorted(found, key=lambda one: one.seconds)[RUNS // 2] for label, found in runs.items()}
+        rows[name] = {}
         for label, found in middle.items():
             speedup = middle["lightcuts"].seconds / found.seconds
+            rows[name][label] = {
+                "error": errors[label], "seconds": found.seconds, "rays": found.rays, "bounds": found.bounds,
+                "rmse": found.rmse, "relative_l1": found.relative, "speedup": speedup,
+            }  # fmt: skip
             if label in speedups:
                 speedups[label].append(speedup)
             print(
@@ -139,10 +145,12 @@ def equal_quality(title: str, names, samples: int, lightcuts_error: float, **set
             )
     for visibility, values in speedups.items():
         print(f"geometric mean of the speedups, visibility={visibility}: {scenes.geometric_mean(values):.2f}")
+    return rows
 
 
-def ray_rates(names) -> None:
+def ray_rates(names) -> dict:
     """Part "rays"."""
+    rows = {}
     print("\n## shadow rays per second: all of shade, error 1.5%, against the rays of its pairs alone")
     print("scene | rays, M | whole, M/s | alone, M/s | share")
     for name in names:
@@ -154,11 +162,13 @@ def ray_rates(names) -> None:
             count = float(download(shaded.shadow_rays).sum(dtype=np.float64))
             rays, whole, alone = rays + count, whole + spent, alone + count * _seconds_alone(plugin, job)
         rate, bare = rays / whole / 1e6, rays / alone / 1e6
+        rows[name] = {"illuminationcut": {"rays_per_second": rate}, "rays alone": {"rays_per_second": bare}}
         print(f"{name} | {rays / 1e6:.1f} | {rate:.1f} | {bare:.1f} | {100 * rate / bare:.0f}%", flush=True)
+    return rows
 
 
 def _seconds_alone(plugin, job, most: int = 1 << 22) -> float:
-    """Seconds per shadow ray, for some million of a job's pairs expanded and traced alone, light by light."""
+    """Seconds per shadow ray of some million expanded pairs of a job, traced alone, grouped by light kind."""
     clusters = PointClusters(job.batch)
     bound = dr.opaque(mi.Float, plugin.error * job.mean)
     seconds = count = 0.0
@@ -170,7 +180,7 @@ def _seconds_alone(plugin, job, most: int = 1 << 22) -> float:
             continue
         pairs = Pairs.join(found)
         points = download(pairs.points)
-        # A random part of the pairs, in the order in which their points lie along the tree
+        # A random subset of the pairs, with points in the order of the point tree
         chosen = np.random.default_rng(0).permutation(len(points))
         chosen = chosen[: np.searchsorted(np.cumsum(clusters.tree.count[points[chosen]], dtype=np.int64), most)]
         chosen = chosen[np.argsort(clusters.tree.first[points[chosen]], kind="stable")]
@@ -190,8 +200,9 @@ def _seconds_alone(plugin, job, most: int = 1 << 22) -> float:
     return seconds / max(count, 1)
 
 
-def many_lights(names) -> None:
+def many_lights(names) -> dict:
     """Part "lights"."""
+    rows = {}
     print("\n## render time and number of VPLs (width 512, illuminationcut at its default error)")
     print("scene | VPLs | trees s | render s, all | render s, adaptive")
     for name in names:
@@ -208,16 +219,22 @@ def many_lights(names) -> None:
                 ]
                 seconds.append(float(np.median(runs[1:])))
             tree = prepared.clock.seconds[Stage.TREE]
+            rows[f"{name}, {count}"] = {"tree_seconds": tree} | {
+                visibility: {"seconds": one} for visibility, one in zip(("all", "adaptive"), seconds, strict=True)
+            }
             print(f"{name} | {count} | {tree:.2f} | {seconds[0]:.2f} | {seconds[1]:.2f}", flush=True)
-    print("\n## peak memory above the scene, 1600×1200, 1.2 M VPLs, 1 sample a pixel")
+    print("\n## peak memory above the scene, 1600×1200, 1.2 M VPLs, 1 sample per pixel")
     for name in names:
         command = [sys.executable, __file__, "--memory-of", name]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         print(f"{name}: {done.stdout.strip()}", flush=True)
+        words = done.stdout.split()
+        rows[f"{name}, 1600×1200"] = {words[k]: {"memory": float(words[k + 1])} for k in range(0, len(words), 3)}
+    return rows
 
 
 def memory_of(name: str) -> None:
-    """Print the growth of this process's peak memory while it renders a large image with many lights."""
+    """Print the growth of this process's peak memory during the render of a large image with many lights."""
     scene = mi.load_file(str(scenes.scene_file(name)), resx=1600, resy=1200)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for visibility in ("all", "adaptive"):
@@ -229,19 +246,20 @@ def memory_of(name: str) -> None:
     print()
 
 
-def public_settings() -> None:
+def public_settings() -> dict:
     """Part "public"."""
     print("\n## settings of the public C++ code: Cornell box, 512×512, max_depth 9, 2048 direct and 47 k indirect")
     print("VPLs, distances clamped at 5% of the diagonal; CPU seconds of all threads")
     print("method | light tree | render | rays/px | bounds/px | relative L1 | public code: tree + render, L1")
     rows = {
-        "lightcuts": ("lightcuts", {}, "4 + 57 s, 0.64%"),
-        "illuminationcut": ("illuminationcut", {"visibility": "all"}, "7 + 20 s, 0.57%"),
-        "illuminationcut, adaptive": ("illuminationcut", {"visibility": "adaptive"}, "7 + 13.5 s, 0.57%"),
+        "lightcuts": ("lightcuts", {}, (61, 0.0064)),
+        "illuminationcut": ("illuminationcut", {"visibility": "all"}, (27, 0.0057)),
+        "illuminationcut, adaptive": ("illuminationcut", {"visibility": "adaptive"}, (20.5, 0.0057)),
     }
-    # Of the distance between so many lights, which is 0.0194, clamping takes the multiple that is 5% of the diagonal
+    # 5% of the diagonal is 8.94 times the mean distance between the lights, 0.0194, which is the unit of clamping
     settings = {"max_depth": 9, "direct": "vpl", "direct_count": 2048, "vpl_count": 47_000, "clamping": 8.94}
     problem = Problem("cornell", 1, **settings)
+    measured = {}
     for label, (kind, more, published) in rows.items():
         for error in (0.01, 0.005, 0.0025):
             plugin = problem.plugin(kind, error=error, **more)
@@ -250,11 +268,17 @@ def public_settings() -> None:
             found = problem.shade(plugin)
             render = time.process_time() - start
             tree = problem.prepared.clock.seconds[Stage.TREE]
+            measured[f"{label}, {100 * error:.2g}%"] = {
+                "public code": dict(zip(("cpu_seconds", "relative_l1"), published, strict=True)),
+                "cpu_seconds": tree + render, "rays": found.rays, "bounds": found.bounds,
+                "relative_l1": found.relative,
+            }  # fmt: skip
             print(
                 f"{label}, {100 * error:.2g}% | {tree:.2f} s | {render:.2f} s | {found.rays:.0f} | "
-                f"{found.bounds:.0f} | {100 * found.relative:.2f}% | {published}",
+                f"{found.bounds:.0f} | {100 * found.relative:.2f}% | {published[0]} s, {100 * published[1]:.2f}%",
                 flush=True,
             )
+    return measured
 
 
 def main() -> None:
@@ -264,24 +288,27 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(NAMES), choices=NAMES)
     parser.add_argument("--parts", nargs="+", default=list(parts), choices=parts)
     parser.add_argument("--memory-of", choices=NAMES, help=argparse.SUPPRESS)
+    results.add_json_option(parser)
     options = parser.parse_args()
+    results.check_json_option(parser, options)
     if options.memory_of:
         memory_of(options.memory_of)
         return
     names = scenes.available(options.scenes)
     some = [name for name in ("cornell", "sponza_crytek", "dining_room") if name in names]
-    if "table" in options.parts:
-        equal_quality("the RMSE of lightcuts at 1%", names, 1, 0.01)
-    if "tight" in options.parts:
-        equal_quality("the RMSE of lightcuts at 0.1%, cuts unlimited", some, 1, 0.001, max_cut=0)
-    if "samples" in options.parts:
-        equal_quality("the RMSE of lightcuts at 1%", some, 9, 0.01)
-    if "lights" in options.parts:
-        many_lights(some)
-    if "rays" in options.parts:
-        ray_rates(names)
-    if "public" in options.parts:
-        public_settings()
+    runs = {
+        "table": lambda: equal_quality("the RMSE of lightcuts at 1%", names, 1, 0.01),
+        "tight": lambda: equal_quality("the RMSE of lightcuts at 0.1%, cuts unlimited", some, 1, 0.001, max_cut=0),
+        "samples": lambda: equal_quality("the RMSE of lightcuts at 1%", some, 9, 0.01),
+        "lights": lambda: many_lights(some),
+        "rays": lambda: ray_rates(names),
+        "public": public_settings,
+    }
+    settings = {"max_depth": DEPTH, "vpl_count": VPLS, "width": WIDTH, "runs": RUNS}
+    for part in options.parts:
+        rows = runs[part]()
+        if options.json:
+            results.write_results(options.json, part, settings, rows)
 
 
 if __name__ == "__main__":

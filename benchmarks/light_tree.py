@@ -1,7 +1,7 @@
-"""How long a light tree takes to build, by stage, and how good it is.
+"""Build time of a light tree by stage, and its quality.
 
     python benchmarks/light_tree.py            # build times, 10,000 to 1.2 million lights
-    python benchmarks/light_tree.py --cuts     # sizes of cuts, for the choices that vpl/lights/light_tree.py makes
+    python benchmarks/light_tree.py --cuts     # cut sizes for the parameters of vpl/lights/light_tree.py
 
 The lights lie on the surfaces of a room with boxes and spheres. The cost of a tree is the sum of the paper's cluster
 sizes over its inner nodes; "halved" is a balanced tree over the lights in Morton order.
@@ -16,6 +16,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from benchmarks import results
 from vpl.lights import light_tree
 from vpl.lights.light_tree import BOX_MAX, BOX_MIN, CONE_AXIS, CONE_COS, INTENSITY, build_light_tree
 
@@ -24,9 +25,9 @@ STAGES = ("_validate", "_sort_lights", "_start_clusters", "_cluster", "_assemble
 
 
 def room(count, rng, roughness=0.0):
-    """Oriented lights, uniform by area, on the walls of a room, 60 boxes and 20 spheres in it.
+    """Oriented lights, uniform by area, on the walls of a room and on 60 boxes and 20 spheres inside.
 
-    roughness: standard deviation of the noise added to the normals, as by a bump map.
+    roughness: standard deviation of a random perturbation of the normals, similar to a bump map.
     """
     boxes = [(np.zeros(3), SIZE, -1)]
     for _ in range(60):
@@ -53,7 +54,7 @@ def room(count, rng, roughness=0.0):
 
 
 def ellipsoids(count, rng):
-    """Oriented lights on 80 tilted ellipsoids in the same volume."""
+    """Oriented lights on 80 rotated ellipsoids in the same volume."""
     position, direction = np.empty((count, 3)), np.empty((count, 3))
     owner = rng.integers(0, 80, count)
     for number in range(80):
@@ -67,7 +68,7 @@ def ellipsoids(count, rng):
 
 
 def bounce_flux(count, rng):
-    """Flux that halves with each of up to three bounces."""
+    """Random flux, halved at each of up to three bounces."""
     return rng.uniform(0.2, 1, (count, 3)) * 0.5 ** rng.integers(0, 4, (count, 1))
 
 
@@ -80,7 +81,7 @@ def as_float32(*arrays):
 
 
 def halved(position, direction, flux):
-    """A balanced tree: neighbours in Morton order merge two by two, level by level."""
+    """Balanced tree: neighbours in Morton order merge in pairs, level by level."""
     count = len(flux)
     node, made, rounds = np.arange(count), count, []
     while len(node) > 1:
@@ -93,7 +94,7 @@ def halved(position, direction, flux):
 
 
 def total_cost(tree):
-    """Sum of the cluster sizes [LC, section 5] of the inner nodes, relative to intensity and size of the scene."""
+    """Sum of the cluster sizes [LC, section 5] of the inner nodes, relative to the scene's intensity and size."""
     record = tree.records.astype(np.float64)
     squared = ((record[:, BOX_MAX] - record[:, BOX_MIN]) ** 2).sum(axis=1)
     size = record[:, INTENSITY] * (squared / squared[0] + (1 - record[:, CONE_COS]) ** 2)
@@ -101,7 +102,7 @@ def total_cost(tree):
 
 
 def timed_stages():
-    """Wrap the stages of the build so that they add their seconds to the returned dictionary."""
+    """Wrap the build stages so that they record their seconds in the returned dictionary."""
     seconds = {}
 
     def timed(name, function):
@@ -121,23 +122,25 @@ def timed_stages():
 def benchmark_builds(counts):
     print(f"{'lights':>9} {'seconds':>8}  " + " ".join(f"{name[1:]:>14}" for name in STAGES), end="")
     print(f"  {'depth':>5} {'cost':>7} {'halved':>7} {'ratio':>6}")
-    seconds = timed_stages()
+    seconds, rows = timed_stages(), {}
     for count in counts:
         lights = room(count, np.random.default_rng(1))
-        build_light_tree(*lights, np.random.default_rng(0))  # touches the memory once
+        build_light_tree(*lights, np.random.default_rng(0))  # warm-up: touches the memory
         begin = time.perf_counter()
         tree = build_light_tree(*lights, np.random.default_rng(0))
         total = time.perf_counter() - begin
         stages = " ".join(f"{seconds[name]:14.3f}" for name in STAGES)
         cost, baseline = total_cost(tree), total_cost(halved(*lights))
+        rows[count] = {"seconds": total, "depth": tree.depth, "cost": cost, "halved": {"cost": baseline}}
         print(f"{count:9d} {total:8.3f}  {stages}  {tree.depth:5d} {cost:7.2f} {baseline:7.2f} {cost / baseline:6.2f}")
+    return rows
 
 
 # --- Cuts ---
 
 
 def largest_cosine(axis, centre, extent):
-    """Bound on the cosine between unit axes and the vectors from the origin to points of boxes, all (m, 3)."""
+    """Upper bound of the cosine between unit axes and vectors from the origin to points of boxes, all (m, 3)."""
     helper = np.where(np.abs(axis[:, :1]) < 0.6, [[1.0, 0, 0]], [[0, 1.0, 0]])
     first = normalised(np.cross(axis, helper))
     square_near = square_far = 0
@@ -151,7 +154,7 @@ def largest_cosine(axis, centre, extent):
 
 
 def node_bounds(record, point, normal, shortest):
-    """Upper bounds on what nodes send to diffuse receivers: intensity, both cosines, inverse squared distance."""
+    """Upper bounds of the contributions of nodes to diffuse receivers: intensity × cosines / squared distance."""
     low, high = record[:, BOX_MIN], record[:, BOX_MAX]
     centre, extent = (low + high) / 2 - point, (high - low) / 2
     squared = (np.maximum(np.maximum(low - point, point - high), 0) ** 2).sum(axis=1)
@@ -164,7 +167,7 @@ def node_bounds(record, point, normal, shortest):
 
 
 def cut_size(tree, lights, receivers, error=0.02):
-    """Mean over receivers: nodes in the cut whose bounds are below ``error`` of the sum of all, and bounds computed."""
+    """Mean over receivers: nodes in a cut with bounds below ``error`` times the total, and computed bounds."""
     position, direction, flux = (array.astype(np.float64) for array in lights)
     record = tree.records.astype(np.float64)
     shortest = 0.01 * np.linalg.norm(record[0, BOX_MAX] - record[0, BOX_MIN])
@@ -190,7 +193,7 @@ def cut_size(tree, lights, receivers, error=0.02):
 
 
 def benchmark_cuts(count):
-    print(f"{count} lights, cut of 2%, mean of 200 receivers: nodes in the cut, bounds computed, cost of the tree")
+    print(f"{count} lights, cut of 2%, mean of 200 receivers: nodes in the cut, computed bounds, cost of the tree")
     for name, make in (
         ("flat walls", room),
         ("bumpy walls", lambda count, rng: room(count, rng, roughness=0.25)),
@@ -211,14 +214,19 @@ def benchmark_cuts(count):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cuts", action="store_true", help="compare the sizes of cuts instead of timing builds")
+    parser.add_argument("--cuts", action="store_true", help="compare cut sizes instead of build times")
     parser.add_argument("counts", nargs="*", type=int, help="numbers of lights")
+    results.add_json_option(parser)
     arguments = parser.parse_args()
+    if arguments.cuts and arguments.json:
+        parser.error("--json writes build times, not --cuts")
     if arguments.cuts:
         for count in arguments.counts or [60_000]:
             benchmark_cuts(count)
     else:
-        benchmark_builds(arguments.counts or [10_000, 50_000, 200_000, 650_000, 1_200_000])
+        rows = benchmark_builds(arguments.counts or [10_000, 50_000, 200_000, 650_000, 1_200_000])
+        if arguments.json:
+            results.write_results(arguments.json, "builds", {}, rows)
 
 
 if __name__ == "__main__":

@@ -2,16 +2,17 @@
 
     ./run -- python benchmarks/lightcuts.py [--scenes NAME ...] [--parts brute rays cold path]
 
-brute  same VPLs, one run: time and error of ``lightcuts`` at 1% against plugin ``vpl``, whose sum is made for a fixed
-       random subset of points and its time scaled to all of them.
-rays   shadow rays per second of the whole cut evaluation, against the same rays traced alone in one batch.
-cold   first render in a fresh process with an empty kernel cache, against ``path``.
-path   ``lightcuts`` and ``mdlightcuts`` against ``path`` in equal time, by compare.py, with its report in output/path.
+brute  same VPLs, one run: time and error of ``lightcuts`` at 1% against plugin ``vpl``, evaluated at a fixed random
+       subset of points and extrapolated to the time of all points.
+rays   shadow rays per second of the whole cut evaluation, against the same rays traced alone in a batch.
+cold   first render in a new process with an empty kernel cache, against ``path``.
+path   ``lightcuts`` and ``mdlightcuts`` against ``path`` at equal time by compare.py, with a report in output/path.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -27,7 +28,7 @@ mi.set_variant("llvm_ad_rgb")
 
 import compare  # noqa: E402
 import integrators  # noqa: E402, F401
-from benchmarks import scenes  # noqa: E402
+from benchmarks import results, scenes  # noqa: E402
 from vpl.core.arrays import download, upload  # noqa: E402
 from vpl.core.stages import Stage  # noqa: E402
 from vpl.cuts.light_cuts import collect_cuts, limited_cuts  # noqa: E402
@@ -35,20 +36,20 @@ from vpl.transport.contribution import contribution, shadow_ray  # noqa: E402
 from vpl.transport.evaluation import sum_all_lights  # noqa: E402
 
 DEPTH, VPLS, SUBSET = 6, 200_000, 4000
-# What summing over all lights takes too
+# Stages that the sum of all lights also needs
 COMMON_STAGES = (Stage.SCENE, Stage.GATHER, Stage.TRACE, Stage.DIRECT, Stage.PROBE)
 
 
 def lightcuts(**more):
-    """The plugin with the settings that all parts share."""
+    """Plugin with the settings shared by all parts."""
     return mi.load_dict({"type": "lightcuts", "max_depth": DEPTH, "vpl_count": VPLS, "error": 0.01, **more})
 
 
-def brute_force(names) -> None:
+def brute_force(names) -> dict:
     """Part "brute"."""
     print(f"\n## lightcuts, error 1%, against all VPLs (width 256, {VPLS} VPLs, max_depth {DEPTH}, warm)")
     print("scene | VPLs | lightcuts s | of it tree | rays/px | bounds/px | cut | rel. L1 | all VPLs s | ratio")
-    ratios = []
+    ratios, rows = [], {}
     for name in names:
         scene, plugin = scenes.load(name), lightcuts()
         for _ in range(2):
@@ -61,6 +62,14 @@ def brute_force(names) -> None:
         common = sum(found["seconds"].get(stage, 0) for stage in COMMON_STAGES)
         points = found["gather_points"]
         ratios.append((common + brute) / ours)
+        counts = {"rays": "shadow_rays", "bounds": "bound_computations", "cut": "cut_size"}
+        rows[name] = {
+            "lightcuts": {"seconds": ours, "tree_seconds": found["seconds"]["tree"], "relative_l1": error}
+            | {short: found[long] / points for short, long in counts.items()},
+            "vpl": {"seconds": common + brute},
+            "lights": sum(found["lights"].values()),
+            "speedup": ratios[-1],
+        }
         print(
             f"{name} | {sum(found['lights'].values())} | {ours:.2f} | {found['seconds']['tree']:.2f} | "
             f"{found['shadow_rays'] / points:.0f} | {found['bound_computations'] / points:.0f} | "
@@ -68,10 +77,11 @@ def brute_force(names) -> None:
             flush=True,
         )
     print(f"geometric mean of the ratios: {scenes.geometric_mean(ratios):.0f}")
+    return rows
 
 
 def _error_and_brute_seconds(scene, plugin):
-    """Relative L1 of a cut render on a fixed random subset, and seconds of the sum of all lights for all points."""
+    """Relative L1 of ``lightcuts`` on a fixed random subset, and extrapolated seconds of the sum of all lights."""
     prepared = plugin.prepare(scene, *scenes.camera_rays(scene, 0))
     points = prepared.paths.points.count
     difference = total = seconds = 0.0
@@ -81,7 +91,7 @@ def _error_and_brute_seconds(scene, plugin):
         rows = np.sort(np.random.default_rng(number).choice(job.batch.count, min(share, job.batch.count), False))
         part = job.batch.select(upload(mi.UInt32, rows))
         few = job.batch.select(upload(mi.UInt32, rows[:16]))
-        sum_all_lights(job.transport, few)  # compiles the kernel
+        sum_all_lights(job.transport, few)  # warm-up: compiles the kernel
         (exact, _), spent = scenes.timed(lambda: sum_all_lights(job.transport, part))  # noqa: B023
         exact, direct = download(exact), download(job.direct)[rows]
         scale = job.batch.count / len(rows)
@@ -91,8 +101,9 @@ def _error_and_brute_seconds(scene, plugin):
     return difference / total, seconds
 
 
-def ray_rates(names) -> None:
+def ray_rates(names) -> dict:
     """Part "rays"."""
+    rows = {}
     print("\n## shadow rays per second: the whole cut evaluation (estimate, cut, shading, rays) against the rays alone")
     print("scene | rays, M | whole, M/s | alone, M/s | share")
     for name in names:
@@ -106,11 +117,13 @@ def ray_rates(names) -> None:
             whole += spent
             alone += _seconds_alone(plugin, job) * float(download(shaded.shadow_rays).sum(dtype=np.int64))
         rate, bare = rays / whole / 1e6, rays / alone / 1e6
+        rows[name] = {"lightcuts": {"rays_per_second": rate}, "rays alone": {"rays_per_second": bare}}
         print(f"{name} | {rays / 1e6:.1f} | {rate:.1f} | {bare:.1f} | {100 * rate / bare:.0f}%", flush=True)
+    return rows
 
 
 def _seconds_alone(plugin, job) -> float:
-    """Seconds per shadow ray of a job's cuts, traced alone in one batch."""
+    """Seconds per shadow ray of a job's cuts, traced alone in a batch."""
     threshold = dr.full(mi.Float, plugin.error * job.mean, job.batch.count)
     threshold, sizes, _ = limited_cuts(job.lights, job.batch, threshold, plugin.max_cut)
     seconds = count = 0.0
@@ -144,8 +157,9 @@ print(scenes.timed(lambda: mi.render(scene, integrator=integrator, spp=1, seed=0
 """
 
 
-def cold_starts(names) -> None:
+def cold_starts(names) -> dict:
     """Part "cold"."""
+    rows = {}
     print("\n## first render in a fresh process with an empty kernel cache (1 sample a pixel; loading not counted)")
     print("scene | lightcuts s | path s | ratio")
     for name in names:
@@ -163,21 +177,40 @@ def cold_starts(names) -> None:
                     )
                     runs.append(float(done.stdout.split()[-1]))
             seconds[plugin] = float(np.median(runs))
+        rows[name] = {plugin: {"seconds": spent} for plugin, spent in seconds.items()}
         ratio = seconds["lightcuts"] / seconds["path"]
         print(f"{name} | {seconds['lightcuts']:.1f} | {seconds['path']:.1f} | {ratio:.2f}", flush=True)
+    return rows
 
 
-def against_path(names, budget: float) -> None:
+def against_path(names, budget: float) -> dict:
     """Part "path": what compare.py prints for the scenes that have a reference."""
     files = [str(scenes.scene_file(name)) for name in names if scenes.reference_file(name)]
-    if files:
-        compare.main(
-            [
-                *files, "--integrators", "path,lightcuts,mdlightcuts", "--param", "mdlightcuts.error=0.02",
-                "--max-depth", str(DEPTH), "--time", f"{budget:g}", "--reference", str(scenes.REFERENCES),
-                "--out", "output/path",
-            ]
-        )  # fmt: skip
+    if not files:
+        return {}
+    compare.main(
+        [
+            *files, "--integrators", "path,lightcuts,mdlightcuts", "--param", "mdlightcuts.error=0.02",
+            "--max-depth", str(DEPTH), "--time", f"{budget:g}", "--reference", str(scenes.REFERENCES),
+            "--out", "output/path",
+        ]
+    )  # fmt: skip
+    return _compared_rows(json.loads(Path("output/path/results.json").read_text()))
+
+
+def _compared_rows(found: dict) -> dict:
+    """Rows of the results of compare.py: error, bias and samples of each integrator, and times at equal error."""
+    rows = {}
+    for scene in found["scenes"]:
+        outcomes = found["summary"]["scenes"][scene["name"]]
+        samples = {one["label"]: one["spp"] for one in scene["renders"]}
+        rows[scene["name"]] = row = {}
+        for label, one in outcomes.items():
+            row[label] = {"relmse": one["measured"], "bias": one["bias"], "hidden": one["hidden"]}
+            row[label] |= {"samples": samples[label], "seconds": one["seconds"]}
+        if time := outcomes["mdlightcuts"]["time"]:
+            row["speedup"] = 1 / time["value"]
+    return rows
 
 
 def main() -> None:
@@ -186,16 +219,21 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(scenes.NAMES), choices=scenes.NAMES)
     parser.add_argument("--parts", nargs="+", default=["brute", "rays", "cold", "path"])
     parser.add_argument("--time", type=float, default=10.0, help="seconds of part path (default: 10)")
+    results.add_json_option(parser)
     options = parser.parse_args()
+    results.check_json_option(parser, options)
     names = scenes.available(options.scenes)
-    if "brute" in options.parts:
-        brute_force(names)
-    if "rays" in options.parts:
-        ray_rates(names)
-    if "cold" in options.parts:
-        cold_starts([name for name in ("kitchen", "everything8003") if name in names])
-    if "path" in options.parts:
-        against_path(names, options.time)
+    parts = {
+        "brute": lambda: brute_force(names),
+        "rays": lambda: ray_rates(names),
+        "cold": lambda: cold_starts([name for name in ("kitchen", "everything8003") if name in names]),
+        "path": lambda: against_path(names, options.time),
+    }
+    settings = {"max_depth": DEPTH, "vpl_count": VPLS, "width": 256}
+    for part in options.parts:
+        rows = parts[part]()
+        if options.json:
+            results.write_results(options.json, part, settings, rows)
 
 
 if __name__ == "__main__":

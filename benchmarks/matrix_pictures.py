@@ -1,4 +1,4 @@
-"""The matrices of one slice as pictures [MSR figure 7]."""
+"""Pictures of the matrices of a slice [MSR figure 7]."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from vpl.core.arrays import download
 
 
 def draw_slice(plugin, job, number: int, file, note: dict) -> None:
-    """Recover the slices of a batch and draw the one with a number, counted from 0 and at most the last.
+    """Recover the slices of a batch and draw slice ``number``, from 0 and clipped to the last.
 
-    ``plugin``: a ``matrixrecovery`` integrator; ``job``: the batch; ``note``: what goes into the file's metadata.
+    ``plugin``: a ``matrixrecovery`` integrator; ``job``: the batch; ``note``: metadata of the file.
     """
     work = plugin.start(job)
     number = min(number, work.entries.rows.slices - 1)
@@ -25,11 +25,11 @@ def draw_slice(plugin, job, number: int, file, note: dict) -> None:
         if inside and found.part is not None and found.part.counts[number - block.begin][0]:
             _draw(_panels(block, found, number), f"slice {number}", file, note | {"plugin": str(plugin)})
             return
-    raise ValueError(f"slice {number} was left out: no light arrives there, or none of it is in question")
+    raise ValueError(f"slice {number} was skipped: it receives no light, or no entries are uncertain")
 
 
 def _panels(block, found, number: int) -> dict:
-    """Matrices to draw, (rows, columns) each: those of the columns that were separated."""
+    """Matrices to draw, (rows, columns) each, restricted to the separated columns."""
     part, piece = found.part, number - block.begin
     rows = part.counts[piece][1]
 
@@ -54,7 +54,7 @@ def _panels(block, found, number: int) -> dict:
         panels["(e) density of errors"] = matrix(found.density, part)
     panels |= {
         "(f) recovered": recovered * light,
-        "(g) what is wrong": np.abs(recovered - exact) * light,
+        "(g) remaining errors": np.abs(recovered - exact) * light,
         "(h) all traced": exact * light,
     }
     values = {
@@ -65,7 +65,7 @@ def _panels(block, found, number: int) -> dict:
 
 
 def _slots(block, part, number: int) -> np.ndarray:
-    """Slots in the whole block of the columns of a part."""
+    """Slots of a part's columns within the block."""
     inside, wanted = block.columns.piece == number, part.columns.piece == number
     keys = {(g, n) for g, n in zip(part.columns.group[wanted], part.columns.node[wanted], strict=True)}
     pairs = zip(block.columns.group[inside], block.columns.node[inside], block.slot[inside], strict=True)

@@ -1,20 +1,20 @@
-"""``matrixrecovery`` against ``mdlightcuts`` and ``lightslice``, and what each of its steps does.
+"""``matrixrecovery`` against ``mdlightcuts`` and ``lightslice``, and the effect of its steps.
 
     ./run -- python benchmarks/matrixrecovery.py [--scenes NAME ...] [--parts table steps pictures]
 
-table     [MSR] Table 1: shadow rays, sampling rate, columns, time by stage and error; the other methods with the
-          parameter that gives the same mean absolute error of pixels, and with that which takes as many rays; and what
-          a shadow ray would have to cost more for both to take as long.
-cost      the same at equal error in scenes/veils.xml, with more and more veils, which make shadow rays more and
-          more expensive: whether and where the method is the fastest.  Only where it is asked for, whatever the scenes.
-steps     [MSR] figure 8: error and rays with one step after another left out, and with light separated as in the paper.
-pictures  [MSR] figure 7: the matrices of one slice of each scene, as PNG files below --out (needs matplotlib).
+table     [MSR] Table 1: shadow rays, sampling rate, columns, time by stage and error. The further methods use the
+          parameter of equal mean absolute pixel error, and the parameter of equal rays. break-even: additional cost of
+          a shadow ray that would equalize the times.
+cost      the same at equal error in scenes/veils.xml with an increasing number of veils, which make shadow rays
+          expensive. Runs on request only, independent of --scenes.
+steps     [MSR] figure 8: error and rays without single steps, and with separation of light as in the paper.
+pictures  [MSR] figure 7: the matrices of a slice of each scene, as PNG files below --out (needs matplotlib).
 
-``lightslice`` has 256 slices and 2048 shared columns, or 512 and 8192, whichever takes fewer rays: half of those that
-its defaults take, which are for larger images. Four samples a pixel, 256 wide, 200,000 VPLs, max_depth 6. Errors are
-those of whole pixels relative to the image's mean, direct light included, against the sum of all lights at all
-samples of a random subset of them. Rates are of all entries. Times are medians of three interleaved warm runs of what
-a method does after lights, their trees and gather points are there, which all methods share.
+``lightslice`` uses 256 slices and 2048 shared columns, or 512 and 8192, whichever takes fewer rays: half the rays of
+its defaults, which suit larger images. Four samples per pixel, 256 wide, 200,000 VPLs, max_depth 6. Errors are pixel
+errors relative to the image mean, including direct light, against the sum of all lights at all samples of a random
+subset. Rates refer to all entries. Times are medians of three interleaved warm runs, after the shared work (lights,
+light trees, gather points).
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ import mitsuba as mi
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 mi.set_variant("llvm_ad_rgb")
 
-from benchmarks import scenes  # noqa: E402
+from benchmarks import results, scenes  # noqa: E402
 from benchmarks.baselines import QUALITY, VPLS, Found, Problem  # noqa: E402
 from benchmarks.separated_light import light_of_entries  # noqa: E402
 from vpl.core.stages import Stage  # noqa: E402
 from vpl.matrix import recovery  # noqa: E402
 
 METHOD = "matrixrecovery"
-# With other properties that suit images of this size; of several, those that take the fewest rays for the same error
+# Property sets for images of this size; the set with the fewest rays at equal error is used
 OTHERS: dict = {
     "mdlightcuts": [{}],
     "lightslice": [{"slices": 256, "shared_columns": 2048}, {"slices": 512, "shared_columns": 8192}],
 }
 SAMPLES = 4
-# Where all lights are summed for pictures, which do not look at errors
+# Points with exact sums for pictures, which show no errors
 _FEW_POINTS = 400
 NAMES = ("cornell", "kitchen", "sponza_crytek", "dining_room", "bistro_interior")
 VEILS, VEILS_DEPTH = (0, 8, 16, 32), 80
@@ -64,12 +64,13 @@ STEPS = {
 
 
 def _rate(found: Found, pixels: int) -> float:
-    """Shadow rays over entries."""
+    """Shadow rays divided by matrix entries."""
     return found.rays * pixels / found.counts["entries"]
 
 
-def table(names, options) -> None:
+def table(names, options) -> dict:
     """Part "table"."""
+    rows: dict = {}
     print(f"\n## equal error and equal rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
     print("scene | method | s | rays/px | rate | columns | mean absolute | RMSE | fewer rays | faster | break-even, ns")
     ratios: dict = {}
@@ -77,6 +78,7 @@ def table(names, options) -> None:
         problem = Problem(name, SAMPLES, options.width, options.points)
         found = problem.interleaved(_equal_plugins(problem, ("error", "rays")))
         ours = found[METHOD]
+        rows[name] = _equal_error_row(found, problem)
         for label, one in found.items():
             _show(name, label, one, ours, problem)
             if "equal error" in label:
@@ -86,10 +88,26 @@ def table(names, options) -> None:
     for method, pairs in ratios.items():
         rays, seconds = (scenes.geometric_mean(values) for values in zip(*pairs, strict=True))
         print(f"geometric means over {method}: {rays:.2f} times fewer rays, {seconds:.2f} times faster")
+    return rows
+
+
+def _equal_error_row(found: dict, problem: Problem) -> dict:
+    """Row of a result file: our method, and the others at equal error."""
+    ours, row = found[METHOD], {}
+    for label, one in found.items():
+        if label != METHOD and "equal error" not in label:
+            continue
+        numbers = {name: float(getattr(one, name)) for name in ("seconds", "rays", "absolute", "rmse")}
+        if label == METHOD:
+            numbers |= {"rate": _rate(one, problem.pixels), "columns": one.cut / SAMPLES}
+        else:
+            numbers |= {"fewer_rays": one.rays / ours.rays, "speedup": one.seconds / ours.seconds}
+        row[label.split(",")[0]] = numbers
+    return row
 
 
 def _equal_plugins(problem: Problem, measures) -> dict:
-    """Our method, and the others with that value of their parameter that gives the same error or rays, by label."""
+    """Return label -> plugin: our method, and further methods with the parameter of equal error or equal rays."""
     plugins = {METHOD: problem.plugin(METHOD)}
     ours = problem.shade(plugins[METHOD])
     for other in OTHERS:
@@ -102,8 +120,9 @@ def _equal_plugins(problem: Problem, measures) -> dict:
     return plugins
 
 
-def costs(_, options) -> None:
+def costs(_, options) -> dict:
     """Part "cost"."""
+    rows: dict = {}
     print(f"\n## more and more expensive rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
     print("veils | method | s | rays/px | mean absolute | RMSE | ns a ray, all in all | fewer rays | faster")
     for veils in VEILS:
@@ -116,6 +135,7 @@ def costs(_, options) -> None:
         problem = Problem("veils", SAMPLES, options.width, options.points, VEILS_DEPTH, scene)
         found = problem.interleaved(_equal_plugins(problem, ("error",)))
         ours = found[METHOD]
+        rows[veils] = _equal_error_row(found, problem)
         for label, one in found.items():
             each = 1e9 * one.seconds / (one.rays * problem.pixels)
             print(
@@ -123,10 +143,11 @@ def costs(_, options) -> None:
                 f"{one.rmse:.4f} | {each:.0f} | {one.rays / ours.rays:.1f} | {one.seconds / ours.seconds:.2f}",
                 flush=True,
             )
+    return rows
 
 
 def _show(name: str, label: str, one: Found, ours: Found, problem: Problem) -> None:
-    """One row of the table."""
+    """Print a row of the table."""
     rate, columns = "", f"{one.cut / SAMPLES:.0f}"
     if label == METHOD:
         rate = f"{100 * _rate(one, problem.pixels):.1f}%"
@@ -143,8 +164,9 @@ def _show(name: str, label: str, one: Found, ours: Found, problem: Problem) -> N
         print(f"  stages: {stages}; prediction and separation {100 * share:.0f}%; counted: {one.counts}", flush=True)
 
 
-def steps(names, options) -> None:
+def steps(names, options) -> dict:
     """Part "steps"."""
+    rows: dict = {label: {} for label in STEPS}
     print(f"\n## steps left out ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs)")
     print("scene | steps | rays/px | rate | mean absolute | RMSE")
     for name in names:
@@ -154,10 +176,12 @@ def steps(names, options) -> None:
             with patch.object(recovery, "whole_entries", weight):
                 found = problem.shade(problem.plugin(METHOD, **settings))
             rate = 100 * _rate(found, problem.pixels)
+            rows[label][name] = {"absolute": float(found.absolute), "rays": found.rays, "rmse": float(found.rmse)}
             print(
                 f"{name} | {label} | {found.rays:.1f} | {rate:.1f}% | {100 * found.absolute:.2f}% | {found.rmse:.4f}",
                 flush=True,
             )
+    return rows
 
 
 def pictures(names, options) -> None:
@@ -183,16 +207,23 @@ def main() -> None:
     parts = {"table": table, "cost": costs, "steps": steps, "pictures": pictures}
     usual = [part for part in parts if part != "cost"]
     parser.add_argument("--parts", nargs="+", default=usual, choices=list(parts))
-    parser.add_argument("--width", type=int, default=256, help="pixels (default: 256)")
-    parser.add_argument("--points", type=int, default=8000, help="where all lights are summed (default: 8000)")
-    parser.add_argument("--slice", type=int, default=20, help="the slice of part pictures (default: 20)")
+    parser.add_argument("--width", type=int, default=256, help="width in pixels (default: 256)")
+    parser.add_argument("--points", type=int, default=8000, help="gather points with exact sums (default: 8000)")
+    parser.add_argument("--slice", type=int, default=20, help="number of the slice in part pictures (default: 20)")
     parser.add_argument(
-        "--out", type=Path, default=Path("matrices"), help="folder of part pictures (default: matrices)"
+        "--out", type=Path, default=Path("matrices"), help="output folder of part pictures (default: matrices)"
     )
+    results.add_json_option(parser)
     options = parser.parse_args()
+    results.check_json_option(parser, options)
+    if options.json and options.parts == ["pictures"]:
+        parser.error("--json: part pictures has no rows")
     names = scenes.available(options.scenes)
+    settings = {"vpl_count": VPLS, "width": options.width, "samples": SAMPLES, "points": options.points}
     for part in options.parts:
-        parts[part](names, options)
+        rows = parts[part](names, options)
+        if options.json:
+            results.write_results(options.json, part, settings, rows)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The scenes that the benchmarks use: our own, and the real ones of other people where their folder is present."""
+"""Scenes of the benchmarks: those of this project, and external scenes if their folder is present."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NAMES = (
     "cornell", "kitchen", "sponza_crytek", "staircase2", "living_room", "dining_room", "bistro_interior",
     "veach_ajar", "everything8003",
 )  # fmt: skip
-# Heights at a width of 256, by the aspect of the references
+# Heights at a width of 256, from the aspect ratios of the references
 _HEIGHTS = {
     "cornell": 256, "glossy": 256, "everything8003": 256, "bistro_interior": 192, "kitchen_lamps": 192,
     "kitchen_windows": 192, "forest_lights": 192, "concourse": 192, "veils": 192,
@@ -23,34 +23,34 @@ _HEIGHTS = {
 
 
 def scene_file(name: str) -> Path:
-    """The XML file of a scene; FileNotFoundError with the reason where it is absent."""
+    """XML file of a scene; FileNotFoundError with the reason if it is absent."""
     own = PROJECT / "scenes" / f"{name}.xml"
     if own.exists():
         return own
     path = SHARED / "scenes" / name / "scene.xml"
     if not path.exists():
-        raise FileNotFoundError(f"{path} is absent: the scenes of other people are not part of this project")
+        raise FileNotFoundError(f"{path} is absent: external scenes are not part of this project")
     return path
 
 
 def reference_file(name: str) -> Path | None:
-    """The path-traced reference of a scene at a width of 256, if there is one."""
+    """Path-traced reference of a scene at a width of 256, None if absent."""
     path = REFERENCES / f"{name}.exr"
     return path if path.exists() else None
 
 
 def height(name: str, width: int) -> int:
-    """Height of a scene's image at a width in pixels."""
+    """Height of a scene's image for a width in pixels."""
     return round(_HEIGHTS.get(name, 144) * width / 256)
 
 
 def load(name: str, width: int = 256):
-    """Load a scene at a width in pixels."""
+    """Load a scene with a width in pixels."""
     return mi.load_file(str(scene_file(name)), resx=width, resy=height(name, width))
 
 
 def available(names) -> list[str]:
-    """Those of the names whose files are present; prints the others with the reason."""
+    """Return the names with existing files; print the missing ones with the reason."""
     found = []
     for name in names:
         try:
@@ -62,7 +62,7 @@ def available(names) -> list[str]:
 
 
 def camera_rays(scene, seed: int, samples: int = 1):
-    """Sampler and camera rays as ``mi.render`` makes them for a box filter, ``samples`` of them a pixel."""
+    """Sampler and camera rays as in ``mi.render`` with a box filter, ``samples`` per pixel."""
     sensor = scene.sensors()[0]
     width, height = sensor.film().crop_size()
     sampler = sensor.sampler().clone()
@@ -76,7 +76,7 @@ def camera_rays(scene, seed: int, samples: int = 1):
 
 
 def timed(function):
-    """(result, seconds), the device idle before and after."""
+    """Return (result, seconds) of a call; the device is idle before and after."""
     dr.sync_thread()
     start = time.perf_counter()
     result = function()

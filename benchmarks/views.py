@@ -1,4 +1,4 @@
-"""Views of scenes that nobody chose, by cameras at random: what suits a scene's own picture has to suit them, too."""
+"""Random views of scenes, to test settings beyond the scenes' own cameras."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ import numpy as np
 from benchmarks import scenes
 from vpl.core.arrays import download
 
-# Distance of a camera from a surface, of half of the way to the next at most, and from the place that it is turned to,
-# which may be hidden, at least; in median distances of what the scene's own camera sees
+# In median distances of the surfaces visible to the scene's camera: maximum distance of a new camera from its surface
+# (at most half of the free distance), and minimum distance from its target, which may be occluded
 _STEP, _NEAREST = 0.15, 0.3
 
 
 def move_cameras(scene, number: int) -> None:
-    """Move all cameras of a scene to one place before a surface that the first of them sees, and turn them towards
-    another place that this one sees; the same for the same ``number``.  RuntimeError where it sees too little."""
+    """Move all cameras to a random position near a surface visible to the first camera, facing another visible point.
+
+    Deterministic for a ``number``. Raises RuntimeError if the first camera sees too little.
+    """
     origin, target = _place(scene, number)
     for sensor in scene.sensors():
         parameters = mi.traverse(sensor)
@@ -27,7 +29,7 @@ def move_cameras(scene, number: int) -> None:
 
 
 def _place(scene, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where a camera stands and what it looks at, (3,) each."""
+    """Return position and target of a camera, (3,) each."""
     _, ray = scenes.camera_rays(scene, number)
     si = scene.ray_intersect(ray)
     away = si.spawn_ray(si.n * dr.mulsign(mi.Float(1), -dr.dot(si.n, ray.d)))
@@ -35,10 +37,10 @@ def _place(scene, number: int) -> tuple[np.ndarray, np.ndarray]:
     place, normal = download(si.p), download(away.d)
     seen = np.flatnonzero(np.isfinite(distance))
     if len(seen) == 0:
-        raise RuntimeError("the camera of the scene sees no surface that another could look at")
+        raise RuntimeError("the camera of the scene sees no surface")
     typical = np.median(distance[seen])
     for start, end in np.random.default_rng(number).choice(seen, (1000, 2)):
         origin = place[start] + min(_STEP * typical, 0.5 * free[start]) * normal[start]
         if np.linalg.norm(place[end] - origin) > _NEAREST * typical:
             return origin, place[end]
-    raise RuntimeError("the camera of the scene sees nothing that is far enough from the rest")
+    raise RuntimeError("the camera of the scene sees only surfaces too close to each other for another view")

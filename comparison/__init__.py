@@ -1,36 +1,36 @@
-"""Parts of `manylights.py` and `compare.py`: loading scenes, rendering them in passes, images, errors, and reports.
+"""Modules of `manylights.py` and `compare.py`: scene files, rendering in passes, images, errors, reports.
 
-`scene_files`   parse a scene file, change its integrator or its size, and load it
-`rendering`     average passes of different seeds, within samples or seconds
+`scene_files`   parse a scene file, change its integrator or size, load it
+`rendering`     average passes with different seeds, for samples or seconds
 `render`, `pass_sizes`, `convergence`, `interruption`
-                an image that ends by itself: passes of some seconds, the error that is left, Ctrl-C
-`checkpoint`    what a render goes on from that was not finished
+                render until a time or an error: pass sizes, error estimate, Ctrl-C
+`checkpoint`    state of an unfinished render
 `one_image`, `batch`
-                an image of the command, rendered here or by workers; which images, of frames, scenes and sensors
-`occasional`    files that are written every now and then
+                an image of the command, rendered locally or by workers; batches of frames, scenes and sensors
+`occasional`    files written periodically
 `cluster/`      passes and runs on several processes or machines
-`denoising`     Open Image Denoise, and the albedo and normals that guide it
+`denoising`     Open Image Denoise with albedo and normal
 `images`        EXR files with metadata, tone mapping, false colours
-`metrics`       how far an image is from a reference
-`references`    references from files, and path-traced ones that are kept and continued
-`worker`        render and measure one integrator in a process of its own
-`runs`          finished runs, kept to go on after an interruption
-`sweeps`        which parameters integrators are rendered with, and in which order
+`metrics`       errors against a reference
+`references`    references from files, and cached path-traced references
+`worker`        render and measure an integrator in a separate process
+`runs`          finished runs, for resuming
+`sweeps`        settings of integrators and the order of runs
 `scene_comparison`, `progress`
-                all runs on one scene; how far they are
+                all runs on a scene; progress display
 `curves`, `analysis`
-                error against time and rays: means, intervals, what is read off; from runs to these
+                error against time and rays: means, intervals, interpolation; curves from runs
 `quantities`, `published_table`, `published`, `paper_tables`
-                what the papers' tables list; their figures; the same tables from runs
+                quantities and figures of the papers' tables; the same tables from runs
 `tables`, `report`, `plots`, `pictures`, `page_images`, `page`
                 tables, `results.json` (`results.schema.json`) and `report.html`
-`strip`         pictures beside each other, for a paper
-`baseline`      have speed-ups fallen since an earlier comparison?
+`strip`         a row of pictures for a paper
+`baseline`      regression test of speed-ups
 `machine`       processor, load, versions
-`command_line`  what the two commands' options and error messages have in common
+`command_line`  common options and error messages of the two commands
 """
 
 import os
 
-# FLIP's threads would otherwise wait for each other in a busy loop: a hundred times slower on a loaded machine.
+# By default threads of FLIP wait in a busy loop, which is a hundred times slower on a loaded machine
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")

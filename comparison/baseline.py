@@ -1,7 +1,7 @@
-"""`--check`: have integrators become slower, compared with each other, than in an earlier comparison?
+"""`--check`: detect slow-downs relative to the first integrator since an earlier comparison.
 
-What is checked are the speed-ups at equal error of every integrator over the first, which, unlike seconds, carry over
-from machine to machine. They are read off the new curves at the errors for which the earlier comparison has them.
+The check compares speed-ups at equal error over the first integrator. Unlike seconds, speed-ups carry over between
+machines. They are interpolated on the new curves at the errors of the earlier comparison.
 """
 
 import json
@@ -13,8 +13,8 @@ from .report import FORMAT
 
 
 def read(path, metric, names):
-    """Return the content of a `results.json`. Raises UsageError if it is none, or of another format, has no speed-ups
-    to check, measures another error than `metric`, or has none of the scenes of these names."""
+    """Return the content of a `results.json`. Raises UsageError if the file is invalid, has another format, contains no
+    speed-ups, uses another metric, or has none of the scenes `names`."""
     try:
         results = json.loads(Path(path).read_text())
     except (OSError, ValueError) as error:
@@ -31,7 +31,7 @@ def read(path, metric, names):
 
 
 def _speed_ups(results):
-    """Yield scene, first label, label, cost, error and speed-up of everything that can be checked."""
+    """Yield (scene, first label, label, cost, error, speed-up) for every known speed-up."""
     for scene in results.get("scenes", []):
         for cost, entries in scene.get("equal_errors", {}).items():
             for entry in entries:
@@ -42,9 +42,8 @@ def _speed_ups(results):
 
 
 def check(results, baseline, share):
-    """Return what has become worse, a list of lines: speed-ups that fell by more than a `share` (a fraction), or that
-    can no longer be told. One that is known to be at least what it may fall to has not fallen, though the curves do not
-    overlap any more. Scenes that only one of the two has are left out."""
+    """Return a list of messages: speed-ups that fell by more than the fraction `share`, or are no longer measurable.
+    A known lower bound above the permitted minimum passes. Compares only scenes present in both results."""
     metric = results["metrics"]["compared"]
     found, lines = {scene["name"]: scene for scene in results["scenes"]}, []
     for name, base, label, cost, error, before in _speed_ups(baseline):
@@ -58,7 +57,7 @@ def check(results, baseline, share):
 
 
 def _fall(first, other, before, share):
-    """Say how a speed-up has fallen, None if it has not; `first` and `other` are the readings of the two labels."""
+    """Describe the fall of a speed-up (None: no fall); `first` and `other` are the readings of the two labels."""
     now, least = other["speed_up"], other["speed_up_at_least"]
     if now is not None:
         return f"{now:.3g}× now, {1 - now / before:.0%} less" if now < (1 - share) * before else None
@@ -68,13 +67,13 @@ def _fall(first, other, before, share):
         return "not reached now"
     if first["value"] is None and first["at_most"] is None:
         return "not reached now by the first"
-    return "only known by bounds now"
+    return "only bounds are known now"
 
 
 def _readings(scene, base, label, cost, error, metric):
-    """Return the readings of two labels at an error, see `curves.equal_errors`; None if one of them has no curve."""
-    of = dict(analysis.points(scene["renders"], metric))[cost]
-    pair = analysis.make_curves(of, [base, label])
+    """Return the readings of two labels at an error (see `curves.equal_errors`), None if one has no curve."""
+    points = dict(analysis.points_by_cost(scene["renders"], metric))[cost]
+    pair = analysis.make_curves(points, [base, label])
     if [curve.label for curve in pair] != [base, label]:
         return None
     costs = curves.equal_errors(pair, [error])[0]["costs"]

@@ -1,11 +1,11 @@
-"""Curves of error against time or shadow rays, and what is read off them. NumPy only.
+"""Curves of error against time or shadow rays, and values interpolated on them. NumPy only.
 
-A point is a setting, its coordinates are means over seeds. An integrator's curve joins those of its points that no
-other of its points beats in both (its own front), by straight lines in logarithmic axes. Errors that the reference's
-noise hides are no part of it, but bounds: they are at most that noise. Nothing is read off beyond a curve's ends.
+A point is a setting; its coordinates are means over seeds. The curve of an integrator is its Pareto front, connected by
+straight lines in logarithmic axes. An error below the reference's noise is not part of a curve; the noise is an upper
+bound of it. Curves are not extrapolated.
 
-Confidence intervals are at 95%: of means by Student's t on a logarithmic scale, of what is read off by the jackknife
-over seeds. Ratios of two integrators leave the same seed out of both, as they may share lights.
+Confidence intervals are at 95%: Student's t on a logarithmic scale for means, the jackknife over seeds for interpolated
+values. Ratios of two integrators leave out the same seed of both, because both may use the same lights.
 """
 
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from itertools import pairwise
 
 import numpy as np
 
-# Quantiles of Student's t at 97.5%, for 1 to 10 degrees of freedom; beyond them by an expansion good to 1e-4.
+# Quantiles of Student's t at 97.5% for 1 to 10 degrees of freedom; above by an expansion with an error of 1e-4
 _QUANTILES = (12.7062, 4.3027, 3.1824, 2.7764, 2.5706, 2.4469, 2.3646, 2.3060, 2.2622, 2.2281)
 _NORMAL = 1.959964
-TARGETS = 4  # at most so many errors, and times, at which integrators are compared
+TARGETS = 4  # maximum number of errors, and of times, in a comparison of integrators
 
 
 def quantile(freedom):
-    """The quantile of Student's t at 97.5% for `freedom` degrees of freedom, at least 1."""
+    """Return the 97.5% quantile of Student's t for `freedom` (at least 1) degrees of freedom."""
     if freedom <= len(_QUANTILES):
         return _QUANTILES[freedom - 1]
     z = _NORMAL
@@ -29,8 +29,8 @@ def quantile(freedom):
 
 
 def spread(values):
-    """Return the mean of positive values over seeds and its interval: a dict with "mean", "low" and "high", the latter
-    two None for a single value, or where the mean is zero."""
+    """Return the mean of positive values over seeds with its confidence interval: "mean", "low" and "high"; the latter
+    two are None for a single value or a mean of zero."""
     values = np.asarray(values, np.float64)
     mean = float(values.mean())
     if len(values) < 2 or mean <= 0:
@@ -41,8 +41,8 @@ def spread(values):
 
 @dataclass
 class Point:
-    """A setting: for each of its seeds, the cost (seconds or rays), the error, and the noise below which an error means
-    nothing. `cost` and the others are dicts from seed to number."""
+    """Setting with its cost (seconds or rays), its error, and the noise below which the error is indistinguishable from
+    zero; each a dict from seed to number."""
 
     label: str
     name: str
@@ -51,13 +51,13 @@ class Point:
     noise: dict
 
     def mean(self, without=None):
-        """Return the means of cost and error, with a seed left out; None if there is no other seed, or if the error
-        cannot be told from the reference's noise."""
+        """Return the means of cost and error, leaving out a seed; None without a further seed, or if the reference's
+        noise hides the error."""
         cost, error, noise = self._means(without)
         return (cost, error) if error > noise and cost > 0 else None
 
     def bound(self, without=None):
-        """Return the means of cost and noise where that hides the error, which is at most as large; None elsewhere."""
+        """Return the means of cost and noise if the noise hides the error and so bounds it from above, else None."""
         cost, error, noise = self._means(without)
         return (cost, noise) if error <= noise and cost > 0 else None
 
@@ -65,44 +65,46 @@ class Point:
         seeds = [seed for seed in self.cost if seed != without]
         if not seeds:
             return np.nan, np.nan, np.nan
-        return tuple(float(np.mean([of[seed] for seed in seeds])) for of in (self.cost, self.error, self.noise))
+        return tuple(float(np.mean([values[seed] for seed in seeds])) for values in (self.cost, self.error, self.noise))
 
 
 class Curve:
-    """The curve of one integrator; `points` are its `Point`s."""
+    """Curve of an integrator from its `Point`s."""
 
     def __init__(self, label, points):
         self.label, self.points = label, points
 
     def front(self, without=None):
-        """Return cost and error, arrays of the points of the curve in order of rising cost and falling error."""
+        """Return the arrays of costs (rising) and errors (falling) of the Pareto front."""
         return front([mean for point in self.points if (mean := point.mean(without)) is not None])
 
     def bounds(self, without=None):
-        """Return cost and noise, a list of pairs, of the points whose errors the noise hides."""
+        """Return (cost, noise) of the points with hidden errors."""
         return [bound for point in self.points if (bound := point.bound(without)) is not None]
 
     def cost_at(self, error, without=None):
-        """Return the cost of an error as (cost, at most): the second where a cheaper point is better than that, be it
-        the cheapest or one that the noise hides, (None, None) where the curve does not get there."""
+        """Return (cost, None) of an error; (None, upper bound) if a cheaper point already has a smaller error, measured
+        or hidden by noise; (None, None) if no point reaches the error."""
         costs, errors = self.front(without)
         hidden = [cost for cost, noise in self.bounds(without) if noise <= error]
-        return _read_off(error, errors[::-1], costs[::-1], hidden)
+        return _interpolate(error, errors[::-1], costs[::-1], hidden)
 
     def error_at(self, cost, without=None):
-        """Return the error at a cost as (error, at most): the second where a point that costs less, be it the most
-        expensive or one that the noise hides, is better, (None, None) where even the cheapest costs more."""
+        """Return (error, None) at a cost; (None, upper bound) if a point of lower cost already has a smaller error,
+        measured or hidden by noise; (None, None) if every point costs more."""
         hidden = [noise for at, noise in self.bounds(without) if at <= cost]
-        return _read_off(cost, *self.front(without), hidden)
+        return _interpolate(cost, *self.front(without), hidden)
 
-    def between(self, value, axis):
-        """Return the settings that what is read off at a cost (axis 0) or an error (axis 1) comes from: a dict from
-        names to shares in logarithmic axes, which add up to 1. They are two settings of the front, or one; where only a
-        bound is known it is the setting that has it, and where the curve does not get there, none."""
+    def interpolation_weights(self, value, axis):
+        """Return setting name -> weight for the interpolation at a cost (axis 0) or an error (axis 1).
+
+        The weights, with sum 1, belong to one or two settings of the front. If only a bound is known, its setting has
+        the weight 1. The dict is empty if the curve does not reach the value.
+        """
         read, at_most = self.error_at(value) if axis == 0 else self.cost_at(value)
         if at_most is not None:
             pairs = {point.name: point.mean() or point.bound() for point in self.points}
-            # Bounds may be alike, as the reference's noise is: of them, one that is not beyond the place
+            # Several bounds may equal the reference's noise; take one that reaches the value
             reached = {name: pair for name, pair in pairs.items() if pair and pair[axis] <= value}
             return {next(name for name, pair in reached.items() if pair[1 - axis] == at_most): 1.0}
         if read is None:
@@ -122,7 +124,7 @@ class Curve:
 
 
 def front(pairs):
-    """Return, of (cost, error) pairs, those that no other beats in both, as two arrays in order of rising cost."""
+    """Return the Pareto front of (cost, error) pairs, two arrays in order of rising cost."""
     kept = []
     for cost, error in sorted(pairs):
         if not kept or error < kept[-1][1]:
@@ -130,9 +132,9 @@ def front(pairs):
     return tuple(np.array(kept, np.float64).reshape(-1, 2).T)
 
 
-def _read_off(x, xs, ys, bounds):
-    """Return the value at x of a falling curve through (xs, ys), xs rising, and None; or None and what it is at most,
-    beyond the end of the curve, or because one of `bounds` is lower; or None twice."""
+def _interpolate(x, xs, ys, bounds):
+    """Interpolate a falling curve (xs, ys), xs rising, at x. Return (value, None), or (None, upper bound) beyond the
+    end of the curve or if one of `bounds` is lower, or (None, None)."""
     value, at_most = None, min(bounds, default=np.inf)
     if xs.size and x > xs[-1]:
         at_most = min(at_most, float(ys[-1]))
@@ -144,9 +146,8 @@ def _read_off(x, xs, ys, bounds):
 
 
 def interval(value, seeds):
-    """Return the 95% interval of a positive number by the jackknife, (low, high), or (None, None) where it cannot be
-    told: a single seed, or a number that is not there without one of them. `value` maps the seed that is left out, or
-    None, to the number or None."""
+    """Return the 95% jackknife interval (low, high) of a positive number; (None, None) for a single seed, or if the
+    number is unknown without one of the seeds. `value` maps the omitted seed (None: no seed) to the number or None."""
     without = [value(seed) for seed in seeds]
     if len(seeds) < 2 or any(number is None for number in without):
         return None, None
@@ -157,10 +158,12 @@ def interval(value, seeds):
 
 
 def equal_errors(curves, targets=None):
-    """Return what each curve costs at the same errors: a list of {"error", "costs"}, the latter from label to {"value",
-    "at_most", "low", "high", "speed_up", "speed_up_low", "speed_up_high", "speed_up_at_least"}; a speed-up is the cost
-    of the first curve over that of the label's, the last one over `at_most`. What is not known is None; "not reached"
-    is where both value and at_most are."""
+    """Return the costs of the curves at equal errors: a list of {"error", "costs": label -> reading}.
+
+    A reading has "value", "at_most", "low", "high", "speed_up", "speed_up_low", "speed_up_high" and
+    "speed_up_at_least". "speed_up" is the cost of the first curve over the cost of the label, "speed_up_at_least" the
+    former over "at_most". Unknown entries are None; if value and at_most are None, the error is not reached.
+    """
     targets = _targets([curve.front()[1] for curve in curves]) if targets is None else targets
     return [
         {"error": target, "costs": {curve.label: _read(curves[0], curve, Curve.cost_at, target) for curve in curves}}
@@ -169,8 +172,8 @@ def equal_errors(curves, targets=None):
 
 
 def equal_costs(curves, targets=None):
-    """Return the error of each curve at the same costs: a list of {"cost", "errors"}, the latter as in `equal_errors`,
-    with the ratio of errors in place of the speed-up."""
+    """Return the errors of the curves at equal costs: a list of {"cost", "errors"} with readings as in `equal_errors`,
+    where the speed-up is a ratio of errors."""
     targets = _targets([curve.front()[0] for curve in curves]) if targets is None else targets
     return [
         {"cost": target, "errors": {curve.label: _read(curves[0], curve, Curve.error_at, target) for curve in curves}}
@@ -196,16 +199,19 @@ def _read(base, curve, read, target):
 
 
 def _targets(ranges):
-    """Choose the numbers at which to compare: round ones (1, 2 or 5 times a power of ten) that as many as possible of
-    the ranges hold, `TARGETS` of them at most; the middle of what the ranges share where no round one is. Where they
-    share nothing, the ends that are closest to each other, so that one of them is a bound."""
+    """Choose the values for comparisons of curves with these ranges.
+
+    Chooses at most `TARGETS` round numbers (1, 2 or 5 times a power of ten) contained in as many ranges as possible.
+    Without a round number, chooses the middle of the common range; without a common range, the two closest ends, so
+    that one is a bound.
+    """
     ranges = [(float(values.min()), float(values.max())) for values in ranges if values.size]
     if not ranges:
         return []
     low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
     decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     candidates = [float(f"{step}e{int(decade)}") for decade in decades for step in (1, 2, 5)]
-    # Corners of the ranges join: somewhere between two of them is the most that can be had.
+    # The number of ranges that contain a value changes only at their ends; test a value between each pair of ends
     corners = sorted({corner for pair in ranges for corner in pair})
     candidates += [float(f"{np.sqrt(a * b):.3g}") for a, b in pairwise(corners)]
     holders = [sum(low <= number <= high for low, high in ranges) for number in candidates]
@@ -220,8 +226,7 @@ def _targets(ranges):
 
 
 def pareto(points):
-    """Return the set of (label, name) of those points of all curves that no point of any curve beats in both, be it one
-    that the noise hides."""
+    """Return the set of (label, name) on the Pareto front of all curves, including bounds of hidden errors."""
     means = {(point.label, point.name): mean for point in points if (mean := point.mean()) is not None}
     bounds = [bound for point in points if (bound := point.bound()) is not None]
     kept = set(zip(*map(np.ndarray.tolist, front([*means.values(), *bounds])), strict=True))

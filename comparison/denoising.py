@@ -1,11 +1,11 @@
-"""Denoising by Open Image Denoise, on the CPU, guided by the albedo and the normal of what the camera sees.
+"""Denoising by Open Image Denoise on the CPU, guided by albedo and shading normal.
 
-The package is `mitsuba-oidn`, which `pip install 'manylights[denoise]'` brings. Albedo and normal are those of the
-first surface that is neither mirror nor glass, have little noise after a few samples per pixel, and lose that by a
-filter of their own ("prefiltering"), so that the image can be taken to have exactly their edges.
+Requires the package `mitsuba-oidn` (`pip install 'manylights[denoise]'`). Albedo and normal belong to the first surface
+that is neither mirror nor glass. A few samples per pixel suffice for them, and a separate filter removes the remaining
+noise ("prefiltering"), so that the denoiser can treat them as noise-free.
 
-Noise that neighbouring pixels share looks like detail to the filter: a film with a wide reconstruction filter is
-denoised less well than one with a box filter.
+The denoiser mistakes noise correlated between pixels for detail: a wide reconstruction filter of the film gives worse
+results than a box filter.
 """
 
 import time
@@ -18,13 +18,13 @@ import numpy as np
 from .images import colour
 
 FEATURE_SPP = 16
-FEATURE_SEED = 0xFEA7  # combined with the image's, whose noise it must not share
-DEEPEST = 16  # mirrors, panes and masks behind each other
+FEATURE_SEED = 0xFEA7  # combined with the seed of the image, to avoid correlated noise
+DEEPEST = 16  # interactions with mirrors, panes and masks
 FEATURES = ("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z")
 
 
 def import_oidn():
-    """Return the module; raises ModuleNotFoundError that says what to install."""
+    """Import `mitsuba_oidn`; raises a ModuleNotFoundError that states the command to install it."""
     try:
         import mitsuba_oidn
     except ModuleNotFoundError:
@@ -35,10 +35,10 @@ def import_oidn():
 
 
 class Denoiser:
-    """Denoises images of a scene by its sensor of a number.
+    """Denoises images of a scene by one of its sensors (an index).
 
-    `seconds`: what it has taken so far, with the passes for albedo and normal, which are made at once;
-    `filter_seconds`: what `denoise` will take, about.
+    `seconds`: time spent so far, including the auxiliary passes, which the constructor renders.
+    `filter_seconds`: estimated time of a call of `denoise`.
     """
 
     def __init__(self, scene, sensor=0, seed=0):
@@ -51,8 +51,8 @@ class Denoiser:
         self.seconds, self.filter_seconds = end - begin, end - filtering
 
     def denoise(self, image, channels):
-        """Return an image, (height, width, channels), with its colour denoised; other channels are left as they are,
-        and pixels that are not finite are taken as black."""
+        """Denoise the colour of an image (height, width, channels). Keeps its other channels, and treats non-finite
+        pixels as black."""
         begin = time.perf_counter()
         names = ("R", "G", "B") if "R" in channels else ("Y",)
         planes = np.array(image, np.float32)
@@ -64,7 +64,7 @@ class Denoiser:
         return type(image)(planes) if isinstance(image, mi.TensorXf) else planes
 
     def _filtered(self, inputs, **settings):
-        """Filter the first of the images `inputs` (name -> (height, width, 3) float32), guided by the others."""
+        """Filter the first image of `inputs` (name -> (height, width, 3) float32), guided by the remaining ones."""
         arrays = {name: np.ascontiguousarray(plane, np.float32) for name, plane in inputs.items()}
         output = np.empty_like(next(iter(arrays.values())))
         network = self._device.new_filter("RT")
@@ -77,12 +77,12 @@ class Denoiser:
 
 
 def auxiliary_features(scene, sensor, spp, seed):
-    """Return a dict of "albedo" and "normal", (height, width, 3) float32, of the first surfaces seen by a sensor (a
-    `mi.Sensor`) that are neither mirror nor glass, by `spp` samples per pixel through the film's filter.
+    """Render "albedo" and "normal", a dict of (height, width, 3) float32, of the first surfaces that are neither mirror
+    nor glass, with `spp` samples per pixel and the film's filter; `sensor` is a `mi.Sensor`.
 
-    The albedo, 0 to 1, is what the surface scatters of the light from all directions, by single samples of the BSDF,
-    times what mirrors and glass before it leave, plus what is emitted; black where there is nothing. The shading normal
-    is in world space and turned towards the viewer; 0 where there is nothing.
+    Albedo, 0 to 1: directional albedo, estimated by one BSDF sample, times the throughput of mirrors and glass before
+    the surface, plus emission. Normal: shading normal in world space, turned towards the viewer. Both are 0 in empty
+    directions.
     """
     seed = int(np.random.SeedSequence((FEATURE_SEED, seed)).generate_state(1)[0])
     mi.render(scene, sensor=sensor, integrator=_feature_integrator(mi.variant()), spp=spp, seed=seed)
@@ -95,8 +95,8 @@ def auxiliary_features(scene, sensor, spp, seed):
 
 @cache
 def _feature_integrator(variant):
-    """Return an integrator of a variant (the current one, by which Mitsuba chooses its base) with albedo and normal as
-    further channels of an image that is otherwise black."""
+    """Return an integrator that renders a black image with albedo and normal as AOVs. Mitsuba's base class depends on
+    the variant; `variant`, the current one, is the cache key."""
 
     class FeatureIntegrator(mi.SamplingIntegrator):
         def aov_names(self):
@@ -113,8 +113,7 @@ def _feature_integrator(variant):
 
 @dr.syntax
 def _first_rough_surface(scene, sampler, ray, active):
-    """Follow camera rays through mirrors, glass and masks; return albedo and normal of what they meet, and whether that
-    is anything."""
+    """Trace camera rays through mirrors, glass and masks; return albedo, normal, and the mask of hits."""
     throughput, depth = mi.Color3f(1), mi.UInt32(0)
     albedo, normal, valid = mi.Color3f(0), mi.Normal3f(0), mi.Bool(False)
     while active:
@@ -124,7 +123,7 @@ def _first_rough_surface(scene, sampler, ray, active):
         bsdf = si.bsdf(ray)
         sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(hit), sampler.next_2d(hit), hit)
         throughput *= _three(weight)
-        # Where a surface has a smooth lobe too, as plastic has, that is what is seen of it.
+        # A surface with a delta and a smooth lobe, such as plastic, counts by its smooth lobe
         smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         passed = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
         onward = hit & (passed | (mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta) & ~smooth))
@@ -139,6 +138,6 @@ def _first_rough_surface(scene, sampler, ray, active):
 
 
 def _three(value):
-    """Return a spectrum as three channels: the mean of its wavelengths where it has no colours."""
+    """Convert a spectrum to three channels; without RGB, the mean over the wavelengths."""
     value = mi.unpolarized_spectrum(value)
     return mi.Color3f(value) if mi.is_rgb else mi.Color3f(dr.mean(value))

@@ -1,4 +1,4 @@
-"""Circumstances that a measurement depends on besides the scene: machine, load, software."""
+"""Conditions of a measurement besides the scene: machine, load, software."""
 
 import hashlib
 import os
@@ -8,7 +8,7 @@ from pathlib import Path
 from . import command_line
 
 ROOT = Path(__file__).resolve().parent.parent
-# What seconds and images depend on; the report may change without a run having to be made again.
+# Sources that seconds and images depend on; changes of the report do not invalidate finished runs
 SOURCES = (
     "integrators/*.py",
     "vpl/**/*.py",
@@ -17,13 +17,13 @@ SOURCES = (
 
 
 def describe():
-    """Return processor, cores that may be used, memory in bytes, and system."""
+    """Return processor, usable cores, memory in bytes, and operating system."""
     processor = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         processor = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
-        pass  # not Linux, or an architecture that has no names there
+        pass  # not Linux, or an architecture without processor names
     return {
         "processor": processor,
         "cores": cores(),
@@ -33,28 +33,28 @@ def describe():
 
 
 def identity():
-    """Return what of the machine seconds depend on, and what stays the same for as long as it does: memory may be lent
-    and taken back, systems are brought up to date."""
+    """Return the stable part of the machine's description that seconds depend on. Memory limits and system versions
+    may change between runs."""
     return {key: value for key, value in describe().items() if key in ("processor", "cores")}
 
 
 def cores():
-    """Number of processor cores that this process may use."""
+    """Number of processor cores usable by this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
 def load():
-    """Return the load average of the last minute: how many threads of all processes wanted to run, our own included."""
+    """Return the load average of the last minute: runnable threads of all processes, including this one."""
     return os.getloadavg()[0]
 
 
 def versions():
-    """Return the versions (text) of what made a comparison; "sources" is a hash of this project's."""
+    """Return the versions (text) of the software of a comparison; "sources" is a hash of this project's sources."""
     return command_line.versions() | {"python": platform.python_version(), "sources": sources()}
 
 
 def sources(patterns=SOURCES):
-    """Return a hash (hexadecimal) of those of this project's files that match one of some patterns."""
+    """Return a hash (16 hexadecimal digits) of this project's files that match the glob patterns."""
     digest = hashlib.sha256()
     for file in sorted({file for pattern in patterns for file in ROOT.glob(pattern)}):
         digest.update(f"{file.relative_to(ROOT)}\0".encode() + file.read_bytes())

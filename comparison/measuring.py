@@ -1,4 +1,4 @@
-"""Which passes an image is made of, and which of them are measured: for a time budget, or given samples per pixel."""
+"""Division of an image into passes, for a time budget or a number of samples per pixel; warm-up passes."""
 
 from itertools import count
 
@@ -7,18 +7,18 @@ import numpy as np
 from .pass_sizes import FIRST_SAMPLES
 from .rendering import pass_seed, pass_sizes
 
-LONG_PASS = 60.0  # seconds; with given samples, only small passes compile for passes longer than this
-WARM_SPP = 4  # Mitsuba compiles other kernels for passes of fewer samples per pixel, and for no power of two
-PASSES_IN_BUDGET = 3  # or about so many; fewer, where starting that many would take more of it than
+LONG_PASS = 60.0  # seconds; with given samples, passes longer than this are warmed up by small passes alone
+WARM_SPP = 4  # Mitsuba compiles different kernels below this number, and for numbers other than powers of two
+PASSES_IN_BUDGET = 3  # target number; fewer if starting them would exceed this share of the budget:
 START_SHARE = 0.3
-UNUSED_PASSES = 2**31  # passes that are not in the image are numbered from here, so that they share no lights with it
+UNUSED_PASSES = 2**31  # first number of warm-up passes, which must not share lights with passes of the image
 
 
 def measure(progressive, job):
-    """Render the passes of a job; return the seconds of the first of all.
+    """Render the passes of a job; return the seconds of the first pass, including compilation.
 
-    With `job.cold` all are in the image, as for a person who waits for it. Otherwise those that compile kernels are
-    not, whatever they take, so that times are warm.
+    With `job.cold` the image includes all passes. Otherwise warm-up passes compile the kernels first and are excluded
+    from image and time, whatever they take.
     """
     if job.cold:
         _render_cold(progressive, job)
@@ -32,7 +32,7 @@ def measure(progressive, job):
             progressive.render(spp)
         return cold
     if job.pass_spp:
-        smaller = [WARM_SPP, WARM_SPP + 1] if job.pass_spp > WARM_SPP else []  # which the last pass may be
+        smaller = [WARM_SPP, WARM_SPP + 1] if job.pass_spp > WARM_SPP else []  # possible sizes of the last pass
         cold, (spp, start) = _compile(progressive, [job.pass_spp, *smaller], unused), (job.pass_spp, 0.0)
     else:
         cold = _compile(progressive, [1], unused)
@@ -46,18 +46,18 @@ def measure(progressive, job):
 
 
 def _render_cold(progressive, job):
-    """Render the passes of a job from the first on; in a budget their sizes double as long as it has room for more."""
+    """Render the passes of a job from the first; with a time budget, double their sizes while the budget allows."""
     if job.spp:
         for spp in pass_sizes(job.spp, job.pass_spp or progressive.largest_pass):
             progressive.render(spp)
         return
     first = WARM_SPP if WARM_SPP * progressive.pixels <= FIRST_SAMPLES else 1
     spp, largest = job.pass_spp or first, job.pass_spp or progressive.largest_pass
-    least, expected = {}, 0.0  # seconds, by size and of the next pass
+    least, expected = {}, 0.0  # seconds: minimum by size, and expectation for the next pass
     while (left := job.budget - progressive.seconds) > expected / 2:
         seconds, is_first = progressive.render(spp).seconds, spp not in least
         least[spp] = min(seconds, least.get(spp, seconds))
-        if is_first:  # it may have compiled, and is repeated
+        if is_first:  # may include compilation; repeat it
             expected = min(least[spp], 2 * least.get(spp // 2, 0.0))
             continue
         each = seconds / spp
@@ -69,10 +69,10 @@ def _render_cold(progressive, job):
 
 
 def _compile(progressive, sizes, seeds):
-    """Render passes that are in no image, so that those of `sizes` (samples per pixel) find their kernels compiled;
-    return the seconds of the first. They are small; where passes take no longer than `LONG_PASS`, those of their own
-    size follow, as integrators may do other things for more samples."""
-    small = {spp: min(spp, WARM_SPP + (spp & (spp - 1) != 0)) for spp in sizes}  # both powers of two, or neither
+    """Render warm-up passes that compile the kernels for passes of `sizes` (samples per pixel); return the seconds of
+    the first. Small passes come first. Full-size passes follow if they take at most `LONG_PASS`, because integrators
+    may use other kernels for more samples."""
+    small = {spp: min(spp, WARM_SPP + (spp & (spp - 1) != 0)) for spp in sizes}  # keeps "is a power of two"
     cold, *_ = [progressive.render(spp, next(seeds)).seconds for spp in dict.fromkeys(small.values())]
     for spp in sorted({*sizes} - {*small.values()}):
         seconds = progressive.render(small[spp], next(seeds)).seconds
@@ -82,9 +82,11 @@ def _compile(progressive, sizes, seeds):
 
 
 def _samples_that_fit(progressive, spp, budget, start):
-    """Return the samples per pixel of the next pass, 0 if the budget is used up: `spp`, or in the last pass as many as
-    there is time for, when it has been started in `start` seconds. Fewer than `WARM_SPP` are not worth one, unless
-    `spp` is; whether that many are still rendered is decided by what is nearer to the budget."""
+    """Return the samples per pixel of the next pass, 0 at the end of the budget. `start`: seconds to start a pass.
+
+    The last pass has as many samples as still fit. Below `WARM_SPP` (or `spp`, if smaller) it renders this minimum if
+    that ends closer to the budget than stopping does.
+    """
     if progressive.passes[-1].spp < spp:
         return 0
     sampling = progressive.seconds - len(progressive.passes) * start
@@ -96,12 +98,11 @@ def _samples_that_fit(progressive, spp, budget, start):
 
 
 def _samples_of_a_pass(progressive, budget, seeds):
-    """Return the samples per pixel of the passes that a budget is divided into, found by rendering some, and the
-    seconds that starting one takes.
+    """Return the samples per pixel of each pass of a budget, from trial passes, and the seconds to start a pass.
 
-    Of about `PASSES_IN_BUDGET` passes, or of fewer where starting them (every pass has VPLs of its own, and
-    trees) would take more than `START_SHARE` of the time; one sample, and no time to start that is known, if even that
-    takes half of the budget.
+    Aims at `PASSES_IN_BUDGET` passes, or fewer if starting them (each pass traces VPLs and builds trees) would take
+    more than `START_SHARE` of the budget. If one sample already takes half of the budget, returns one sample and an
+    unknown start of 0 s.
     """
     largest = progressive.largest_pass
     if largest < WARM_SPP:
@@ -115,11 +116,11 @@ def _samples_of_a_pass(progressive, budget, seeds):
     each = max(more, 0.01 * first) / (WARM_SPP - 1)
     start = max(first - each, 0)
     affordable = START_SHARE * budget / start if start > 0 else PASSES_IN_BUDGET
-    seconds = budget / np.clip(int(affordable), 1, PASSES_IN_BUDGET)  # of one pass
+    seconds = budget / np.clip(int(affordable), 1, PASSES_IN_BUDGET)  # per pass
     spp = int(np.clip((seconds - start) / each, 1, largest))
     for _ in range(3):
         taken = progressive.render(spp, next(seeds)).seconds
-        if taken > 1.1 * seconds:  # it may have compiled, as integrators do other things for more samples
+        if taken > 1.1 * seconds:  # may include the compilation of other kernels; repeat it
             taken = progressive.render(spp, next(seeds)).seconds
         if taken <= 1.1 * seconds:
             break

@@ -1,33 +1,33 @@
-"""How far an image is from a reference; images are (height, width, 3), errors plain numbers.
+"""Errors of images against a reference. Images are (height, width, 3), errors plain numbers.
 
-A path-traced reference has noise of its own. Where its standard error is known, the expected square of that noise is
-taken off every squared error, so that a perfect image scores zero on average; and an error that is smaller than the
-noise is named as such, because it can then no longer be told from zero.
+A path-traced reference has noise. If its standard error is known, each squared error is reduced by the expected squared
+noise, so that an exact image scores zero on average. An error below the noise of the reference is marked, because it
+cannot be distinguished from zero.
 """
 
 import flip_evaluator
 import numpy as np
 
-EPSILON = 1e-2  # added to the square of the reference in relMSE, as a fraction of the square of its mean
-TRIMMED = 1e-3  # fraction of the pixels, those with the largest errors, that trimmed relMSE leaves out
-SQUARED = ("relmse", "relmse_trimmed")  # errors whose noise falls with the samples, not with their root
+EPSILON = 1e-2  # relMSE: weight of the squared mean reference in the denominator
+TRIMMED = 1e-3  # trimmed relMSE: fraction of the pixels, with the largest errors, that is excluded
+SQUARED = ("relmse", "relmse_trimmed")  # errors proportional to the variance instead of the standard deviation
 NAMES = ("relative_l1", "rmse", "relmse", "relmse_trimmed")
 
 
 def compare(image, reference, standard_error=None):
     """Return a dict of errors of `image` against `reference`, both linear.
 
-    relative_l1     sum |x - r| / sum r; the noise is not taken off, but `noise` says what it alone would give
+    relative_l1     sum |x - r| / sum r, without noise correction
     rmse            square root of the mean of (x - r)² - se²
-    relmse          mean of ((x - r)² - se²) / (r² + EPSILON mean(r)²): scale does not matter
-    relmse_trimmed  the same without the 0.1% of pixels where (x - r)² / (r² + ...) is largest
+    relmse          mean of ((x - r)² - se²) / (r² + EPSILON mean(r)²), independent of the scale
+    relmse_trimmed  the same without the 0.1% of pixels with the largest (x - r)² / (r² + ...)
     bias            (mean x - mean r) / mean r
-    noise           the same errors (but `bias`) that an exact image would show for the reference's noise alone
-    below_noise     names of errors that cannot be told from the noise: smaller than `least`
-    bad_pixels      number of pixels that are not finite; they count as black
+    noise           the errors above (except `bias`) of an exact image against the noisy reference
+    below_noise     names of errors below the detection threshold, see `detection_threshold`
+    bad_pixels      number of non-finite pixels, which count as black
 
-    Without `standard_error` the noise is taken as zero and `below_noise` is empty. Raises ValueError if the shapes
-    differ or the reference is black.
+    Without `standard_error` the noise is zero and `below_noise` is empty. Raises ValueError if the shapes differ or the
+    reference is black.
     """
     if image.shape != reference.shape:
         raise ValueError(f"the image is {_size(image)} pixels, the reference {_size(reference)}")
@@ -42,7 +42,7 @@ def compare(image, reference, standard_error=None):
     raw, noise = squared / scale, variance / scale
     kept = _all_but_largest(raw.mean(axis=-1), TRIMMED)
 
-    totals = {  # error -> raw value, value of the noise
+    totals = {  # error -> uncorrected value, value of the noise
         "rmse": (squared.mean(), variance.mean()),
         "relmse": (raw.mean(), noise.mean()),
         "relmse_trimmed": (raw[kept].mean(), noise[kept].mean()),
@@ -51,8 +51,8 @@ def compare(image, reference, standard_error=None):
     noises = {name: of_noise for name, (_, of_noise) in totals.items()}
     errors["rmse"], noises["rmse"] = np.sqrt(errors["rmse"]), np.sqrt(noises["rmse"])
     errors["relative_l1"] = np.abs(image - reference).sum() / reference.sum()
-    noises["relative_l1"] = np.sqrt(2 / np.pi * variance).sum() / reference.sum()  # the mean of |n| for a normal n
-    below = [name for name in NAMES if errors[name] < least(name, noises)]
+    noises["relative_l1"] = np.sqrt(2 / np.pi * variance).sum() / reference.sum()  # E|n| of normal noise n
+    below = [name for name in NAMES if errors[name] < detection_threshold(name, noises)]
     errors["bias"] = (image.mean() - mean) / mean
     return {
         **{name: float(value) for name, value in errors.items()},
@@ -62,43 +62,43 @@ def compare(image, reference, standard_error=None):
     }
 
 
-def least(name, noise):
-    """Return the least error that can be told from the reference's noise, given that one's errors (a dict).
+def detection_threshold(name, noise):
+    """Return the smallest error that is distinguishable from the noise of the reference; `noise` is a dict of errors.
 
-    It is the noise itself; for relative_l1, from which that is not taken off, it is where an error adds as much to the
-    noise, in quadrature, as that has.
+    This is the noise itself. Exception: relative_l1 has no noise correction; its threshold is the quadratic sum of the
+    noise and an equal error.
     """
     return noise[name] * (np.sqrt(2) if name == "relative_l1" else 1)
 
 
 def relative_error(image, reference):
-    """Return |x - r| / (r + 1% of the mean r), (height, width), averaged over the channels: what error images show."""
-    return (np.abs(image - reference) / _floored(reference)).mean(axis=-1)
+    """Return |x - r| / (r + 1% of the mean r), (height, width), averaged over the channels, for error images."""
+    return (np.abs(image - reference) / _denominator(reference)).mean(axis=-1)
 
 
 def signed_error(image, reference):
-    """Return (x - r) / (r + 1% of the mean r), (height, width), averaged over the channels: where images are too bright
-    or too dark, whereas noise has both signs."""
-    return ((image - reference) / _floored(reference)).mean(axis=-1)
+    """Return (x - r) / (r + 1% of the mean r), (height, width), averaged over the channels. Bias has one sign in a
+    region; noise has both."""
+    return ((image - reference) / _denominator(reference)).mean(axis=-1)
 
 
-def _floored(reference):
+def _denominator(reference):
     return np.abs(reference) + EPSILON * reference.mean()
 
 
 def distance(image, reference):
-    """Return the Euclidean distance of the colours, (height, width)."""
+    """Return the Euclidean distance between colours, (height, width)."""
     return np.sqrt(np.square(np.asarray(image, np.float64) - reference).sum(axis=-1))
 
 
 def flip(image, reference):
-    """Return the map of HDR-FLIP, (height, width) from 0 to 1, its mean, and the settings it was made with (a dict).
+    """Return the HDR-FLIP map, (height, width) from 0 to 1, its mean, and its settings (a dict).
 
-    How different the two look when flipped between, over the exposures at which the reference shows something; for 67
-    pixels per degree of the eye's view. Negative values and values that are not finite count as black. The reference
-    must not be black.
+    FLIP estimates the perceived difference when alternating between two images, over all useful exposures of the
+    reference, at 67 pixels per degree of view. Negative and non-finite values count as black. The reference must not be
+    black.
     """
-    # Of images that are as dark as 1e-7 FLIP finds no exposures, and ends the process; it does not depend on the scale.
+    # FLIP is scale-invariant, but finds no exposures for images as dark as 1e-7 and then ends the process
     scale = 1 / np.mean(reference, dtype=np.float64)
     shown = [np.nan_to_num(scale * np.asarray(one, np.float64), posinf=0, neginf=0) for one in (reference, image)]
     shown = [np.clip(one, 0, np.finfo(np.float32).max).astype(np.float32) for one in shown]
@@ -108,7 +108,7 @@ def flip(image, reference):
 
 
 def _all_but_largest(values, fraction):
-    """Return a mask (height, width) that leaves out the given fraction of the values, the largest, rounded down."""
+    """Return a mask (height, width) without the given fraction (rounded down) of the largest values."""
     mask = np.ones(values.size, bool)
     count = int(fraction * values.size)
     if count:

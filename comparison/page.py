@@ -1,4 +1,4 @@
-"""The page `report.html`: one file that needs no other, and no network. Its parts lie in the folder `page`."""
+"""The page `report.html`, self-contained and usable offline. Its sources are in the folder `page`."""
 
 import base64
 import json
@@ -18,7 +18,7 @@ KINDS = {"relative": "relative error", "signed": "signed error", "distance": "di
 
 
 def render(results, pictures, reference_text):
-    """Return the page for the content of `results.json` and the `Pictures` (or None) of each of its scenes."""
+    """Return the page for the content of `results.json` and the `Pictures` (or None) of each scene."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(PARTS), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
@@ -42,42 +42,44 @@ def render(results, pictures, reference_text):
 
 
 def _scene(scene, pictures, results):
-    """Return what the template shows of a scene."""
+    """Return the template variables of a scene."""
     metric = results["metrics"]["compared"]
     labels = list(dict.fromkeys(render["label"] for render in scene["renders"]))
     shown = {"result": scene, "name": scene["name"], "error": scene.get("error"), "rows": tables.rows(scene)}
     shown |= {"views": None, "bars": None, "plots": [], "comparisons": [], "block": pictures.block if pictures else 1}
     if pictures and pictures.views:
         data = {"views": pictures.views, "exposure": pictures.exposure, "metric": plots.ERRORS[metric]}
-        shown["views"] = json.dumps(data).replace("</", "<\\/")  # "</" would end the script element that holds it
+        shown["views"] = json.dumps(data).replace("</", "<\\/")  # "</" would end the enclosing script element
         shown["has_maps"] = any(view["maps"] for view in pictures.views)
         shown["stills"] = pictures.stills
-    for cost, of in analysis.points(scene["renders"], metric):
-        are_curves = len({point.label for point in of}) < len(of)
-        if cost == "seconds" and not are_curves and len(of) > 1:
-            shown["bars"] = plots.error_bars(of, labels, metric)
+    for cost, points in analysis.points_by_cost(scene["renders"], metric):
+        are_curves = len({point.label for point in points}) < len(points)
+        if cost == "seconds" and not are_curves and len(points) > 1:
+            shown["bars"] = plots.error_bars(points, labels, metric)
         if are_curves:
-            shown["plots"].append(plots.error_against(cost, of, pareto(of), labels, metric))
+            shown["plots"].append(plots.error_against(cost, points, pareto(points), labels, metric))
         for title, table in (("equal error", tables.equal_errors), ("equal cost", tables.equal_costs)):
             if rows := table(scene, cost):
                 shown["comparisons"].append((cost, title, rows))
     shown["paper_tables"] = paper_tables.shown(scene)
-    shown["warnings"] = tables.doubts(scene)
+    shown["warnings"] = tables.scene_warnings(scene)
     counted = {render["label"] for render in scene["renders"] if render.get("rays_per_sample") is not None}
     shown["uncounted"] = [label for label in labels if label not in counted]
     return shown
 
 
 def _warnings(results):
-    """Return (name of a scene or None, sentence) of all scenes; what is said of the machine is said once."""
+    """Return (scene name or None, sentence) for all scenes; warnings on the machine appear once, without a scene."""
     renders = [render for scene in results["scenes"] for render in scene["renders"]]
-    found = [(None, sentence) for sentence in tables.busy(renders, results["machine"]["cores"])]
-    return found + [(scene["name"], sentence) for scene in results["scenes"] for sentence in tables.doubts(scene)]
+    found = [(None, sentence) for sentence in tables.load_warnings(renders, results["machine"]["cores"])]
+    return found + [
+        (scene["name"], sentence) for scene in results["scenes"] for sentence in tables.scene_warnings(scene)
+    ]
 
 
 def _summary(results):
-    """Return the table of scenes and integrators: a list of labels, rows of (scene, cells), and the cells of the means;
-    a cell is a list of (text, verdict) of error, time and bias."""
+    """Return labels, rows (scene, cells) and cells of the means of the summary table; a cell is a list of
+    (text, verdict) for error, time and bias."""
     summary = results["summary"]
     labels = list(dict.fromkeys(label for row in summary["scenes"].values() for label in row))
     rows = [
@@ -117,9 +119,9 @@ def _ratio_cell(ratio):
 
 
 def _palettes():
-    """Return colours (256 times 3 bytes, a list) of each kind of map, and the scales of the kinds."""
+    """Return, as JSON, the colours of each kind of map (256 × 3 bytes, a flat list), and the scales."""
     steps = np.linspace(0, 1, 256)
-    found = {name: _bytes(colormaps[of](steps)) for name, of in (("flip", "magma"), ("signed", "RdBu_r"))}
+    found = {name: _bytes(colormaps[scale](steps)) for name, scale in (("flip", "magma"), ("signed", "RdBu_r"))}
     found["distance"] = images.tone_map(np.repeat(steps[:, None], 3, axis=1), 1.0)
     found["relative"] = images.palette(steps)
     scales = {"range": images.ERROR_RANGE, "stored": page_images.RELATIVE_ENDS, "whitest": 1 / DISTANCE_FACTOR}
@@ -131,5 +133,5 @@ def _bytes(colours):
 
 
 def embedded(file):
-    """Return a PNG file as a data URL."""
+    """Encode a PNG file as a data URL."""
     return "data:image/png;base64," + base64.b64encode(Path(file).read_bytes()).decode()

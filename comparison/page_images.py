@@ -1,9 +1,9 @@
-"""Images in a form that the report's page can hold: small, and deep enough to change the exposure.
+"""Compact encodings of images for the report's page, with enough dynamic range for exposure changes.
 
-A colour becomes a half-precision number without its sign and with `BITS_LEFT_OUT` fewer bits: 12 bits, 14 stops below
-the white of the pictures to 16 above it, in steps of 0.8%, which no eye sees. Neighbours are subtracted, planes of high
-and of low bytes follow each other, and zlib does the rest; pixels.js undoes it. Most maps of errors have 8 bits, on
-scales wide enough for the exposure to act on them.
+A colour is a half-precision number without its sign and its last `BITS_LEFT_OUT` bits. The remaining 12 bits cover 14
+stops below to 16 stops above the white of the pictures, in invisible steps of 0.8%. Horizontal differences, split into
+planes of high and low bytes, are compressed by zlib; pixels.js decodes them. Error maps have 8 bits, on scales wide
+enough for exposure changes.
 """
 
 import base64
@@ -15,17 +15,17 @@ import numpy as np
 from . import images
 
 BITS_LEFT_OUT = 3
-RELATIVE_ENDS = (1e-4, 10.0)  # of the logarithmic scale of relative errors
-LARGEST = 2**20  # pixels; larger images are shown by the means of blocks
+RELATIVE_ENDS = (1e-4, 10.0)  # logarithmic scale of relative errors
+LARGEST = 2**20  # pixels; larger images are reduced to means of blocks
 
 
 def block_size(height, width):
-    """Return the side of the blocks of pixels that one pixel of the page shows: 1 up to `LARGEST` pixels."""
+    """Return the side of the image blocks shown as one pixel of the page: 1 up to `LARGEST` pixels."""
     return max(1, int(np.ceil(np.sqrt(height * width / LARGEST))))
 
 
 def reduce(image):
-    """Return the means over blocks, (height, width, channels), of an image; those at the right and lower edges may be
+    """Reduce an image (height, width, channels) to means of blocks; those at the right and lower edges may be
     smaller."""
     block = block_size(*image.shape[:2])
     if block == 1:
@@ -37,8 +37,8 @@ def reduce(image):
 
 
 def colours(rgb, scale):
-    """Encode linear colours, (height, width, channels), that a picture shows multiplied by `scale`; return a dict for
-    pixels.js. What is not finite or negative is black, what is too bright as bright as can be told."""
+    """Encode linear colours (height, width, channels) times `scale`; return a dict for pixels.js. Negative and
+    non-finite values become black; large values saturate."""
     limit = float(np.finfo(np.float16).max)
     scaled = np.clip(reduce(np.nan_to_num(rgb, posinf=0, neginf=0)) * scale, 0, limit)
     half = scaled.astype(np.float16).view(np.uint16)
@@ -52,7 +52,7 @@ def relative(errors):
 
 
 def signed(errors):
-    """Encode errors of both signs, (height, width), up to 100%: by their roots, so that small ones are told apart."""
+    """Encode signed errors (height, width), clipped to ±100%, by square roots, which resolve small errors."""
     errors = np.clip(_reduced(errors), -1, 1)
     return _plane(0.5 + 0.5 * np.sign(errors) * np.sqrt(np.abs(errors)))
 
@@ -63,7 +63,7 @@ def plane(values):
 
 
 def jpeg(pixels):
-    """Return an image, (height, width, 3) uint8 sRGB, as a data URL."""
+    """Encode an image (height, width, 3) uint8 sRGB as a JPEG data URL."""
     stream = mi.MemoryStream()
     mi.Bitmap(np.ascontiguousarray(reduce(pixels).astype(np.uint8))).write(stream, mi.Bitmap.FileFormat.JPEG, 85)
     return "data:image/jpeg;base64," + base64.b64encode(stream.raw_buffer()).decode()
@@ -74,12 +74,12 @@ def _reduced(values):
 
 
 def _plane(values):
-    """Encode values from 0 to 1 in 8 bits."""
+    """Encode values from 0 to 1 with 8 bits."""
     return _pack((np.clip(values, 0, 1)[..., None] * 255 + 0.5).astype(np.uint16), 1)
 
 
 def _pack(codes, depth):
-    """Return "width", "height", "channels", "depth" (bytes of a code) and "data" of codes (height, width, channels)."""
+    """Return "width", "height", "channels", "depth" (bytes per code) and "data" of codes (height, width, channels)."""
     differences = np.diff(codes, axis=1, prepend=0)  # modulo 65536
     planes = np.moveaxis(differences, -1, 0)
     content = [(planes >> shift & 255).astype(np.uint8).tobytes() for shift in (0, 8)[:depth]]

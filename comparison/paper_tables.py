@@ -1,8 +1,8 @@
-"""The tables of the papers, filled from the runs of a scene: for `results.json`, and as text for the report.
+"""The tables of the papers, filled from the runs of a scene, for `results.json` and as text for the report.
 
-`published` says which tables there are. Where runs make curves, the paper's equal errors (or equal rays) are read off:
-each setting of the first method is set beside the others where their curves have as much, between two of their
-settings. All quantities of a row are those of that one place, weighted means along logarithmic axes.
+`published` lists the tables. If the runs form curves, methods are compared at equal error or equal rays, as in the
+paper: each setting of the first method is a target, and curves of further methods are interpolated at it. All
+quantities of a row are weighted means, in logarithmic axes, of the same two settings.
 """
 
 import math
@@ -11,18 +11,18 @@ from . import analysis, metrics, tables
 from .published import PAPERS, TABLES
 from .quantities import QUANTITIES
 
-ROUNDING = 1e-9  # relative; a mean that is summed up in another order is the same number
+ROUNDING = 1e-9  # relative tolerance for means summed in another order
 
 
 def make(renders):
-    """Return the tables that the runs of a scene (see worker.run) can fill, as they stand in `results.json`: a list of
-    dicts. Runs that failed are left out, and tables without the integrators that they need."""
+    """Return the tables filled by the runs of a scene (see worker.run), a list of dicts for `results.json`. Omits
+    failed runs, and tables whose required integrators are missing."""
     good = [run for run in renders if "error" not in run]
     return [found for table in TABLES if (found := _fill(table, good))]
 
 
 def _fill(table, runs):
-    """Return one table, None if the runs cannot fill it."""
+    """Return a table, None if the runs do not fill it."""
     runs = [run for run in runs if table.method_of(run)]
     if not set(table.needed) <= {run["integrator"] for run in runs}:
         return None
@@ -44,15 +44,15 @@ def _fill(table, runs):
     }
 
 
-# --- Runs as they are ---
+# --- Runs without interpolation ---
 
 
 def _measured(table, runs):
-    """Return a dict from (label, setting) to its row, label by label: means over seeds."""
+    """Return (label, setting) -> row, grouped by label; values are means over seeds."""
     labels, found = _labels(runs), {}
     for run in sorted(runs, key=lambda run: labels.index(run["label"])):
         found.setdefault((run["label"], run["setting"]), []).append(run)
-    return {key: _mean_row(table, of) for key, of in found.items()}
+    return {key: _mean_row(table, group) for key, group in found.items()}
 
 
 def _labels(runs):
@@ -60,14 +60,14 @@ def _labels(runs):
 
 
 def _mean_row(table, runs):
-    """Return the row of a setting. Errors that the reference's noise hides are given as that noise, and are at most
-    as large."""
+    """Return the row of a setting. An error hidden by the reference's noise is replaced by that noise, an upper
+    bound."""
     values, at_most = {}, []
     for name in table.quantities:
         numbers = [QUANTITIES[name].of(run) for run in runs]
         values[name] = None if None in numbers else sum(numbers) / len(numbers)
         if name in metrics.NAMES and values[name] is not None:
-            least = sum(metrics.least(name, run["errors"]["noise"]) for run in runs) / len(runs)
+            least = sum(metrics.detection_threshold(name, run["errors"]["noise"]) for run in runs) / len(runs)
             if values[name] <= least and least > 0:
                 values[name] = least
                 at_most.append(name)
@@ -84,8 +84,8 @@ def _row(method, label, shares, values, at_most=(), beyond=False):
 
 
 def _plain_rows(table, runs):
-    """Return a row a setting. Ratios are to the row of the first method with the same setting, or to its only one;
-    there are none where seconds were given beforehand."""
+    """Return a row per setting. Ratios refer to the row of the first method with the same setting, or to its only row;
+    with a time budget there are none."""
     rows = list(_measured(table, runs).values())
     label = next((row["label"] for row in rows if row["method"] == table.methods[0].name), None)
     first = [] if any(run["budget"] for run in runs) else [row for row in rows if row["label"] == label]
@@ -95,7 +95,7 @@ def _plain_rows(table, runs):
 
 
 def _with_ratios(table, row, first):
-    """Add the ratios to the row of the first method, None where a number is not known."""
+    """Add the ratios to the row `first`; None if a number is unknown."""
     return row | {"values": row["values"] | _ratios(table, row["values"], first["values"] if first else {})}
 
 
@@ -113,13 +113,13 @@ def _ratios(table, own, first):
 
 
 def _equal_rows(table, runs):
-    """Return the rows for each setting on the curve of the first method, which come first, with those of all others;
-    [] without curves."""
+    """Return, for each setting on the curve of the first method, its row and those of the further methods; [] without
+    curves."""
     if table.equal is None:
         return []
     cost = "rays" if table.equal == "rays" else "seconds"
     first = next(run["label"] for run in runs if table.method_of(run) is table.methods[0])
-    points = dict(analysis.points(runs, table.metric))[cost]
+    points = dict(analysis.points_by_cost(runs, table.metric))[cost]
     curves = analysis.make_curves(points, [first, *(label for label in _labels(runs) if label != first)])
     several = len(curves) > 1 and any(len(curve.points) > 1 for curve in curves)
     if not several or curves[0].label != first:
@@ -132,8 +132,8 @@ def _equal_rows(table, runs):
 
 
 def _place(table, measured, curve, target, axis):
-    """Return the row of a curve where it has a cost (axis 0) or an error (axis 1)."""
-    shares = curve.between(target, axis)
+    """Return the interpolated row of a curve at a cost (axis 0) or an error (axis 1)."""
+    shares = curve.interpolation_weights(target, axis)
     parts = [measured[curve.label, name] for name in shares]
     method = measured[curve.label, curve.points[0].name]["method"]
     if not parts:
@@ -145,7 +145,7 @@ def _place(table, measured, curve, target, axis):
 
 
 def _weighted(numbers, weights):
-    """Return the weighted mean of logarithms, or of the numbers where one is zero; None if one is not known."""
+    """Return the weighted geometric mean, or the arithmetic mean if a number is zero; None if a number is unknown."""
     if None in numbers:
         return None
     if len(numbers) == 1 or min(numbers) <= 0:
@@ -153,15 +153,18 @@ def _weighted(numbers, weights):
     return math.exp(sum(math.log(number) * weight for number, weight in zip(numbers, weights, strict=True)))
 
 
-# --- What the papers say ---
+# --- Figures of the papers ---
 
 
 def _published(table, method):
-    """Return the least and largest figures of a method over the paper's scenes, ratios scene by scene included."""
+    """Return the smallest and largest figures of a method over the paper's scenes, including ratios per scene."""
     figures = {name: method.figures[name] for name in table.quantities if name in method.figures}
     scenes = max(map(len, figures.values()))
     ratios = [
-        _ratios(table, *({name: of[scene] for name, of in one.figures.items()} for one in (method, table.methods[0])))
+        _ratios(
+            table,
+            *({name: numbers[scene] for name, numbers in one.figures.items()} for one in (method, table.methods[0])),
+        )
         for scene in range(scenes)
     ]
     figures |= {name: [one[name] for one in ratios] for name in table.ratios if ratios[0][name] is not None}
@@ -175,9 +178,9 @@ def _published(table, method):
 
 
 def shown(scene):
-    """Return the tables of a scene as text: a list of dicts with "title", "reading" (how rows came about), "departures"
-    (how ours differs from the paper's), "head", "rows" (lists of cells) and "classes" of these rows:
-    "begins" where what is equal changes, "published" for the paper's, "" for others."""
+    """Return the tables of a scene as text, a list of dicts: "title", "reading" (how the rows were obtained),
+    "departures" (differences from the paper), "head", "rows" (lists of cells) and "classes" (of rows): "begins" at the
+    start of a group of equal error or rays, "published" for figures of the paper, otherwise ""."""
     described = {(table.paper, table.name): table for table in TABLES}
     return [_shown(described[entry["paper"], entry["table"]], entry) for entry in scene.get("paper_tables", [])]
 
@@ -205,19 +208,19 @@ def _class(entry, row):
 
 
 def _how_read(table, entry):
-    """Say how the rows came about."""
+    """Describe how the rows were obtained."""
     paper = (
-        f"[{table.paper}]: the figures of {PAPERS[table.paper]}, from the least to the largest of its scenes, blank "
-        "where it gives none."
+        f"[{table.paper}]: figures of {PAPERS[table.paper]}, minimum to maximum over the paper's scenes; blank: not "
+        "published."
     )
     if entry["equal"] is None:
-        ratios = " Their errors differ: ratios are not at equal error." if table.ratios else ""
-        return f"Runs as they are, means over seeds.{ratios} {paper}"
+        ratios = " The errors differ: ratios are not at equal error." if table.ratios else ""
+        return f"Single settings, means over seeds.{ratios} {paper}"
     held = "shadow rays per pixel" if entry["equal"] == "rays" else QUANTITIES[table.metric].head
     first = entry["rows"][0]["label"]
     return (
-        f"At equal {held}: each setting of {first}, and below it the others, read off between two of their settings "
-        "along logarithmic axes, never beyond the end of a curve; 'less already' is a setting that has less of it. "
+        f"At equal {held}: each setting of {first}, followed by the further methods, interpolated between two of their "
+        "settings in logarithmic axes, without extrapolation; 'less already' marks a setting with a smaller value. "
         f"{paper}"
     )
 

@@ -1,18 +1,18 @@
-"""The pictures of one scene's comparison: PNG files, and what the report's page shows."""
+"""Pictures of a scene's comparison: PNG files and the images of the report's page."""
 
 from . import images, metrics, page_images
 
-REFERENCE = "reference"  # what its picture is called
-DISTANCE_FACTOR = 16  # of the images of Euclidean distance, as in the paper on IlluminationCut
+REFERENCE = "reference"  # title of the reference picture
+DISTANCE_FACTOR = 16  # brightness of images of Euclidean distance, as in [IC]
 
 
 class Pictures:
-    """Pictures of a scene called `name`, written to `folder`.
+    """Pictures of the scene `name`, written to `folder`.
 
-    `views` is a list for the page: a dict an image with "title", "label", "image", "error" (text, "" without one),
-    "exr" (name of a file beside the page), and, if it has a reference, "maps": from the kind ("relative", "signed",
-    "distance", "flip") to what page_images.py makes of it. `stills` are (title, error, data URL), for where no scripts
-    run. The first image that is shown chooses the exposure of all, `exposure`.
+    `views` is a list of dicts for the page, one per image: "title", "label", "image", "error" (text, may be empty),
+    "exr" (file name beside the page) and "maps" (kind "relative", "signed", "distance" or "flip" -> encoding by
+    page_images.py; empty without a reference). `stills` are (title, error, data URL) for browsers without scripts. The
+    first image determines the common `exposure`.
     """
 
     def __init__(self, folder, name):
@@ -21,8 +21,8 @@ class Pictures:
         self._aovs = {}  # channel -> title -> values, (height, width)
 
     def show(self, title, label, file_name, exr, image, reference=None, flip=None, error=""):
-        """Show an image, (height, width, 3) linear, of an integrator's label (None: the reference), which is in the
-        file `exr`; if it has a reference also its errors, `flip` being the map of metrics.flip."""
+        """Add an image, (height, width, 3) linear, from the file `exr`, with the label of its integrator (None: the
+        reference). With a reference, also add its error maps; `flip` is the map of metrics.flip."""
         self.exposure = self.exposure or images.automatic_exposure(image)
         self.block = page_images.block_size(*image.shape[:2])
         pixels = images.tone_map(image, self.exposure)
@@ -43,18 +43,18 @@ class Pictures:
         self.views.append(view)
 
     def add_aovs(self, wanted, title, planes, channels):
-        """Keep those channels of an image that are AOVs out of `wanted`, until `write_aovs`."""
+        """Store the AOV channels `wanted` of an image for `write_aovs`."""
         for index, channel in enumerate(channels):
-            if channel.partition(".")[0] in wanted:  # "aov", or "aov.R" of one that is a colour
+            if channel.partition(".")[0] in wanted:  # "aov", or "aov.R" of a colour AOV
                 self._aovs.setdefault(channel, {})[title] = planes[..., index].copy()
 
     def write_aovs(self, file_names):
-        """Draw each channel on one scale for all images; `file_names` maps titles to parts of names of files. Return a
-        dict from channel to "scale" and "files" (see results.schema.json), {} if there are no channels."""
+        """Write each channel of all images as PNG files on a common scale; `file_names` maps titles to file name parts.
+        Return channel -> "scale" and "files" (see results.schema.json)."""
         shown = {}
-        for channel, of in self._aovs.items():
-            ends, files = images.logarithmic_ends(of.values()), {}
-            for title, values in of.items():
+        for channel, values_of in self._aovs.items():
+            ends, files = images.logarithmic_ends(values_of.values()), {}
+            for title, values in values_of.items():
                 files[title] = str(self.path(f"{file_names[title]}.{channel}", ".png"))
                 images.write_png(files[title], images.false_colours(values, ends))
             shown[channel] = {"scale": ends, "files": files}

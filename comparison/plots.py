@@ -10,14 +10,14 @@ from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
 from . import analysis, tables
 
-# Told apart with any kind of colour vision (Okabe and Ito); more labels begin again, with the next marker.
+# Colours by Okabe and Ito, distinguishable with all types of colour vision; after the last, the marker changes
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 MARKERS = "osD^vP"
 AXES = {"seconds": "time of the image [s]", "rays": "shadow rays per pixel"}
 ERRORS = {"relmse": "relMSE", "relmse_trimmed": "relMSE, trimmed", "rmse": "RMSE", "relative_l1": "relative L1 error"}
 STYLE = {
-    "svg.fonttype": "none",  # text stays text
-    "svg.hashsalt": "comparison",  # the same results, the same file
+    "svg.fonttype": "none",  # keeps text as text
+    "svg.hashsalt": "comparison",  # makes the file reproducible
     "font.family": "sans-serif",
     "font.size": 10,
     "axes.spines.top": False,
@@ -26,22 +26,22 @@ STYLE = {
     **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), "#010203"),
     "grid.color": "#040506",
 }
-# Colours of the page, light or dark, in place of the ones above
+# Replacements by CSS colours of the page, light or dark
 PAGE_COLOURS = {"#010203": "currentColor", "#040506": "var(--line)", "#ffffff": "var(--page)"}
 
 
 def colour(index):
-    """Return the colour of the label of an index."""
+    """Return the colour of the label with this index."""
     return COLOURS[index % len(COLOURS)]
 
 
-def error_against(cost, of, best, labels, metric):
-    """Return SVG text: error against a cost ("seconds" or "rays"), both logarithmic.
+def error_against(cost, points, best, labels, metric):
+    """Plot error against a cost ("seconds" or "rays"), both logarithmic; return SVG text, None without points.
 
-    `of` are `curves.Point`s, `best` is the set of those (label, name) that no other beats, which get a ring. Bars are
-    intervals of the means; points below the reference's noise are hollow, and in no curve. Returns None without points.
+    `points`: `curves.Point`s; `best`: the set of (label, name) on the Pareto front, marked by rings. Bars are
+    confidence intervals of the means. Points below the reference's noise are hollow and not part of a curve.
     """
-    if not of:
+    if not points:
         return None
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 4.4), layout="constrained")
@@ -50,26 +50,26 @@ def error_against(cost, of, best, labels, metric):
         axes.grid(True, which="major")
         axes.set_axisbelow(True)
         for index, label in enumerate(labels):
-            _draw(axes, index, label, [point for point in of if point.label == label], best)
+            _draw(axes, index, label, [point for point in points if point.label == label], best)
         for axis in (axes.xaxis, axes.yaxis):
             _tick(axis)
-        _name(figure, axes, of, labels, best)
+        _name(figure, axes, points, labels, best)
         if best:
             axes.plot([], [], "o", markersize=11, markerfacecolor="none", markeredgecolor="#777", label="Pareto front")
         axes.legend(frameon=False, fontsize=9)
         return _svg(figure)
 
 
-def error_bars(of, labels, metric):
-    """Return SVG text: the errors of `curves.Point`s, at most one a label, as bars with their intervals and seconds.
-    Those that the reference's noise hides are hollow, and as long as that."""
+def error_bars(points, labels, metric):
+    """Plot the errors of `curves.Point`s, at most one per label, as bars with intervals and seconds; return SVG text.
+    A bar hidden by the reference's noise is hollow and has the length of that noise."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 0.9 + 0.42 * len(of)), layout="constrained")
+        figure = Figure(figsize=(6.4, 0.9 + 0.42 * len(points)), layout="constrained")
         FigureCanvasSVG(figure)
         axes = figure.add_subplot(xlabel=ERRORS[metric])
         axes.grid(True, axis="x")
         axes.set_axisbelow(True)
-        for row, point in enumerate(of):
+        for row, point in enumerate(points):
             seconds, error = analysis.spread_of(point)
             own, bound = colour(labels.index(point.label)), point.bound()
             length, face = (bound[1], "white") if bound else (error["mean"], own)
@@ -78,7 +78,7 @@ def error_bars(of, labels, metric):
             text = f"{'< ' if bound else ''}{tables.number(length)}, {tables.number(seconds['mean'])} s"
             end = length if bound or error["high"] is None else error["high"]
             axes.annotate(text, (end, row), xytext=(5, 0), textcoords="offset points", va="center", fontsize=9)
-        axes.set_yticks(range(len(of)), [f"{point.label} {point.name}".strip() for point in of])
+        axes.set_yticks(range(len(points)), [f"{point.label} {point.name}".strip() for point in points])
         axes.tick_params(axis="y", length=0)
         axes.invert_yaxis()
         axes.margins(x=0.28)
@@ -86,11 +86,11 @@ def error_bars(of, labels, metric):
         return _svg(figure)
 
 
-def _draw(axes, index, label, of, best):
+def _draw(axes, index, label, points, best):
     style = {"color": colour(index), "marker": MARKERS[index // len(COLOURS) % len(MARKERS)], "linestyle": "none"}
-    for curve in analysis.make_curves(of, [label]):
+    for curve in analysis.make_curves(points, [label]):
         axes.plot(*curve.front(), color=style["color"], linewidth=1.6, label=label)
-    for point in of:
+    for point in points:
         x, y = analysis.spread_of(point)
         if x["mean"] <= 0 or y["mean"] <= 0:
             continue
@@ -103,11 +103,11 @@ def _draw(axes, index, label, of, best):
             axes.plot(x["mean"], y["mean"], "o", markersize=11, markerfacecolor="none", markeredgecolor="#777")
 
 
-def _name(figure, axes, of, labels, best):
-    """Write beside points which setting they are, those of the Pareto front first, where there is room for it."""
+def _name(figure, axes, points, labels, best):
+    """Annotate points with their settings where space permits, starting with the Pareto front."""
     figure.draw_without_rendering()
     taken = []
-    for point in sorted(of, key=lambda point: (point.label, point.name) not in best):
+    for point in sorted(points, key=lambda point: (point.label, point.name) not in best):
         mean = point.mean()
         if not point.name or mean is None:
             continue
@@ -129,7 +129,7 @@ def _bars(spread):
 
 
 def _tick(axis):
-    """Label powers of ten, and in short ranges their multiples."""
+    """Label powers of ten; in ranges below two decades, also their multiples by 2 and 5."""
     low, high = axis.get_view_interval()
     if high / low < 100:
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -140,7 +140,7 @@ def _tick(axis):
 
 
 def _svg(figure):
-    """Return a figure as an SVG element to put into a page."""
+    """Return a figure as an SVG element for embedding in a page."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     content = buffer.getvalue()

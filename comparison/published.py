@@ -1,9 +1,8 @@
-"""The result tables of the papers whose methods are compared, with the figures that they report, as data.
+"""Result tables of the papers whose methods are compared, with their published figures.
 
-Only tables that runs of a comparison can fill are here; `paper_tables` fills them. Figures are those of the paper's
-scenes, in its order. Left out are pictures ([IC] Table 2), how many emitters a pixel sees ([IAS] Table 5), which no
-integrator counts, regions of pixels ([IAS] Table 4), which `adaptivedirect` does without, and
-numbers of triangles and emitters, which say nothing about a method.
+`paper_tables` fills the tables with runs. Figures are listed by the paper's scenes, in the paper's order. Omitted are
+pictures ([IC] Table 2), emitters visible to a pixel ([IAS] Table 5; not counted by the integrators), regions of pixels
+([IAS] Table 4; absent in `adaptivedirect`), and numbers of triangles and emitters, which do not depend on a method.
 """
 
 from .published_table import Method, Ratio, Table
@@ -41,11 +40,10 @@ _IC = {
     "metric": "rmse",
 }
 _IC_DEPARTURES = (
-    "The paper's images have 1600 × 1200 pixels and are made on 20 cores, with about 650 000 VPLs. Its "
-    "errors are against the image of all these lights (as with --reference vpl), ours against this run's reference. "
-    "lights: to trace them and to build their trees, in the paper the trees alone; render: all else. How the paper "
-    "normalises its RMSE it does not say; so none is set beside ours. Its relative error is a mean over pixels, our "
-    "rel. L1 is sum |x - r| / sum r."
+    "Paper: 1600 × 1200 pixels, 20 cores, about 650 000 VPLs. The paper's errors are relative to the image of all VPLs "
+    "(as with --reference vpl), ours to the reference of this run. lights: tracing VPLs and building light trees "
+    "(paper: trees only); render: all further work. The paper does not state the normalization of its RMSE, so its "
+    "RMSE is omitted. The paper's relative error is a mean over pixels, our rel. L1 is sum |x - r| / sum r."
 )
 
 
@@ -93,7 +91,7 @@ _ILLUMINATION_CUT = (
     ),
     Table(
         name="Table 3",
-        title="errors that cannot be seen (an error of 0.2% or less)",
+        title="imperceptible errors (an error of 0.2% or less)",
         # LightSlice has no such bound
         takes=lambda run: run["integrator"] == "lightslice" or run["parameters"].get("error", 1) <= 0.002,
         methods=(  # Banquet alone
@@ -109,7 +107,7 @@ _ILLUMINATION_CUT = (
     Table(
         paper="IC",
         name="Table 4",
-        title="Lightcuts with a largest cut",
+        title="Lightcuts with a maximum cut size",
         takes=lambda run: run["parameters"].get("max_cut", 0) > 0,
         methods=(
             _lightcuts(
@@ -120,7 +118,7 @@ _ILLUMINATION_CUT = (
         ),
         needed=("lightcuts",),
         quantities=("render_seconds", "columns", "rmse", "relative_l1"),
-        departures="Runs that were given a max_cut; there is one by default, too (1000). " + _IC_DEPARTURES,
+        departures="Runs with an explicit max_cut (default: 1000). " + _IC_DEPARTURES,
     ),
     Table(
         paper="IC",
@@ -133,7 +131,7 @@ _ILLUMINATION_CUT = (
         ),
         needed=_IC["needed"],
         quantities=("lights", "points", "memory"),
-        departures="Ours is that of the whole process, with scene, image and compiled kernels.",
+        departures="Our peak memory covers the whole process, including scene, image and compiled kernels.",
     ),
     Table(
         name="Table 6",
@@ -166,7 +164,7 @@ _ILLUMINATION_CUT = (
             ),
         ),
         quantities=("light_seconds", "render_seconds", "rays", "bounds", "columns", "rmse", "relative_l1"),
-        departures="The paper takes 9 samples per pixel. " + _IC_DEPARTURES,
+        departures="Paper: 9 samples per pixel. " + _IC_DEPARTURES,
         **_IC,
     ),
 )
@@ -177,8 +175,8 @@ _ILLUMINATION_CUT = (
 _IAS = {"paper": "IAS", "needed": ("unoccludeddirect", "adaptivedirect")}
 _IAS_EQUAL = {"equal": "error", "metric": "relmse_trimmed", "curves_only": True}
 _IAS_DEPARTURES = (
-    "The paper's images have 1024 × 1024 pixels and are made on two processors of 1.7 GHz. They have the same quality "
-    "by the rule that ends a pixel (our parameter error), not by an error that was measured."
+    "Paper: 1024 × 1024 pixels, two processors of 1.7 GHz. The paper equates quality by the stopping rule of pixels "
+    "(our parameter error), not by a measured error."
 )
 _REFERENCE_SECONDS, _ADAPTIVE_SECONDS = (15364, 68392, 53328, 57432), (1726, 8368, 5604, 7136)
 _REFERENCE_RAYS, _ADAPTIVE_RAYS = (1870, 9916, 10772, 6048), (278, 1604, 1290, 1012)
@@ -223,14 +221,14 @@ _ADAPTIVE_SAMPLING = (
     ),
     Table(
         name="Tables 2 and 3, same rule",
-        title="adaptive sampling and its reference method, pixels ended by the same rule",
+        title="adaptive sampling and its reference method with the same stopping rule",
         methods=(
             _unoccluded(seconds=_REFERENCE_SECONDS, rays=_REFERENCE_RAYS),
             _adaptive(seconds=_ADAPTIVE_SECONDS, rays=_ADAPTIVE_RAYS),
         ),
         quantities=("seconds", "rays", "relmse_trimmed"),
         ratios={"speed_up": _TIMES_FASTER, "fewer_rays": _TIMES_FEWER_RAYS},
-        departures="Ratios are between runs of one setting, as in the paper. " + _IAS_DEPARTURES,
+        departures="Ratios compare runs of the same setting, as in the paper. " + _IAS_DEPARTURES,
         **_IAS,
     ),
     Table(
@@ -240,8 +238,8 @@ _ADAPTIVE_SAMPLING = (
         methods=(_adaptive(passes=(2.7, 4.5, 3.3, 5.5), clusters=(24.4, 24.4 + 175, 47.6 + 164, 81.0)),),
         needed=("adaptivedirect",),
         quantities=("passes", "clusters", "rays", "relmse_trimmed"),
-        departures="Means over gather points, the paper's passes over pixels. Clusters are those of emitters and of "
-        "regions of an environment together, also where a point's light is summed over all emitters instead.",
+        departures="Means over gather points (paper: passes per pixel). Clusters include clusters of emitters and of "
+        "environment regions, also for points whose direct light is summed over all emitters.",
     ),
 )
 
@@ -261,12 +259,12 @@ _MSR = {
     "metric": "relative_l1",
 }  # fmt: skip
 _MSR_DEPARTURES = (
-    "The paper's images have 1600 × 1200 or 1920 × 1080 pixels with 4 samples, a million VPLs, and are made "
-    "with 16 threads. Its errors are against the image of all these lights (as with --reference vpl), ours against the "
-    "reference of this run. columns or cut: a mean over samples, in the paper the most that there may be. choosing: "
-    "slices, columns and prediction of matrixrecovery (the paper's matrix generation); slices, rows and columns of "
-    "LightSlice (its clustering). separation: with the light without shadows, and the correction. render: all but "
-    "lights and their trees. sampling rate: shadow rays over entries of all matrices."
+    "Paper: 1600 × 1200 or 1920 × 1080 pixels with 4 samples, a million VPLs, 16 threads. The paper's errors are "
+    "relative to the image of all VPLs (as with --reference vpl), ours to the reference of this run. columns or cut: "
+    "mean over samples (paper: maximum). choosing: slices, columns and prediction of matrixrecovery (paper: matrix "
+    "generation); slices, rows and columns of LightSlice (paper: clustering). separation: including unoccluded light "
+    "and correction. render: everything except VPLs and light trees. sampling rate: shadow rays over entries of all "
+    "matrices."
 )
 _RECOVERY = Method(
     "matrix recovery",
@@ -288,7 +286,7 @@ def _multidimensional(**figures):
 
 
 def _matrix_slices(gathering, **figures):
-    """LightSlice, whose clustering is the same at equal error and at equal rays; `gathering` follows it, in seconds."""
+    """LightSlice with the common clustering time of equal error and equal rays, followed by `gathering` seconds."""
     clustering = (71, 39, 61, 57)
     whole = tuple(map(sum, zip(clustering, gathering, strict=True)))
     slices = (3147, 1492, 2742, 2655)
@@ -298,7 +296,7 @@ def _matrix_slices(gathering, **figures):
 _MATRIX_RECOVERY = (
     Table(
         name="Table 1, equal quality",
-        title="matrix recovery, and others with the same error",
+        title="matrix recovery and further methods at equal error",
         methods=(
             _RECOVERY,
             _multidimensional(
@@ -321,7 +319,7 @@ _MATRIX_RECOVERY = (
     ),
     Table(
         name="Table 1, equal rays",
-        title="matrix recovery, and others with as many shadow rays per pixel",
+        title="matrix recovery and further methods with equal shadow rays per pixel",
         methods=(
             _RECOVERY,
             _multidimensional(

@@ -1,4 +1,4 @@
-"""Description of a table of a paper: its methods with their published figures, its columns, which runs fill it."""
+"""Description of a paper's table: methods with their published figures, columns, selection of runs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Method:
-    """A method of a paper: what it is called there, our integrator, with which parameters that one is this method, and
-    the paper's figures, a dict from names of `quantities.QUANTITIES` to numbers, one a scene."""
+    """Method of a paper: its name there, the corresponding integrator and parameters, and the published `figures`: name
+    in `quantities.QUANTITIES` -> numbers, one per scene."""
 
     name: str
     integrator: str
@@ -15,14 +15,14 @@ class Method:
     parameters: dict = field(default_factory=dict)
 
     def made(self, run):
-        """Return whether a run is of this method."""
+        """Return whether a run used this method."""
         return run["integrator"] == self.integrator and self.parameters.items() <= run["parameters"].items()
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """A column that compares a quantity with that of the table's first method: how many times less it is than that, or,
-    not `less`, how many times as much."""
+    """Column with the ratio of a quantity between a row and the first method: first over row if `less`, else row over
+    first."""
 
     head: str
     quantity: str
@@ -31,14 +31,17 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Table:
-    """A table: its paper and name, such as "IC" and "Table 1", and its title; its methods, of which the first is what
-    others are compared with; the integrators without which it makes no sense; its columns, quantities and then ratios
-    (by name); how ours departs from the paper's, in sentences; and
+    """Table of a paper.
 
-    `takes`        which runs it is about, a function of a run's result
-    `equal`        what methods have in common, where runs make curves to read it off: "error", "rays", or None
-    `metric`       the error that is then equal, or that is read off
-    `curves_only`  whether there is no such table without curves
+    `paper`, `name`  such as "IC" and "Table 1"
+    `methods`        the first is the base of comparisons
+    `needed`         integrators that must have runs
+    `quantities`     columns, followed by the columns of `ratios` (by name)
+    `departures`     differences from the paper's measurements, in sentences
+    `takes`          predicate that selects runs by their results
+    `equal`          the quantity held equal if runs form curves: "error", "rays", or None
+    `metric`         the error held equal or interpolated
+    `curves_only`    whether the table requires curves
     """
 
     paper: str
@@ -55,7 +58,7 @@ class Table:
     curves_only: bool = False
 
     def method_of(self, run):
-        """Return the method that a run is of, None if it is no part of this table; of several, the one that more
-        parameters say."""
+        """Return the method of a run, None if the run does not belong to this table. Among several matches, the method
+        with the most parameters wins."""
         made = [method for method in self.methods if method.made(run)] if self.takes(run) else []
         return max(made, key=lambda method: len(method.parameters), default=None)

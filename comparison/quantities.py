@@ -1,6 +1,6 @@
-"""Quantities in the tables of the papers, by name: how each quantity follows from the result of a run (see worker.run).
+"""Quantities in the tables of the papers, by name, as functions of the result of a run (see worker.run).
 
-Shadow rays and upper bounds are those per pixel, of all its samples; seconds are those of all passes in the image.
+Shadow rays and upper bounds count all samples of a pixel; seconds count all passes of the image.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from vpl.core.stages import Stage
 
 from . import analysis
 
-# What is made before a method begins: VPLs and their trees
+# Preparation before a method starts: VPLs and light trees
 LIGHT_STAGES = (Stage.TRACE, Stage.LIGHTS, Stage.TREE)
 CHOOSING_STAGES = {
     "matrixrecovery": (Stage.SLICES, Stage.INITIAL_CUT, Stage.COLUMNS, Stage.PREDICTION),
@@ -21,8 +21,8 @@ SEPARATION_STAGES = (Stage.SHADING, Stage.SEPARATION, Stage.CORRECTION)
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column of a table: its head, a function from a run's result to a number (None if it is not known of that run),
-    and whether the number is shown in percent."""
+    """Column of a table: its head, a function from the result of a run to a number (None: unknown), and whether it is
+    shown as a percentage."""
 
     head: str
     of: Callable
@@ -38,7 +38,7 @@ def _per_pixel(name):
 
 
 def _ratio(over, under):
-    """Return a function to the ratio of two counters."""
+    """Return a function that computes the ratio of two counters."""
 
     def of(run):
         above, below = (run["statistics"].get(name) for name in (over, under))
@@ -48,7 +48,7 @@ def _ratio(over, under):
 
 
 def _stages(run, names):
-    """Return the seconds of some stages, None for a method that has none of them."""
+    """Return the total seconds of some stages, None if the method has none of them."""
     spent = [seconds for name, seconds in run["statistics"].get("seconds", {}).items() if name in names]
     return sum(spent) if spent else None
 
@@ -63,7 +63,7 @@ def _light_count(run):
 
 
 def _per_pass(name):
-    """Return a function to a counter of what every pass has of its own: counters of passes are added up."""
+    """Return a function that computes the mean of a counter over passes."""
 
     def of(run):
         count = run["statistics"].get(name)

@@ -1,4 +1,4 @@
-"""Files of a comparison: the table, `results.json` and `report.html`. results.schema.json documents the second."""
+"""Files of a comparison: tables as text, `results.json` (see results.schema.json) and `report.html`."""
 
 import json
 from datetime import UTC, datetime
@@ -6,12 +6,11 @@ from pathlib import Path
 
 from . import images, machine, metrics, page, paper_tables, tables, verdict
 
-FORMAT = 2  # of results.json; rises with changes that old readers would not understand
+FORMAT = 2  # of results.json; incremented by incompatible changes
 
 
 def describe(command, options, scenes, complete):
-    """Return the content of `results.json` for the results (dicts) of some scenes; `complete` says that none is left
-    to do."""
+    """Return the content of `results.json` for the results (dicts) of scenes; `complete`: no runs are pending."""
     return {
         "format": FORMAT,
         "command": command,
@@ -28,7 +27,7 @@ def describe(command, options, scenes, complete):
 
 
 def text(scene):
-    """Return a scene's results as tables in plain text."""
+    """Return the results of a scene as plain-text tables."""
     parts = [f"{scene['name']}: FAILED: {scene['error']}"] if "error" in scene else []
     rows = tables.rows(scene)
     if not rows:
@@ -41,7 +40,7 @@ def text(scene):
         ("error at equal time", tables.equal_costs(scene, "seconds")),
     ):
         if table:
-            parts += ["", f"{title} (in brackets: how many times better than {table[0][1]}, 95% interval)"]
+            parts += ["", f"{title} (in brackets: improvement factor over {table[0][1]}, 95% interval)"]
             parts.append(tables.text(table))
     for table in paper_tables.shown(scene):
         parts += ["", table["title"], tables.text([table["head"], *table["rows"]]), table["reading"]]
@@ -50,7 +49,7 @@ def text(scene):
 
 
 def reference_text(scene):
-    """Say in a few words what a scene's images were compared with."""
+    """Describe the reference of a scene in a few words."""
     reference = scene.get("reference")
     if reference is None:
         return "vpl, with the same VPLs" if any(map(_has_vpl, scene["renders"])) else "none"
@@ -63,20 +62,19 @@ def reference_text(scene):
 
 
 def _limit_text(scene):
-    """Say where a reference was wanted that has less noise than it was allowed to get; empty where it has."""
+    """Return a note if --reference-limit stopped the reference above its permitted noise, else an empty text."""
     if not any("errors" in render for render in scene["renders"]) or "reference_fraction" not in scene:
         return ""
     share = scene["reference_share"]
     if share is None:
-        return "; stopped at --reference-limit, its noise being larger than an error"
+        return "; stopped at --reference-limit with noise larger than an error"
     if share > scene["reference_fraction"]:
-        return f"; stopped at --reference-limit, its noise being up to {share:.0%} of an error"
+        return f"; stopped at --reference-limit with noise up to {share:.0%} of an error"
     return ""
 
 
 def write(folder, results, pictures):
-    """Write `results.json` and `report.html` to a folder. `pictures` are the `Pictures` of each scene of `results`,
-    None for those that have none."""
+    """Write `results.json` and `report.html` to a folder. `pictures`: the `Pictures` (or None) of each scene."""
     folder = Path(folder)
     with images.replacing(folder / "results.json") as file:
         file.write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")

@@ -1,8 +1,8 @@
-"""Finished runs, kept on disk so that a comparison which was interrupted or killed can go on where it stopped.
+"""Finished runs on disk, so that an interrupted comparison can resume.
 
-A run is recognised by all that its image and its seconds depend on: the job, the scene with all files that it names,
-the versions of the software, the sources of this project, and the machine. Its image is written first, then, renamed
-into place, the file that says that it is finished.
+The key of a run covers everything that its image and time depend on: job, scene with all referenced files, software
+versions, sources of this project, and machine. A run's image is written first; then the result file, which marks the
+run as finished, is moved into place.
 """
 
 import fcntl
@@ -17,46 +17,38 @@ from . import images
 from .command_line import UsageError
 
 FOLDER = "runs"
-NOT_OF_THE_RUN = (
-    "label",
-    "output",
-    "run",
-    "scene",
-    "kernel_cache",
-    "vpl_folder",
-    "denoised_output",
-)  # where files are, and names
+IRRELEVANT = ("label", "output", "run", "scene", "kernel_cache", "vpl_folder", "denoised_output")  # paths and names
 
 
 class Runs:
-    """The finished runs of an output folder, which is this process's alone. `made_by` is what, besides jobs and scenes,
-    they depend on (a dict)."""
+    """Finished runs of an output folder owned by this process. `made_by` (a dict): dependencies of all runs besides job
+    and scene."""
 
     def __init__(self, out, made_by):
         self.folder, self._made_by = Path(out) / FOLDER, made_by
         self.kernels = self.folder / "kernels"
         self.folder.mkdir(parents=True, exist_ok=True)
-        # What a comparison that was killed left behind:
-        self.forget_kernels()
+        # Remnants of a killed comparison
+        self.remove_kernels()
         for folder in (out, self.folder):
             images.remove_abandoned(folder)
 
     def key(self, job, scene_hash):
-        """Return what a run is recognised by: 32 hexadecimal digits."""
-        described = {key: value for key, value in asdict(job).items() if key not in NOT_OF_THE_RUN}
+        """Return the key of a run: 32 hexadecimal digits."""
+        described = {key: value for key, value in asdict(job).items() if key not in IRRELEVANT}
         described |= {"with_vpl": job.vpl_folder is not None, "denoised": job.denoised_output is not None}
         described |= {"hash": scene_hash, **self._made_by}
         return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:32]
 
     def find(self, job):
-        """Return the result of the run `job.run`, or None if it was not finished or its images are no longer there."""
+        """Return the result of the run `job.run`, None if it is unfinished or its images are missing."""
         try:
             result = json.loads(self._file(job.run).read_text())
         except FileNotFoundError:
             return None
-        except ValueError:  # a disk that was full, or a hand that edited: the run is made again
+        except ValueError:  # truncated by a full disk, or edited: repeat the run
             return None
-        # Other settings may have written their image to the same place since.
+        # Another setting may have overwritten the image since
         if _run_of(job.output) != job.run or (result["vpl_output"] and not Path(result["vpl_output"]).is_file()):
             return None
         if job.denoised_output and _run_of(job.denoised_output) != job.run:
@@ -65,12 +57,12 @@ class Runs:
         return result | files | {"label": job.label, "scene": job.scene}
 
     def save(self, result):
-        """Keep the result of a run that went well."""
+        """Save the result of a successful run."""
         with images.replacing(self._file(result["run"])) as temporary:
             temporary.write_text(json.dumps(result, indent=1))
 
-    def forget_kernels(self):
-        """Remove compiled kernels; `kernels` is a folder for those of this comparison, each label with its own."""
+    def remove_kernels(self):
+        """Remove the folder `kernels` of compiled kernels, one subfolder per label."""
         shutil.rmtree(self.kernels, ignore_errors=True)
 
     def _file(self, key):
@@ -78,7 +70,7 @@ class Runs:
 
 
 def _run_of(file):
-    """Return which run wrote an EXR file, None if that cannot be told."""
+    """Return the run that wrote an EXR file, None if unknown."""
     try:
         return images.read_exr_metadata(file).get("run")
     except (OSError, RuntimeError, ValueError):
@@ -87,8 +79,8 @@ def _run_of(file):
 
 @contextmanager
 def locked(file, complaint=None):
-    """Hold a lock, the existence of which is of no importance, on a file. Waits for it, or raises UsageError with the
-    `complaint` if one is given."""
+    """Hold a lock on a file, whose existence has no meaning. Waits for the lock; with a `complaint`, raises UsageError
+    instead."""
     with open(file, "w") as handle:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | (fcntl.LOCK_NB if complaint else 0))

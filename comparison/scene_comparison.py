@@ -1,4 +1,4 @@
-"""Compare integrators on one scene: reference, renders in processes of their own, errors, curves, pictures."""
+"""Comparison of integrators on a scene: reference, runs in separate processes, errors, curves, pictures."""
 
 import math
 from pathlib import Path
@@ -11,17 +11,16 @@ from .pictures import REFERENCE, Pictures
 from .scene_files import SceneFile, short_name
 from .sweeps import order
 
-FIRST_SPP = 64  # of a reference that is continued until its noise is small enough
-GROWTH = (1.2, 4.0)  # least and largest factor by which it is continued at a time
+FIRST_SPP = 64  # initial samples of an automatic reference
+GROWTH = (1.2, 4.0)  # minimum and maximum factor of its refinement steps
 
 
 class SceneComparison:
-    """The comparison on one scene: `settings` (label -> list of `sweeps.Setting`) with each of `options.seeds`.
+    """Comparison on one scene: `settings` (label -> list of `sweeps.Setting`) with each of `options.seeds`.
 
-    `options` are those of compare.py's command line, `store` keeps finished runs (`runs.Runs`), `progress` is told what
-    is done (`progress.Progress`). `result` is the scene's part of `results.json`, complete after `finish`; `pictures`
-    are then those to show. `runner` makes the runs: `worker`, in processes of this machine, or
-    `cluster.runs.DistributedRuns`.
+    `options`: the command line of compare.py; `store`: finished runs (`runs.Runs`); `progress`: receives the progress
+    (`progress.Progress`); `runner`: `worker` (processes of this machine) or `cluster.runs.DistributedRuns`. After
+    `finish`, `result` is the complete entry of the scene in `results.json`, and `pictures` are ready.
     """
 
     def __init__(self, path, settings, options, store, progress, runner=worker):
@@ -31,8 +30,8 @@ class SceneComparison:
         self.result = {"scene": str(path), "name": short_name(path), "renders": []}
 
     def prepare(self):
-        """Read the scene, get the reference that it begins with, and tell a runner that makes several runs at once
-        which are to come. What fails is recorded. What is done already is not done again."""
+        """Parse the scene and load the first reference; announce the runs to a distributed runner. Records a failure.
+        Repeated calls have no effect."""
         if "hash" in self.result or "error" in self.result:
             return
         try:
@@ -41,7 +40,7 @@ class SceneComparison:
             self._reference = self._first_reference(file)
             if self._runner is not worker:
                 self._expect_runs()
-        except Exception as error:  # whatever it is, it must not lose the other scenes
+        except Exception as error:  # of any kind: the comparison continues with the next scene
             self._fail(error)
 
     def _expect_runs(self):
@@ -51,7 +50,7 @@ class SceneComparison:
                 self._runner.expect(job, SceneFile(self.path, dict(self.options.define)))
 
     def run(self):
-        """Make all runs. What fails is recorded, and the others go on."""
+        """Make all runs. Records failures and continues."""
         if "error" in self.result:
             return
         for setting, seed in order(self.settings, self.options.seeds):
@@ -63,7 +62,7 @@ class SceneComparison:
                 self._fail(error)
 
     def finish(self):
-        """Measure the errors of all runs that there are, and make curves and pictures. What fails is recorded."""
+        """Compute the errors of all finished runs, curves and pictures. Records failures."""
         if "hash" not in self.result:
             return
         try:
@@ -85,7 +84,7 @@ class SceneComparison:
                 self._assess(result)
             except Exception as error:
                 result |= failure(error)
-        names = {setting.title: setting.file_name for of in self.settings.values() for setting in of}
+        names = {setting.title: setting.file_name for group in self.settings.values() for setting in group}
         if aovs := self.pictures.write_aovs(names):
             self.result["aovs"] = aovs
         self.result |= analysis.analyse(self.result["renders"], labels, self.options.metric)
@@ -104,7 +103,7 @@ class SceneComparison:
         return file
 
     def _first_reference(self, file):
-        """Return the reference, or None if each image has one of its own."""
+        """Return the reference; None if each image is compared with an image by `vpl`."""
         wanted = self.options.reference
         if wanted.kind == "vpl":
             return None
@@ -112,7 +111,7 @@ class SceneComparison:
             return self._path_traced(wanted.spp or FIRST_SPP)
         reference = references.read(wanted.file_of(file.name))
         depth, known = file.integrator[1].get("max_depth", -1), reference.description.get("max_depth")
-        # Some programs write no attributes but text
+        # Some programs write all attributes as text
         if known not in (None, depth, str(depth)):
             raise ValueError(f"the reference has max_depth {known}, the scene {depth}; try --max-depth {known}")
         return reference
@@ -122,21 +121,21 @@ class SceneComparison:
             return references.path_traced(self._parse(), spp, self.options.cache)
 
     def _refine_reference(self):
-        """Continue the reference until its noise is at most the wanted fraction of the smallest error of any run, or
-        the limit of samples is reached."""
+        """Continue the reference until its noise is at most the permitted fraction of the smallest error, or until the
+        limit of samples."""
         wanted = self.options.reference
         while True:
             spp, share = self._reference.description["spp"], self._noise_share()
             if share is None or share <= wanted.fraction or spp >= self.options.reference_limit:
-                told = None if share == np.inf else share  # JSON has no infinity
-                self.result |= {"reference_share": told, "reference_fraction": wanted.fraction}
+                finite = None if share == np.inf else share  # JSON has no infinity
+                self.result |= {"reference_share": finite, "reference_fraction": wanted.fraction}
                 return
             growth = np.clip((share / wanted.fraction) ** 2, *GROWTH)
             self._reference = self._path_traced(min(self.options.reference_limit, math.ceil(spp * growth)))
 
     def _noise_share(self):
-        """Return the largest share that the reference's noise has in the error of a run, infinite where it hides one
-        altogether, None if there are no runs. Shares of squared errors are given as those of their roots."""
+        """Return the largest ratio of the reference's noise to the error of a run: infinite if an error is hidden, None
+        without runs. For squared errors this is the ratio of their roots."""
         metric, shares = self.options.metric, []
         for result in self._finished():
             errors = self._errors(images.colour(*images.read_exr(result["output"])[:2]), self._reference)
@@ -168,7 +167,7 @@ class SceneComparison:
             self.result["renders"].append(_denoised(result))
 
     def _keep(self, result):
-        """Keep the result of a run that went well; one that cannot be kept has failed."""
+        """Save the result of a successful run; failure to save fails the run."""
         if "error" not in result:
             try:
                 self._store.save(result)
@@ -177,7 +176,7 @@ class SceneComparison:
 
     def _job(self, setting, seed):
         options, name = self.options, self.result["name"]
-        # Mitsuba's own integrators have no VPLs to share, nor has `manylights`, whose lights are others.
+        # `vpl` cannot share the lights of Mitsuba's integrators, which have none, or of `manylights`
         shares = setting.integrator in own_integrators() and setting.integrator != "manylights"
         with_vpl = options.reference.kind == "vpl" and shares
         of_seed = f".seed{seed}" if len(options.seeds) > 1 else ""
@@ -192,7 +191,7 @@ class SceneComparison:
             vpl_folder=str(options.out) if with_vpl else None,
             variant=options.mode,
             defines=dict(options.define),
-            # Its width is the reference's, unless given: then a difference is an error.
+            # Defaults to the width of the reference; a width given by the user must match, or the comparison fails
             width=options.width or (self._reference.size[0] if self._reference else None),
             max_depth=options.max_depth,
             seed=seed,
@@ -212,7 +211,7 @@ class SceneComparison:
     # --- Errors and pictures ---
 
     def _assess(self, result):
-        """Add the errors of a run to its result; show the first seed's image."""
+        """Add the errors of a run to its result; add the image of the first seed to the pictures."""
         planes, channels, _ = images.read_exr(result["output"])
         image = images.colour(planes, channels).astype(np.float64)
         reference = references.read(result["vpl_output"]) if result["vpl_output"] else self._reference
@@ -222,7 +221,7 @@ class SceneComparison:
             flip, result["errors"]["flip"], result["errors"]["flip_settings"] = metrics.flip(image, reference.image)
             error = tables.error([result["errors"]], self.options.metric, ".3g")
         if result["seed"] == self.options.seeds[0]:
-            title = f"{result['label']} {result['setting']}".strip()
+            title = tables.title(result)
             file_name = Path(result["output"]).name[len(self.result["name"]) + 1 : -len(".exr")]
             file_name = file_name.removesuffix(f".seed{result['seed']}")
             self.pictures.show(
@@ -241,12 +240,12 @@ class SceneComparison:
 
 
 def denoised_label(label):
-    """Return what the denoised images of a label are called."""
+    """Return the label of the denoised images of a label."""
     return f"{label}, denoised"
 
 
 def _denoised(result):
-    """Return the result of a run as that of its denoised image, which takes a little longer."""
+    """Return the result of the denoised image of a run, with the time of denoising added."""
     cold = result["cold_seconds"]
     return result | {
         "label": denoised_label(result["label"]),

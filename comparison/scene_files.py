@@ -1,7 +1,7 @@
-"""Scene files: parse, change the integrator or the size of the image, fingerprint and load.
+"""Parse scene files, change integrator or image size, compute fingerprints, load scenes.
 
-The work is Mitsuba's own parser's, which substitutes `$parameters` and follows includes; changes are made to its nodes
-before any object is created, so a scene may name an integrator that is replaced before it could be missed.
+Mitsuba's parser substitutes `$parameters` and resolves includes. Changes apply to the parsed nodes before objects are
+created; a scene may therefore name an integrator that does not exist here, if it is replaced.
 """
 
 import hashlib
@@ -11,29 +11,28 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-# What a scene is looked at by
+# Object types of the camera
 _OF_CAMERA = ("Sensor", "Film", "Sampler", "ReconstructionFilter")
-# What a replaced integrator hands on to its successor: it says which light is to be shown, not how it is computed.
+# Parameters that a new integrator inherits: they select light paths, not an algorithm
 KEPT_PARAMETERS = ("max_depth", "rr_depth", "hide_emitters")
 # Names of string properties that plugins of Mitsuba 3.9 open as files: bitmap, envmap, gridvolume, measured,
 # measured_polarized, obj, ply, serialized, sdfgrid, bsplinecurve, linearcurve, ellipsoids and ellipsoidsmesh. None has
 # another such property; those of sunsky are part of Mitsuba.
 FILE_PROPERTIES = ("filename",)
-GIVEN_TO_RENDER = ("sample_count", "seed")  # instead of what the sampler says
+GIVEN_TO_RENDER = ("sample_count", "seed")  # sampler parameters overridden by each render
 
 
 def short_name(path):
-    """Return what a scene file is called for short: its name, or that of its folder where it is just `scene.xml`."""
+    """Return the short name of a scene file: its stem, or the name of its folder for `scene.xml`."""
     path = Path(path)
     return path.resolve().parent.name if path.stem == "scene" else path.stem
 
 
 class SceneFile:
-    """A parsed scene file. A variant must be set.
+    """Parsed scene file. Requires a variant.
 
-    `path` is an XML file and `defines` maps the names of `$parameters` to text; `changes` are those that were made
-    since, a list of the name of a method and its arguments. Raises RuntimeError, with Mitsuba's message, for what does
-    not parse, and ValueError for a scene that cannot be rendered as it is.
+    `path` is an XML file; `defines` maps `$parameters` to text; `changes` is a list of (method, arguments) applied
+    after parsing. Raises RuntimeError with Mitsuba's message for a parse error, ValueError for a scene without sensor.
     """
 
     def __init__(self, path, defines=None, changes=()):
@@ -54,31 +53,30 @@ class SceneFile:
 
     @property
     def integrator(self):
-        """The name (None if it has none) and the parameters (a dict of numbers, bools and strings) of the scene's
-        integrator."""
+        """Plugin name (None: none) and plain parameters (numbers, bools and strings) of the scene's integrator."""
         nodes = self._nodes(mi.ObjectType.Integrator)
         if not nodes:
             return None, {}
-        properties = mi.Properties(nodes[0].props)  # a copy: Mitsuba refuses properties that nobody has read
+        properties = mi.Properties(nodes[0].props)  # a copy: reading marks parameters as queried
         values = dict(properties.items())
         plain = {key: value for key, value in values.items() if isinstance(value, bool | int | float | str)}
         return properties.plugin_name(), plain
 
     @property
     def has_media(self):
-        """Whether it contains participating media."""
+        """Whether the scene contains participating media."""
         return bool(self._nodes(mi.ObjectType.Medium))
 
     def set_integrator(self, name, parameters=None, keep=KEPT_PARAMETERS):
-        """Replace the scene's integrator. Of the old one's parameters it keeps those named by `keep` (None: all),
-        unless given anew, or unknown to the new one; but if all are kept for one of the same name, unknown ones are
-        refused. Raises RuntimeError or ValueError if the new one cannot be created."""
+        """Replace the integrator. Inherits the old parameters named by `keep` (None: all), except those given anew or
+        unknown to the new integrator. If `keep` is None and the name is unchanged, unknown parameters are errors.
+        Raises RuntimeError or ValueError if the integrator cannot be created."""
         self.changes.append(("set_integrator", (name, dict(parameters or {}), keep)))
         given, (old_name, old) = dict(parameters or {}), self.integrator
         kept = {key: old[key] for key in old if key not in given and (keep is None or key in keep)}
         if name != old_name or keep is not None:
-            # Nothing lists the parameters of a plugin, but one that was created, or refused those that it does not
-            # know, tells which it asked for
+            # Mitsuba has no list of a plugin's parameters. A trial creation, even a failed one, records the queried
+            # parameters.
             tried = _properties(name, kept | given)
             with suppress(RuntimeError, ValueError):
                 mi.PluginManager.instance().create_object(tried)
@@ -95,7 +93,7 @@ class SceneFile:
             self._state.root.props["integrator"] = mi.Properties.ResolvedReference(len(self._state.nodes) - 1)
 
     def set_max_depth(self, depth):
-        """Limit the paths to `depth`: by the integrator `path`, until another one is set that keeps it."""
+        """Set `max_depth`, by the integrator `path`; later integrators inherit it."""
         self.set_integrator("path", {"max_depth": depth})
 
     @property
@@ -105,19 +103,19 @@ class SceneFile:
 
     @property
     def size(self):
-        """Width and height of the first film in pixels, as Mitsuba defaults them."""
+        """Width and height of the first film in pixels, with Mitsuba's defaults."""
         films = self._nodes(mi.ObjectType.Film)
         properties = mi.Properties(films[0].props if films else mi.Properties("hdrfilm"))
         return properties.get("width", 768), properties.get("height", 576)
 
     def set_sampler(self, name):
-        """Replace the type of all samplers; they keep their parameters."""
+        """Replace the type of all samplers and keep their parameters."""
         self.changes.append(("set_sampler", (name,)))
         for sampler in self._nodes(mi.ObjectType.Sampler):
             sampler.props.set_plugin_name(name)
 
     def set_width(self, width):
-        """Render `width` pixels wide, keeping the aspect of the first film."""
+        """Set the width in pixels; the height keeps the aspect ratio of the first film."""
         self.changes.append(("set_width", (width,)))
         old_width, old_height = self.size
         for film in self._nodes(mi.ObjectType.Film):
@@ -125,9 +123,8 @@ class SceneFile:
             film.props["height"] = max(1, round(old_height * width / old_width))
 
     def fingerprint(self, camera=True):
-        """Return a hash (hexadecimal) of everything that the image depends on, but for the samples per pixel and the
-        seed: variant, scene with all other parameters, and the content of every file that it names. Without `camera`,
-        sensors and what belongs to them are left out."""
+        """Return a hash (hexadecimal) of all image dependencies except samples per pixel and seed: variant, parameters
+        of the scene, content of referenced files. `camera=False` omits sensors with their parts."""
         digest = hashlib.sha256(mi.variant().encode())
         for node in self._state.nodes:
             if not camera and node.type in {getattr(mi.ObjectType, name) for name in _OF_CAMERA}:
@@ -151,8 +148,8 @@ class SceneFile:
                 yield file
 
     def sampling(self, sensor):
-        """Return the number of pixels of the image of a sensor (by index), and its sampler, a `mi.Sampler`, without
-        creating the scene. Raises ValueError for a sensor that does not exist."""
+        """Return the number of pixels and the `mi.Sampler` of a sensor (by index) without creating the scene. Raises
+        ValueError for an invalid index."""
         sensors = self._nodes(mi.ObjectType.Sensor)
         if not 0 <= sensor < len(sensors):
             raise ValueError(f"no sensor {sensor}: the scene has {len(sensors)}")
@@ -167,10 +164,9 @@ class SceneFile:
         return pixels, mi.PluginManager.instance().create_object(sampler)
 
     def load(self, threads=None):
-        """Create the scene (a `mi.Scene`), once only, as it consumes what was parsed; `threads`, if given, limits what
-        is done from then on."""
+        """Create the `mi.Scene`, once, because this consumes the parsed nodes. `threads`: limit for later work."""
         threads = threads or dr.thread_count()
-        # With a single thread Mitsuba waits for ever when it reads EXR files
+        # Mitsuba deadlocks when it reads EXR files with a single thread
         dr.set_thread_count(max(threads, 2))
         resolver = mi.FileResolver(mi.file_resolver())
         mi.file_resolver().prepend(str(self.path.parent))

@@ -1,10 +1,10 @@
-"""A strip of pictures for a paper or a web page, from what compare.py wrote:
+"""Draw a strip of pictures for a paper or a web page from the output of compare.py:
 
     python compare.py scenes/hall.xml -i path,lightcuts --time 10 -r scenes/hall_reference.exr -o output/strip
     python -m comparison.strip output/strip --scene hall --output docs/equal_time.png
 
-One picture for every integrator (of the first seed), the reference if all share one, and the relative errors in false
-colours, with names and numbers below; a row for every scene that is named.
+A row per scene shows the image of each integrator (first seed), the common reference if there is one, and relative
+errors in false colours, with captions below.
 """
 
 import argparse
@@ -25,8 +25,8 @@ CAPTION = 0.45  # inches below the pictures
 
 
 def panels(results, name):
-    """Return the panels of the scene `name` in the content of `results.json`: a list of file name part and caption.
-    Raises UsageError if there is no such scene."""
+    """Return (file name part, caption) of each panel of the scene `name` in the content of `results.json`. Raises
+    UsageError for an unknown scene."""
     scenes = {scene["name"]: scene for scene in results["scenes"]}
     if name is None and len(scenes) == 1:
         (name,) = scenes
@@ -45,7 +45,7 @@ def panels(results, name):
     reference = [(f"{name}.{REFERENCE}", f"reference\n{_samples(scene['reference'])}")] if "reference" in scene else []
     return [
         *((file, f"{title}\n{seconds}") for file, title, seconds, _ in found),
-        *reference,  # there is none where each image is compared with one of its own
+        *reference,  # absent if each image has its own reference
         *((f"{file}.error", f"error of {title}\ntrimmed relMSE {error}") for file, title, _, error in found),
     ]
 
@@ -55,7 +55,7 @@ def _samples(reference):
 
 
 def draw(pictures, captions):
-    """Return pixels (height, width, 3) uint8: pictures, all of one size, beside each other with captions below."""
+    """Return pixels (height, width, 3) uint8 of pictures of equal size in a row, with captions below."""
     height, width = pictures[0].shape[:2]
     gap = 4
     total = len(pictures) * (width + gap) - gap
@@ -74,7 +74,7 @@ def draw(pictures, captions):
 
 
 def below(strips):
-    """Return strips of pixels below each other, the narrower ones filled up with white."""
+    """Stack strips of pixels vertically, padded with white to the largest width."""
     width = max(strip.shape[1] for strip in strips)
     return np.concatenate(
         [np.pad(strip, ((0, 0), (0, width - strip.shape[1]), (0, 0)), constant_values=255) for strip in strips]

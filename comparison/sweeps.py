@@ -1,7 +1,7 @@
-"""Settings: an integrator with its parameters and its effort. What `--sweep` varies, and the order of the runs.
+"""Settings (an integrator with parameters and effort), sweeps of settings, order of runs.
 
-A setting is rendered once with every seed. Runs take turns, so that a change of the machine's load meets all alike:
-seed by seed, and for each seed the first setting of every integrator, then the second of every one, and so on.
+Each setting runs once per seed. Runs are interleaved, so that changes of the machine's load affect all integrators
+alike: seed by seed, and within a seed the first setting of each integrator, then the second of each, and so on.
 """
 
 import re
@@ -12,9 +12,9 @@ from itertools import product, zip_longest
 from . import command_line
 from .command_line import UsageError
 
-EFFORTS = {"spp": command_line.positive(int), "time": command_line.positive(float)}  # how long, not how
-DEFAULT_SPP = 4  # of a sweep over anything but an effort
-# What an integrator is swept over unless it is said: the parameter that trades error for time...
+EFFORTS = {"spp": command_line.positive(int), "time": command_line.positive(float)}  # amount of work per image
+DEFAULT_SPP = 4  # for sweeps of parameters other than efforts
+# Default sweeps: the parameter that trades error for time
 DEFAULTS = {
     "vpl": ("vpl_count", (250, 1000, 4000, 16_000)),
     "lightcuts": ("error", (0.08, 0.04, 0.02, 0.01)),
@@ -25,15 +25,15 @@ DEFAULTS = {
     "adaptivedirect": ("error", (0.12, 0.06, 0.03, 0.015)),
     "unoccludeddirect": ("error", (0.12, 0.06, 0.03, 0.015)),
 }
-# ... and, where nobody said anything, samples per pixel: every other value with each of these.
+# ... combined, in the default sweep of all integrators, with samples per pixel: every other value with each of these
 DEFAULT_SAMPLES = (1, 4, 16)
-DEFAULT = ("spp", (4, 16, 64, 256))  # of all others: Mitsuba's own, and `manylights`, which chooses by itself
+DEFAULT = ("spp", (4, 16, 64, 256))  # integrators of Mitsuba, and `manylights`, which adapts itself
 
 
 @dataclass
 class Setting:
-    """One point of a curve: the integrator `integrator`, named `label`, with `parameters`, for `spp` samples per pixel
-    or `time` seconds (one of them is None). `swept` holds what the sweep gave it, effort included; {} without one."""
+    """Point of a curve: `integrator`, named `label`, with `parameters`, for `spp` samples per pixel or `time` seconds
+    (the other is None). `swept` holds the swept values, including effort."""
 
     label: str
     integrator: str
@@ -44,7 +44,7 @@ class Setting:
 
     @property
     def name(self):
-        """Text that tells it from others of its label, such as "error=0.02"; empty if it is the only one."""
+        """Text that identifies the setting within its label, such as "error=0.02"; may be empty."""
         return ",".join(f"{key}={text(value)}" for key, value in self.swept.items())
 
     @property
@@ -53,20 +53,20 @@ class Setting:
 
     @property
     def file_name(self):
-        """A part of the names of files that is its own, as long as `check_file_names` has nothing against it."""
+        """Part of file names, unique after `check_file_names`."""
         return re.sub(r"[^\w.,=+-]", "_", ".".join(filter(None, (self.label, self.name))))
 
 
 def text(value):
-    """Write a value as it was typed: a short number, `true`, or the text."""
+    """Format a value as on the command line: a short number, `true`, or text."""
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:.10g}" if isinstance(value, int | float) else str(value)
 
 
 def sweep(content):
-    """Split `LABEL:KEY=VALUE,VALUE,...` into label, key and values, or `LABEL` or `all` into that, None and (); an
-    argparse type. Raises ArgumentTypeError through it."""
+    """Parse `LABEL:KEY=VALUE,VALUE,...` to (label, key, values), `LABEL` or `all` to (text, None, ()); an argparse
+    type."""
     label, separator, definition = content.partition(":")
     if not separator and re.fullmatch(r"[\w-]+", content):
         return content, None, ()
@@ -93,20 +93,18 @@ def _value(key, word):
 
 
 def default_grid(name, samples):
-    """Return what an integrator is swept over unless it is said, a dict from parameter to values; with `samples` also
-    over samples per pixel."""
+    """Return the default sweep of an integrator, parameter -> values; with `samples` also over samples per pixel."""
     key, values = DEFAULTS.get(name, DEFAULT)
     return {key: values[1::2], "spp": DEFAULT_SAMPLES} if samples and key not in EFFORTS else {key: values}
 
 
 def settings(integrators, sweeps, spp, time, samples=True):
-    """Return all settings, a dict from label to a list.
+    """Return all settings, label -> list.
 
-    `integrators` maps labels to names and parameters; `sweeps` are what `sweep` returned for each option; `spp` and
-    `time` are the efforts of what is not swept over one. Several parameters of one label make a grid. Once there is any
-    sweep, labels without one have the default of their integrator; where that is all that is swept, `samples` is true,
-    and there is neither `spp` nor `time`, it is also over samples per pixel. Raises UsageError for labels that do not
-    exist and parameters that are given twice.
+    `integrators`: label -> name and parameters; `sweeps`: results of `sweep`; `spp`, `time`: effort of settings without
+    a swept effort. Several parameters of a label form a grid. If there is a sweep, labels without one get the default
+    of their integrator. A sweep of defaults alone, without `spp` and `time`, includes samples per pixel if `samples` is
+    true. Raises UsageError for unknown labels and repeated parameters.
     """
     samples = samples and not spp and not time and all(key is None for _, key, _ in sweeps)
     grids = {label: {} for label in integrators}
@@ -127,7 +125,7 @@ def settings(integrators, sweeps, spp, time, samples=True):
             _setting(label, name, parameters, spp, time, dict(zip(grid, values, strict=True)))
             for values in product(*grid.values())
         ]
-    check_file_names([setting for of in found.values() for setting in of])
+    check_file_names([setting for group in found.values() for setting in group])
     return found
 
 
@@ -149,7 +147,7 @@ def _setting(label, name, parameters, spp, time, swept):
 
 
 def check_file_names(found):
-    """Raise UsageError if files of two settings would have the same name (in any case of letters)."""
+    """Raise UsageError if files of two settings would have the same name (ignoring case)."""
     names = {}
     for setting in found:
         other = names.setdefault(setting.file_name.lower(), setting)
@@ -158,8 +156,8 @@ def check_file_names(found):
 
 
 def order(found, seeds):
-    """Return all runs, a list of (setting, seed), in the order in which they are made. Each seed begins with another
-    label, so that none always follows the same one."""
+    """Return all runs (setting, seed) in execution order. The first label rotates with the seed, to vary which label
+    precedes which."""
     runs = []
     for turn, seed in enumerate(seeds):
         columns = list(found.values())

@@ -1,4 +1,4 @@
-"""The tables of a comparison, as lists of rows of text: for the terminal and for the report."""
+"""Tables of a comparison as rows of text, for the terminal and for the report; warnings about the runs."""
 
 from collections import Counter
 
@@ -9,72 +9,76 @@ COLUMNS = (
     "rays", "bounds", "memory", "load",
 )  # fmt: skip
 EXPLANATION = (
-    "Means over seeds. time: of the passes in the image, with kernels that are compiled already (with --cold from an "
-    "empty kernel cache on); cold: the first pass of all with an empty kernel cache, compilation included. rel. L1: "
-    "sum |x - r| / sum r; "
+    "Values are means over seeds. time: passes of the image with compiled kernels (with --cold: including "
+    "compilation); cold: first pass with an empty kernel cache, including compilation. rel. L1: sum |x - r| / sum r; "
     f"relMSE: mean (x - r)² / (r² + {metrics.EPSILON:g} mean(r)²); trimmed: the same without the worst "
-    f"{metrics.TRIMMED:.1%} of the pixels; 95%: interval of the mean of the error that curves show (--metric); FLIP: "
-    "mean of HDR-FLIP at 67 pixels per degree; bias: of the mean. The reference's own noise is taken off RMSE and "
-    "relMSE; < marks errors that are smaller than that noise, and gives it (for rel. L1 √2 times it). rays, bounds: "
-    "shadow rays and upper bounds computed, per pixel sample. memory: peak, MB. load: the machine's load average "
-    "before the runs, the largest."
+    f"{metrics.TRIMMED:.1%} of the pixels; 95%: confidence interval of the mean error in curves (--metric); FLIP: "
+    "mean of HDR-FLIP at 67 pixels per degree; bias: relative error of the image mean. RMSE and relMSE are corrected "
+    "for the noise of the reference; < marks an error below that noise and gives the noise (for rel. L1: √2 times the "
+    "noise). rays, bounds: shadow rays and computed upper bounds per pixel sample. memory: peak in MB. load: maximum "
+    "load average of the machine before the runs."
 )
-BUSY = 1.5  # load a core; what is measured makes up to one itself
-UNEQUAL = 0.1  # by which times of one budget may differ
+BUSY = 1.5  # load per core; the measured process itself contributes up to 1
+UNEQUAL = 0.1  # tolerated relative difference of times with equal budgets
 HEADS = {"seconds": "time [s]", "rays": "rays per pixel"}
 
 
 def text(rows):
-    """Lay rows out in columns, the first one to the left; lines without spaces at their ends."""
+    """Format rows as columns, the first left-aligned; without trailing spaces."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
     return "\n".join(line.rstrip() for line in lines)
 
 
+def title(entry):
+    """Return the title of the setting of a run or point, such as "lightcuts error=0.02"."""
+    return f"{entry['label']} {entry['setting']}".strip()
+
+
 def settings(scene):
-    """Return a dict from titles, such as "lightcuts error=0.02", to the results of their runs, in order of labels."""
+    """Return title -> results of its runs, in the order of labels."""
     labels = list(dict.fromkeys(render["label"] for render in scene["renders"]))
     found = {}
     for label in labels:
         of_label = [render for render in scene["renders"] if render["label"] == label]
-        # Runs are made seed by seed, so the settings of the first seed come in their order.
+        # Runs proceed seed by seed; the first seed determines the order of settings
         for render in of_label:
-            found.setdefault(f"{label} {render['setting']}".strip(), []).append(render)
+            found.setdefault(title(render), []).append(render)
     return found
 
 
 def rows(scene):
     """Return the rows of a scene: as many cells as `COLUMNS`, or (title, message) for a failure."""
     intervals, found = _intervals(scene), []
-    for title, renders in settings(scene).items():
+    for name, renders in settings(scene).items():
         good = [render for render in renders if "error" not in render]
         if good:
-            found.append(_row(title, good, intervals.get(title, "")))
+            found.append(_row(name, good, intervals.get(name, "")))
         failures = Counter(render["error"] for render in renders if "error" in render)
         found += [
-            (title, message if len(renders) == 1 else f"{message} ({count} of {len(renders)} seeds)")
+            (name, message if len(renders) == 1 else f"{message} ({count} of {len(renders)} seeds)")
             for message, count in failures.items()
         ]
     return found
 
 
 def _intervals(scene):
-    """Return the 95% intervals of errors as text, by title; none for single seeds, and for errors that the reference's
-    noise hides, as what is left of them says nothing."""
+    """Return the 95% intervals of errors as text, by title, except for single seeds and errors hidden by the
+    reference's noise."""
     found = {}
     for point in scene.get("points", []):
         low, high = point["error"]["low"], point["error"]["high"]
         if low is not None and not point["below_noise"]:
-            found[f"{point['label']} {point['setting']}".strip()] = f"{number(low)} to {number(high)}"
+            found[title(point)] = f"{number(low)} to {number(high)}"
     return found
 
 
-def _row(title, renders, interval):
+def _row(name, renders, interval):
     errors = [render["errors"] for render in renders if "errors" in render]
     bad = sum(one["bad_pixels"] for one in errors)
     cold = [render["cold_seconds"] for render in renders if render["cold_seconds"] is not None]
     return [
-        title + (f" ({bad} pixels not finite)" if bad else ""),
+        name + (f" ({bad} pixels not finite)" if bad else ""),
         str(len(renders)),
         number(_mean(render["seconds"] for render in renders)),
         number(_mean(cold)) if cold else "",
@@ -102,20 +106,21 @@ def _count(renders, key):
 
 
 def error(errors, name, style):
-    """Format the mean of an error, or "< noise" where curves, too, do not tell it from the reference's noise."""
+    """Format the mean of an error, or "< noise" if the reference's noise hides it (as in curves)."""
     if not errors:
         return "n/a"
-    mean, least = _mean(one[name] for one in errors), _mean(metrics.least(name, one["noise"]) for one in errors)
+    mean = _mean(one[name] for one in errors)
+    least = _mean(metrics.detection_threshold(name, one["noise"]) for one in errors)
     return f"< {least:{style}}" if mean <= least and least > 0 else f"{mean:{style}}"
 
 
 def equal_errors(scene, cost):
-    """Return the table of what the same errors cost, with its head; [] if there is nothing to compare."""
+    """Return the table of costs at equal errors, with its head; [] without curves."""
     return _comparison(scene.get("equal_errors", {}).get(cost, []), "error", "costs", "error")
 
 
 def equal_costs(scene, cost):
-    """Return the table of errors at the same cost, with its head; [] if there is nothing to compare."""
+    """Return the table of errors at equal costs, with its head; [] without curves."""
     return _comparison(scene.get("equal_costs", {}).get(cost, []), "cost", "errors", HEADS[cost])
 
 
@@ -130,7 +135,7 @@ def _comparison(entries, what, read, head):
 
 
 def number(value):
-    """Write a number with three digits, or more before the point, never with an exponent down to 1e-4."""
+    """Format a number with three significant digits, larger numbers as integers, without exponent down to 1e-4."""
     return f"{value:.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
 
 
@@ -148,41 +153,41 @@ def _reading(reading):
 
 
 def warnings(scene, cores):
-    """Return sentences about what makes a scene's numbers doubtful; [] if there is nothing."""
-    return busy(scene["renders"], cores) + doubts(scene)
+    """Return the sentences of all warnings about the results of a scene."""
+    return load_warnings(scene["renders"], cores) + scene_warnings(scene)
 
 
-def busy(renders, cores):
-    """Return a sentence if the machine had other things to do, in a list."""
+def load_warnings(renders, cores):
+    """Return a list with a sentence if the machine was busy with other processes."""
     load = max((render["load_average"] for render in renders), default=0)
     if load <= BUSY * cores:
         return []
-    return [f"The machine was busy with other things (load {load:.1f} on {cores} cores): do not trust the times."]
+    return [f"The machine was busy with other processes (load {load:.1f} on {cores} cores); times are unreliable."]
 
 
-def doubts(scene):
-    """Return the sentences of `warnings` that are of the scene, not of the machine."""
+def scene_warnings(scene):
+    """Return warnings about the scene, independent of the machine's load."""
     return _machines(scene) + _unequal_times(scene) + _hidden(scene)
 
 
 def _machines(scene):
-    """Return a sentence where times are of several machines, or of several workers on one, in a list."""
+    """Return a list with a sentence if times stem from several machines, or from several workers on one machine."""
     made_by = [render["machine"] for render in scene["renders"] if "machine" in render]
     names, workers = (sorted({machine[key] for machine in made_by}) for key in ("name", "worker"))
     if len(names) > 1:
-        return [f"Runs were made on different machines ({', '.join(names)}): do not compare their times."]
+        return [f"Runs were made on different machines ({', '.join(names)}); their times are not comparable."]
     if len(workers) > 1:
-        return [f"{len(workers)} workers shared the machine {names[0]}: do not trust the times."]
+        return [f"{len(workers)} workers shared the machine {names[0]}; times are unreliable."]
     return []
 
 
 def _unequal_times(scene):
-    """Return a sentence for each time budget that was not used alike."""
+    """Return a sentence for each time budget that runs used unequally."""
     budgets = {}
-    for title, renders in settings(scene).items():
+    for name, renders in settings(scene).items():
         seconds = [render["seconds"] for render in renders if "error" not in render and render["budget"]]
         if seconds:
-            budgets.setdefault(renders[0]["budget"], {})[title] = _mean(seconds)
+            budgets.setdefault(renders[0]["budget"], {})[name] = _mean(seconds)
     found = []
     for budget, seconds in budgets.items():
         shortest, longest = (choose(seconds, key=seconds.get) for choose in (min, max))
@@ -195,12 +200,8 @@ def _unequal_times(scene):
 
 
 def _hidden(scene):
-    """Return a sentence about errors that the reference's noise hides."""
-    hidden = [
-        f"{point['label']} {point['setting']}".strip()
-        for point in scene.get("points", [])
-        if point["below_noise"] and point["cost"] == "seconds"
-    ]
+    """Return a list with a sentence about errors hidden by the reference's noise."""
+    hidden = [title(point) for point in scene.get("points", []) if point["below_noise"] and point["cost"] == "seconds"]
     if not hidden:
         return []
-    return [f"The reference's noise hides the error of {', '.join(hidden)}: a reference of more samples is needed."]
+    return [f"The reference's noise hides the error of {', '.join(hidden)}; use a reference with more samples."]

@@ -1,9 +1,9 @@
-"""What a comparison comes to: each integrator beside the first, scene by scene, by geometric means, and in a sentence.
+"""Summary of a comparison: each integrator relative to the first, per scene, in geometric means, and in a sentence.
 
-All ratios are an integrator's number over the first one's, so that less than 1 is better. Where there are curves they
-are geometric means of what is read off these, else they are those of single images. The time that the first integrator
-would take for the error of another's image is then told only where it is one of Mitsuba's own: by its error, which
-falls with its samples, while that of others need not.
+A ratio divides a number of an integrator by the number of the first; below 1 is better. With curves, ratios are
+geometric means of interpolated values, otherwise ratios of single images. Single images give a time at equal error only
+if the first integrator is one of Mitsuba's unbiased integrators, because only then its error is known to fall with the
+number of samples.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from . import analysis, curves, metrics, tables
 
 UNBIASED = ("path", "direct", "volpath", "volpathmis", "ptracer")
 KINDS = ("error", "time")
-ALIKE = 1.05  # ratios up to this, and down to its inverse, are no difference where there is no interval
+ALIKE = 1.05  # ratios up to this factor count as equal if there is no interval
 PARTS = ("half", "a third", "a quarter", "a fifth", "a sixth", "a seventh", "an eighth", "a ninth", "a tenth")
 
 
@@ -27,17 +27,16 @@ def summarise(scenes, metric):
     order = sorted(means, key=lambda label: (means[label]["time"] or means[label]["error"] or {}).get("value", np.inf))
     sentences = [text for label in order if (text := _sentence(label, labels[0], rows))]
     if means and not sentences:
-        verb = "compares" if len(order) == 1 else "compare"
-        sentences = [f"How {_listed(order)} {verb} with {labels[0]} cannot be told from these runs."]
+        sentences = [f"These runs do not determine the performance of {_listed(order)} relative to {labels[0]}."]
     return {"base": labels[0] if labels else None, "scenes": rows, "means": means, "sentences": sentences}
 
 
 def _row(scene, labels, metric):
-    """Return what there is to say of the integrators of a scene: a dict from labels."""
-    of = dict(analysis.points(scene["renders"], metric))["seconds"]
+    """Return the summary of a scene: label -> entry."""
+    all_points = dict(analysis.points_by_cost(scene["renders"], metric))["seconds"]
     found = {}
     for label in labels:
-        points = [point for point in of if point.label == label]
+        points = [point for point in all_points if point.label == label]
         if not points:
             continue
         best = min(points, key=lambda point: np.mean(list(point.error.values())))
@@ -57,37 +56,37 @@ def _row(scene, labels, metric):
     if labels and labels[0] in found:
         for label in found:
             if label != labels[0]:
-                found[label] |= _ratios(scene, of, labels[0], label, metric)
+                found[label] |= _ratios(scene, all_points, labels[0], label, metric)
     return found
 
 
-def _ratios(scene, of, base, label, metric):
-    """Return "error" (at equal time) and "time" (at equal error) of a label over the first one, None if not known."""
+def _ratios(scene, points, base, label, metric):
+    """Return "error" (at equal time) and "time" (at equal error) of a label over the first; None: unknown."""
     at_errors, at_costs = (scene.get(key, {}).get("seconds") for key in ("equal_errors", "equal_costs"))
     if at_errors:
         return {
-            "time": _read_off([entry["costs"] for entry in at_errors], base, label),
-            "error": _read_off([entry["errors"] for entry in at_costs], base, label),
+            "time": _mean_of_readings([entry["costs"] for entry in at_errors], base, label),
+            "error": _mean_of_readings([entry["errors"] for entry in at_costs], base, label),
         }
-    first, other = (next(point for point in of if point.label == name) for name in (base, label))
+    first, other = (next(point for point in points if point.label == name) for name in (base, label))
     seconds = sorted(float(np.mean(list(point.cost.values()))) for point in (first, other))
     is_equal_time = seconds[1] <= (1 + tables.UNEQUAL) * seconds[0]
-    error = _of_points(first, other, lambda cost, error: error) if is_equal_time else None
+    error = _ratio_of_points(first, other, lambda cost, error: error) if is_equal_time else None
     integrator = next(render["integrator"] for render in scene["renders"] if render["label"] == base)
     if integrator not in UNBIASED:
         return {"error": error, "time": None}
     power = 1 if metric in metrics.SQUARED else 2
-    time = _of_points(first, other, lambda cost, error: cost * error**power)
+    time = _ratio_of_points(first, other, lambda cost, error: cost * error**power)
     return {"error": error, "time": time and time | {"extrapolated": True}}
 
 
 def _ratio(value, bound=None, low=None, high=None):
-    """Return a ratio; `bound` says that it is "at_most" or "at_least" this."""
+    """Return a ratio; `bound` ("at_most" or "at_least") marks an inequality."""
     return {"value": float(value), "bound": bound, "low": low, "high": high, "extrapolated": False}
 
 
-def _read_off(entries, base, label):
-    """Return the geometric mean of what was read off two curves; a bound where nothing else is known."""
+def _mean_of_readings(entries, base, label):
+    """Return the geometric mean of the ratios interpolated on two curves; a bound if only bounds are known."""
     readings = [entry[label] for entry in entries if label in entry and base in entry]
     exact = [one for one in readings if one["speed_up"]]
     if exact:
@@ -103,8 +102,8 @@ def _read_off(entries, base, label):
     return _ratio(_mean(over), "at_least") if over else None
 
 
-def _of_points(first, other, value):
-    """Return the ratio of `value(cost, error)` of two points; a bound where the noise hides one error."""
+def _ratio_of_points(first, other, value):
+    """Return the ratio of `value(cost, error)` of two points; a bound if noise hides one of the errors."""
 
     def ratio(without):
         pair = [point.mean(without) for point in (other, first)]
@@ -119,13 +118,13 @@ def _of_points(first, other, value):
 
 
 def _mean(values):
-    """Return the geometric mean."""
+    """Return the geometric mean of positive numbers."""
     return float(np.exp(np.mean(np.log(list(values)))))
 
 
 def _over_scenes(ratios):
-    """Return the geometric mean of the ratios of several scenes, with "scenes", how many have one; None for none, and
-    where some are only known to be small and others to be large."""
+    """Return the geometric mean of the known ratios of several scenes, with their number "scenes". Return None without
+    known ratios, or with bounds in both directions."""
     known = [ratio for ratio in ratios if ratio]
     bounds = {ratio["bound"] for ratio in known} - {None}
     if not known or len(bounds) > 1:
@@ -135,7 +134,7 @@ def _over_scenes(ratios):
 
 
 def verdict_of(ratio):
-    """Return "better", "worse", "alike", or None where that cannot be told."""
+    """Return "better", "worse", "alike", or None if undetermined."""
     if ratio is None:
         return None
     low, high = ratio["low"], ratio["high"]
@@ -149,41 +148,40 @@ def verdict_of(ratio):
 
 
 def _sentence(label, base, rows):
-    """Say how an integrator compares with the first; None where nothing is known."""
+    """Compare an integrator with the first in a sentence; None without a known ratio."""
     kind = "time" if any(row.get(label, {}).get("time") for row in rows.values()) else "error"
     ratios = {name: row[label][kind] for name, row in rows.items() if row.get(label, {}).get(kind)}
     if not ratios:
         return None
     if len(rows) == 1:
-        return f"{label} {WORDS[kind]['one'].format(size=size(*ratios.values()), base=base)} in {next(iter(ratios))}."
+        ratio = in_words(*ratios.values())
+        return f"{label} {WORDS[kind]['one'].format(ratio=ratio, base=base)} in {next(iter(ratios))}."
     mean = _over_scenes(ratios.values())
-    of = {one: [name for name, ratio in ratios.items() if verdict_of(ratio) == one] for one in ("better", "worse")}
-    text = f"{label} {WORDS[kind]['less'].format(base=base)} in {len(of['better'])} of {len(rows)} scenes"
+    names = {one: [name for name, ratio in ratios.items() if verdict_of(ratio) == one] for one in ("better", "worse")}
+    text = f"{label} {WORDS[kind]['less'].format(base=base)} in {len(names['better'])} of {len(rows)} scenes"
     if mean:
-        text += f": {size(mean)} {WORDS[kind]['of']} in the geometric mean"
-        text += f" over {mean['scenes']} of them" if mean["scenes"] < len(rows) else ""
-    worse = [f"{name} ({number(ratios[name])})" for name in of["worse"]]
+        over = f" over {mean['scenes']} scenes" if mean["scenes"] < len(rows) else ""
+        text += f" (geometric mean{over}: {in_words(mean)} the {kind})"
+    worse = [f"{name} ({number(ratios[name])})" for name in names["worse"]]
     return f"{text}. {WORDS[kind]['more']} in {_listed(worse)}." if worse else f"{text}."
 
 
 WORDS = {
     "time": {
-        "one": "needs {size} the time of {base} for the same error",
+        "one": "needs {ratio} the time of {base} for the same error",
         "less": "needs less time than {base} for the same error",
-        "of": "its time",
-        "more": "It needs more",
+        "more": "It needs more time",
     },
     "error": {
-        "one": "has {size} the error of {base} at equal time",
+        "one": "has {ratio} the error of {base} at equal time",
         "less": "has a smaller error than {base} at equal time",
-        "of": "its error",
-        "more": "It has a larger one",
+        "more": "It has a larger error",
     },
 }
 
 
-def size(ratio):
-    """Write a ratio so that "the time" can follow: "a fifth of", "1.4 times", "at most half of"."""
+def in_words(ratio):
+    """Format a ratio to precede "the time": "a fifth of", "1.4 times", "at most half of"."""
     value, parts = ratio["value"], round(1 / ratio["value"])
     about = "about " if ratio["extrapolated"] else ""
     bound = {"at_most": "at most ", "at_least": "at least ", None: about}[ratio["bound"]]
@@ -199,7 +197,7 @@ def size(ratio):
 
 
 def number(ratio):
-    """Write a ratio in a table: "0.21×", "≤ 0.5×"."""
+    """Format a ratio for a table: "0.21×", "≤ 0.5×"."""
     sign = {"at_most": "≤ ", "at_least": "≥ ", None: ""}[ratio["bound"]]
     return f"{sign}{tables.number(float(format(ratio['value'], '.2g')))}×"
 

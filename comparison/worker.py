@@ -1,8 +1,8 @@
-"""Render and measure one integrator on one scene, in a process of its own: `python -m comparison.worker`.
+"""Render and measure an integrator on a scene in a separate process: `python -m comparison.worker`.
 
-In a fresh process with an empty kernel cache the first pass is honestly cold, the memory's peak is this integrator's,
-and a crash loses nothing else. The job is a line of JSON on the standard input (see `Job`), the result one on the
-standard output (see `run`): a pipe has room where the disk has none.
+A new process with an empty kernel cache measures the true cold start and the peak memory of an integrator, and isolates
+crashes. The job is a line of JSON on standard input (see `Job`), the result a line on standard output (see `run`):
+pipes work even if the disk is full.
 """
 
 import hashlib
@@ -33,11 +33,12 @@ TICK = 0.5  # seconds
 
 @dataclass
 class Job:
-    """Render to make: either for `budget` seconds or with `spp` samples per pixel, in passes of `pass_spp` (None
-    chooses). `output` is the EXR file to write, which `run` is noted in. `vpl_folder`, if given, is where to keep the
-    same passes rendered by `vpl`, with the same VPLs: once for all jobs that share them. `kernel_cache` is the folder
-    of compiled kernels, a fresh one if None. `cold` asks for times that include compilation. `denoised_output`, if
-    given, is the EXR file for the denoised image."""
+    """Render job, for `budget` seconds or `spp` samples per pixel, in passes of `pass_spp` (None: automatic).
+
+    `output`, `denoised_output`: EXR files to write, with the key `run` as metadata. `vpl_folder`: folder for images of
+    the same passes by `vpl` with the same VPLs, shared between jobs. `kernel_cache`: folder of compiled kernels (None:
+    a new one). `cold`: include compilation in the times.
+    """
 
     label: str
     integrator: str
@@ -61,19 +62,24 @@ class Job:
 
 
 def run(job, tick=lambda: None):
-    """Run a job in a new process and return its result: a dict with the keys of the job that identify it, and
+    """Run a job in a new process; return a dict with the fields of the job and
 
-    `width`, `height`; `load_seconds`; `load_average` (before the run, see machine.load); `cold_seconds` (the first
-    pass, compilation included; None if the kernel cache was not empty); `warm_seconds` (mean of the later passes that
-    are in the image, None if there are none); `seconds`, `spp`, `passes` (of the image); `pass_spp`; `cold_pass_kept`
-    (whether the first pass is in the image, as `cold` asks for); `peak_memory_bytes`; `statistics` (the integrator's
-    counters, added up, {} if it has none); `rays_per_sample`, `bounds_per_sample`, `cut_size_per_sample` (per pixel
-    sample, None if not counted); `vpl_output` (the EXR file with what `vpl` made of the same passes, None if not asked
-    for); `denoise_seconds` and `cold_denoise_seconds` (what denoising takes beyond that, the second time and,
-    compilation included, the first; None if not asked for).
+    `width`, `height`
+    `load_seconds`       time to load the scene
+    `load_average`       before the run, see machine.load
+    `cold_seconds`       first pass including compilation; None if the kernel cache was not empty
+    `warm_seconds`       mean of the later passes of the image, None without any
+    `seconds`, `spp`, `passes`   of the image
+    `pass_spp`           largest pass
+    `cold_pass_kept`     whether the image includes the first pass (`job.cold`)
+    `peak_memory_bytes`
+    `statistics`         sums of the integrator's counters, {} without any
+    `rays_per_sample`, `bounds_per_sample`, `cut_size_per_sample`   per pixel sample, None if not counted
+    `vpl_output`         EXR file of the same passes by `vpl`, None if not requested
+    `denoise_seconds`, `cold_denoise_seconds`   warm and cold time of denoising, None if not requested
 
-    After a failure it holds `error` (one line) and `traceback` instead. `tick` is called every half second. The process
-    ends with this one, even if this one is killed.
+    After a failure the dict holds `error` (one line) and `traceback` instead. `tick` is called every half second. The
+    new process ends with the current one, even if the latter is killed.
     """
     result = asdict(job) | {"load_average": machine.load()}
     try:
@@ -83,14 +89,14 @@ def run(job, tick=lambda: None):
 
 
 def _in_new_process(job, tick):
-    """Return what `run` adds to a job. Raises OSError where there cannot be a process, or a folder for its kernels."""
+    """Return the measurements of a job. Raises OSError if the process or its folder of kernels cannot be created."""
     cache = nullcontext(job.kernel_cache) if job.kernel_cache else tempfile.TemporaryDirectory(prefix="manylights-")
     with cache as kernels:
         Path(kernels).mkdir(parents=True, exist_ok=True)
         is_cold = not any(Path(kernels).iterdir())
         environment = os.environ | {"DRJIT_CACHE_DIR": str(kernels)}
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-        # In a session of its own, so that Ctrl-C is for this process alone, which then ends that one.
+        # In its own session: Ctrl-C reaches only this process, which then ends the worker
         process = subprocess.Popen(
             [sys.executable, "-m", "comparison.worker"],
             env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
@@ -104,10 +110,9 @@ def _in_new_process(job, tick):
 
 
 def _ask(process, job, tick):
-    """Give a process its job; return its status and its answer when it has ended, which it also does if this one is
-    interrupted."""
+    """Send a job to a process; return its exit status and answer. Ends the process, also after an interruption."""
     try:
-        with suppress(BrokenPipeError):  # it has ended already, as its status tells
+        with suppress(BrokenPipeError):  # the process has already ended; its status says why
             process.stdin.write(json.dumps(asdict(job)).encode() + b"\n")
             process.stdin.flush()
         while not select.select([process.stdout], [], [], TICK)[0]:
@@ -123,7 +128,7 @@ def _ask(process, job, tick):
 
 
 def render(job):
-    """Do a job in this process; return the measurements (see `run`)."""
+    """Execute a job in this process; return the measurements (see `run`)."""
     set_variant(job.variant)
     begin = time.perf_counter()
     file = _parse(job)
@@ -161,7 +166,7 @@ def render(job):
 
 
 def _denoise(job, scene, progressive, described):
-    """Write the denoised image, if it is asked for; return its times."""
+    """Write the denoised image if requested; return its times."""
     if not job.denoised_output:
         return {"denoise_seconds": None, "cold_denoise_seconds": None}
     seconds = []
@@ -175,7 +180,7 @@ def _denoise(job, scene, progressive, described):
 
 
 def _parse(job):
-    """Return the `SceneFile` of a job with its integrator."""
+    """Return the `SceneFile` of a job with the job's integrator."""
     file = SceneFile(job.scene, job.defines)
     if job.width:
         file.set_width(job.width)
@@ -186,11 +191,11 @@ def _parse(job):
 
 
 def _render_vpl(job, passes, described):
-    """Render the passes of another integrator (same seeds and parameters, so same lights and camera rays) by `vpl`, and
-    write the image, which is all that the other one approximates. Return its file; one that is there already, of the
-    same passes with the same parameters, is left as it is."""
+    """Render the passes of another integrator by `vpl`, with equal seeds and parameters and so equal lights and camera
+    rays: the image that the integrator approximates. Return its file. An existing file of the same passes and
+    parameters is reused."""
     file = _parse(job)
-    file.set_integrator("vpl", {"aovs": ""}, keep=None)  # nobody asks for its channels, and it may not know them all
+    file.set_integrator("vpl", {"aovs": ""}, keep=None)  # AOVs are not needed, and `vpl` may not know them
     shared = [file.fingerprint(), machine.versions(), [(one.spp, one.seed) for one in passes]]
     key = hashlib.sha256(json.dumps(shared).encode()).hexdigest()[:16]
     output = Path(job.vpl_folder) / f"{file.name}.vpl.{key}.exr"
@@ -204,23 +209,23 @@ def _render_vpl(job, passes, described):
 
 
 def _peak_memory():
-    """Return the largest memory that this process has had so far, in bytes."""
+    """Return the peak memory of this process so far in bytes."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 
 
 def _end_with_parent():
-    """End this process when the one that holds the other end of its standard input does."""
+    """End this process when standard input closes, which the end of the parent process causes."""
     os.read(0, 1)
     os._exit(1)
 
 
 def main():
-    # What others print, such as Mitsuba's log, goes to the standard error
+    # Redirect output of libraries, such as Mitsuba's log, to standard error
     answer = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     line = sys.stdin.readline()
-    if not line:  # who wanted to give a job was interrupted
+    if not line:  # the parent was interrupted before it sent a job
         return 1
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:

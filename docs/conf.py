@@ -1,7 +1,7 @@
 """Settings of the documentation site: `./run docs` builds it with Sphinx, in the theme of Mitsuba's own.
 
-The sources are all of the project, so that links between README.md, scenes/ and docs/ are the same on the site as
-anywhere else; `include_patterns` says which of its files are pages.
+The source folder is the root of the project, so that links between README.md, scenes/ and docs/ stay valid.
+`include_patterns` lists the pages.
 """
 
 import sys
@@ -21,7 +21,7 @@ include_patterns = [
 exclude_patterns = [".*", "build", "dist", "output", "shared"]
 
 extensions = ["myst_parser", "sphinx_tabs.tabs", "plugin_parameters", "generated", "contents", "formulas"]
-myst_heading_anchors = 4  # headings are linked by the anchors that GitHub gives them
+myst_heading_anchors = 4  # anchors of headings as on GitHub
 
 html_theme = "furo"
 html_math_renderer = "mathml"
@@ -31,7 +31,7 @@ html_js_files = ["gallery.js"]
 html_copy_source = False
 html_show_sourcelink = False
 
-# What the manual pages of plugins use, as Mitsuba's own define it
+# Roles and substitutions of Mitsuba's manual, which manual pages of plugins use
 rst_prolog = """
 .. role:: paramtype
 .. role:: monosp

@@ -1,9 +1,9 @@
-"""Draw the figures of docs/methods.md by the code that they explain: light trees, cuts, clusters of points, matrices.
+"""Draw the figures of docs/methods.md by the project's own code: light trees, cuts, clusters of points, matrices.
 
     ./run -- python docs/figures.py [NAME...]
 
-Writes docs/figures/. Everything is 256 pixels wide, with one camera ray a pixel and fewer virtual lights than
-renders have, so that single boxes can be seen.
+Writes docs/figures/. Figures are 256 pixels wide, with a camera ray per pixel and few virtual lights, so that single
+boxes are visible.
 """
 
 import heapq
@@ -37,14 +37,14 @@ from vpl.points.slices import build_slices  # noqa: E402
 
 FOLDER = ROOT / "docs" / "figures"
 WIDTH, LIGHTS, DEPTH, ERROR = 256, 4000, 6, 0.02
-# Corners of a box that its edges join, by the bits of x, y and z
+# Pairs of corners at the ends of the edges of a box, by the bits of x, y and z
 EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
-# Pieces of an edge, of which those outside of the picture are left out
+# Pieces of an edge; pieces outside of the picture are not drawn
 PIECES = 24
 
 
 class View:
-    """Picture of a scene, and what a method would be given to light it with: ``job``, of its diffuse surfaces."""
+    """Picture of a scene, and the `ShadeJob` of its diffuse surfaces."""
 
     def __init__(self, name, samples=1, integrator="lightcuts", **more):
         path = str(ROOT / "scenes" / f"{name}.xml")
@@ -64,7 +64,7 @@ class View:
         return images.tone_map(image, images.automatic_exposure(image))
 
     def project(self, points):
-        """Where points, (n, 3), are in the picture, in pixels: (n, 2), not numbers outside of it."""
+        """Project points, (n, 3), into the picture: pixels, (n, 2), NaN outside of the picture."""
         place = dr.zeros(mi.Interaction3f, len(points))
         place.p = upload_vectors(mi.Point3f, points)
         seen, weight = self.sensor.sample_direction(place, mi.Point2f(0.5))
@@ -73,7 +73,7 @@ class View:
         return found
 
     def outlines(self, low, high, **style):
-        """Lines of the edges of boxes, each of its own colour where ``colors`` has many."""
+        """Lines of the edges of boxes. ``colors``: a colour for all boxes, or for each box."""
         corners = np.where((np.arange(8)[:, None] >> np.arange(3)) & 1, high[:, None], low[:, None])
         along = np.linspace(0, 1, PIECES + 1)[:, None]
         edges = np.stack([corners[:, a, None] * (1 - along) + corners[:, b, None] * along for a, b in EDGES], 1)
@@ -83,7 +83,7 @@ class View:
 
 
 def panels(titles, height):
-    """A figure of panels beside each other, and its axes, without ticks; ``height`` over width of each."""
+    """A figure with a row of panels, and its axes, without ticks. ``height``: height over width of a panel."""
     figure, axes = plt.subplots(1, len(titles), figsize=(3.2 * len(titles), 3.2 * height + 0.3), layout="constrained")
     for axis, title in zip(axes, titles, strict=True):
         axis.set_title(title, fontsize=9)
@@ -103,7 +103,7 @@ def dimmed(pixels):
 
 
 def colours(count, seed=0):
-    """As many colours that neighbours can be told apart by, (count, 3)."""
+    """Distinct colours for neighbours, (count, 3)."""
     hues = np.random.default_rng(seed).permutation(count) / count
     return matplotlib.colormaps["hsv"](hues * 0.95)[:, :3]
 
@@ -138,7 +138,7 @@ def light_tree(view, pixels):
 
 
 def cuts(view, pixels):
-    """How many clusters each pixel of the Cornell box is lit by, and which ones two of them are."""
+    """Number of clusters for each pixel of the Cornell box, and the cuts of two pixels."""
     spots = {"next to a wall": (0.22, 0.30), "on the floor": (0.45, 0.93)}
     figure, axes = panels(["clusters in the cut of each pixel", *spots], 1)
     shown = axes[0].imshow(channel(view, "lightcuts", "cut_size"), cmap="magma")
@@ -206,7 +206,7 @@ def channel(view, name, aov):
 
 
 def bounds(view, _pixels):
-    """How many bounds are computed for each pixel, where it has cuts of its own and where points share them."""
+    """Number of bounds computed for each pixel, for cuts per point and for shared cuts."""
     found = {name: channel(view, name, "upper_bounds") for name in ("lightcuts", "mdlightcuts", "illuminationcut")}
     figure, axes = panels([f"{name}: {values.mean():.0f} a pixel" for name, values in found.items()], 1)
     scale = matplotlib.colors.LogNorm(1, np.percentile(found["lightcuts"], 99.5))
@@ -231,7 +231,7 @@ def learned(_view, _pixels):
 
 
 def split(view, _pixels):
-    """What `manylights` traces, what its virtual lights add, and the sum."""
+    """The traced part of `manylights`, the part of its virtual lights, and the sum."""
     plugin = mi.load_dict({"type": "manylights", "max_depth": DEPTH})
     whole = np.array(mi.render(view.scene, integrator=plugin, spp=256))[..., :3]
     gather = plugin._gather
@@ -244,7 +244,7 @@ def split(view, _pixels):
 
 
 def matrix(_view, _pixels):
-    """The matrices of one slice of the Cornell box, as matrix recovery sees them."""
+    """The matrices of matrix recovery for a slice of the Cornell box."""
     view = View("cornell", samples=4, integrator="matrixrecovery", vpl_count=50_000)
     draw_slice(view.plugin, view.job, 20, FOLDER / "matrix.png", {"scene": "cornell"})
 

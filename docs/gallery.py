@@ -2,8 +2,8 @@
 
     ./run -- python docs/gallery.py
 
-References are made by `manylights`, whose mean is that of `path`, those of direct light alone by `adaptivedirect`; they
-are kept in output/gallery. The comparison is compare.py's. Writes docs/gallery.md and the pictures in docs/gallery/.
+Renders references by `manylights`, or by `adaptivedirect` for scenes with direct light alone, and keeps the references
+in output/gallery. Compares by compare.py. Writes docs/gallery.md and the pictures in docs/gallery/.
 """
 
 import argparse
@@ -28,28 +28,30 @@ SCENES, WORK, PAGE = ROOT / "scenes", ROOT / "output" / "gallery", ROOT / "docs"
 PICTURES = PAGE.with_suffix("")
 INTEGRATORS = ("path", "manylights")
 WIDTH, BATCH, QUALITY = 256, 64, 85
-# Samples of a pixel in a pass: what two seconds hold on an idle machine, so that a busy one does not make passes small
+# Samples per pixel of a pass: two seconds on an idle machine. Passes by time would be small on a busy one
 PASS = 32
-# `max_depth` of scenes that show direct light alone, and the error of a pass of their references
+# `max_depth` of scenes with direct light alone, and the error of a pass of such a reference
 DIRECT, FINE = 2, 0.02
+# Smallest excess of a time over the other time in a warning
+UNEQUAL = 0.1
+BUSY = "The machine ran other programs, too: do not compare numbers of samples. "
 INTRODUCTION = """\
 [README](../README.md) · [front page](index.md) · gallery
 
 # Gallery
 
-Every scene of [scenes/](../scenes/README.md): `path` and `manylights` after about {seconds:g} seconds each, and the \
-reference. On the site, drag across a picture to compare two of them, and choose which two below it. All have \
-{width} pixels across; times are those of rendering, with kernels that are compiled already. Below each picture are \
-its time, its samples per pixel, and its error: the mean absolute difference from the reference, as a share of its \
-mean. The smaller one is bold. Nothing is denoised.
+Every scene of [scenes/](../scenes/README.md) by `path` and by `manylights` at equal time ({seconds:g} seconds), and \
+the reference. On the site, drag across a picture to compare two images. Images are {width} pixels wide, not \
+denoised. Below each image are its samples per pixel and its error: the mean absolute difference from the \
+reference over the mean of the reference. The smaller error is bold.
 
-{doubts}One image of a scene shows its noise, and little more: for how much faster one is than the other, see \
-[results](results.md). `./run -- python docs/gallery.py` renders all of this again.
+{doubts}One image shows noise, not speed: [results](results.md) has times at equal error. \
+`./run -- python docs/gallery.py` renders all images again.
 """
 
 
 def make_reference(name, seconds):
-    """Write output/gallery/references/NAME.exr, at least two batches of samples, unless it is there."""
+    """Write output/gallery/references/NAME.exr, from at least two batches of samples, unless the file exists."""
     file = WORK / "references" / f"{name}.exr"
     if file.exists():
         return
@@ -74,26 +76,37 @@ def convert(source, target):
 
 
 def rows(scene, introduced):
-    """The part of the page about one scene of results.json: a table of three pictures and their numbers."""
+    """Section of a scene of results.json: a table of three pictures with samples and errors, and warnings."""
     name, found = scene["name"], {one["integrator"]: one for one in scene["renders"]}
     errors = {label: found[label]["errors"]["relative_l1"] for label in INTEGRATORS}
     cells = []
     for label in INTEGRATORS:
         one, error = found[label], f"{float(f'{100 * errors[label]:.2g}'):g}%"
         bold = "**" if errors[label] == min(errors.values()) else ""
-        cells.append(f"{one['seconds']:.1f} s, {one['spp']} samples, {bold}{error}{bold}")
+        cells.append(f"{one['spp']} samples, {bold}{error}{bold}")
     labels = [*INTEGRATORS, REFERENCE]
     pictures = [f"![{name} by {label}](gallery/{name}.{label}.jpg)" for label in labels]
     cells.append(f"{scene['reference']['spp']} samples")
     titles = [f"`{label}`" for label in INTEGRATORS] + [REFERENCE]
     lines = [titles, ["---"] * 3, pictures, cells]
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    doubts = "".join(f"\n{sentence}\n" for sentence in tables.doubts(scene))
+    without_budgets = scene | {"renders": [one | {"budget": None} for one in scene["renders"]]}
+    warnings = tables.scene_warnings(without_budgets) + unequal_times(found)
+    doubts = "".join(f"\n{sentence}\n" for sentence in warnings)
     return f"## {name}\n\n{introduced[name]}\n\n{table}\n{doubts}"
 
 
+def unequal_times(found):
+    """Sentence about the ratio of times, in a list; empty where times are equal."""
+    short, long = sorted(found.values(), key=lambda one: one["seconds"])
+    ratio = long["seconds"] / short["seconds"]
+    if ratio <= 1 + UNEQUAL:
+        return []
+    return [f"Not at equal time: `{long['integrator']}` took {ratio:.2f} times as long as `{short['integrator']}`."]
+
+
 def described():
-    """What scenes/README.md says of each scene: lights, and what it is for."""
+    """Lights and purpose of each scene, from scenes/README.md."""
     lines = (SCENES / "README.md").read_text().splitlines()
     cells = [line.strip("| ").split(" | ") for line in lines if line.startswith("| [")]
     return {cell[0][1:].partition("]")[0]: f"{cell[1][0].upper()}{cell[1][1:]}. For: {cell[2]}." for cell in cells}
@@ -101,8 +114,8 @@ def described():
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=30.0, help="time of each image (default: 30)")
-    parser.add_argument("--reference-seconds", type=float, default=150.0, help="of each reference (default: 150)")
+    parser.add_argument("--seconds", type=float, default=30.0, help="time of an image (default: 30)")
+    parser.add_argument("--reference-seconds", type=float, default=150.0, help="time of a reference (default: 150)")
     options = parser.parse_args()
     names = sorted(path.stem for path in SCENES.glob("*.xml"))
     command_line.set_variant("llvm_ad_rgb")
@@ -123,7 +136,7 @@ def main():
             convert(WORK / f"{name}.{label}.png", PICTURES / f"{name}.{label}.jpg")
     introduced = described()
     renders = [one for scene in results["scenes"] for one in scene["renders"]]
-    doubts = "".join(f"{sentence} " for sentence in tables.busy(renders, results["machine"]["cores"]))
+    doubts = BUSY if tables.load_warnings(renders, results["machine"]["cores"]) else ""
     introduction = INTRODUCTION.format(seconds=options.seconds, width=WIDTH, doubts=doubts)
     PAGE.write_text("\n".join([introduction, *(rows(scene, introduced) for scene in results["scenes"])]))
     return 0

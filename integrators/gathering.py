@@ -5,16 +5,16 @@ from __future__ import annotations
 import signal
 import threading
 from dataclasses import dataclass
-from time import perf_counter
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from vpl.core.arrays import add_at, download, usable
+from vpl.core.clock import Clock
 from vpl.core.exclusive import exclusive
 from vpl.core.shared_code import share_code
-from vpl.core.stages import Stage, tell
+from vpl.core.stages import Stage
 from vpl.lights.emitters import Emitters, read_emitters
 from vpl.points.camera_paths import CameraPaths, PixelGrid, SceneTraits, follow_camera_rays, refuse_media, scene_traits
 
@@ -23,36 +23,6 @@ from .knobs import PATH_KNOBS, Integer, read_knobs, show_knobs
 
 # A property of Mitsuba's integrators, whose value Mitsuba does not expose
 _SAMPLES_PER_PASS = Integer("samples_per_pass", 2**32 - 1, "Most samples of a pixel in a pass.", minimum=1)
-
-
-class Clock:
-    """Seconds of each stage of a render.  The first stage begins at construction.  The next stage, or :meth:`stop`,
-    ends a stage after the device has finished.  Listeners (:func:`vpl.core.stages.listening`) hear the start of each
-    stage."""
-
-    def __init__(self, stage: Stage):
-        self.seconds: dict[str, float] = {}
-        self._stage: Stage | None = None
-        self.begin(stage)
-
-    def begin(self, stage: Stage) -> None:
-        """End the current stage and begin ``stage``."""
-        self.stop()
-        tell(stage)
-        self._stage, self._start = stage, perf_counter()
-
-    def stop(self) -> None:
-        """End the current stage."""
-        if self._stage is not None:
-            dr.sync_thread()
-            self.add({self._stage: perf_counter() - self._start})
-            self._stage = None
-
-    def add(self, seconds: dict[str, float]) -> None:
-        """Add seconds by stage, measured by another clock."""
-        for stage, spent in seconds.items():
-            # Plain text, as statistics are printed
-            self.seconds[str(stage)] = self.seconds.get(stage, 0.0) + spent
 
 
 def whole_sum(values) -> int:

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.arrays import download, upload
+from vpl.core.clock import Clock
 from vpl.core.morton import interleave
 from vpl.core.sampling import derived_seed
 from vpl.core.stages import Stage
@@ -19,7 +20,6 @@ from vpl.points.slices import build_slices
 from vpl.transport.evaluation import sum_lights
 
 from .common import ManyLightIntegrator, ShadeJob, ShadeResult
-from .gathering import Clock
 from .knobs import Integer, Number
 from .manual import manual_page
 

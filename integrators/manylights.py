@@ -1,48 +1,24 @@
-"""The image of Mitsuba's ``path``, sooner: virtual lights carry what they can, and the rest is traced."""
+"""The image of Mitsuba's ``path`` with less variance: virtual lights carry diffuse light, paths trace the rest."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
-
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from vpl.core.arrays import channel_mean, download
-from vpl.core.sampling import derived_seed
+from vpl.core.clock import Clock
 from vpl.core.stages import Stage
-from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.perturbed import Perturbed
-from vpl.points.camera_paths import SceneTraits
-from vpl.split.balance import Balance
-from vpl.split.decision import Decision
-from vpl.split.gather_vertices import LitVertices
-from vpl.split.kept_lights import KeptLights, TreedLights
-from vpl.split.next_event import emitters_of
-from vpl.split.paths import Limits, Rules
-from vpl.split.pilot import Arrivals
-from vpl.split.pixel_clusters import PixelClusters, light_clusters
-from vpl.split.site_choice import learning_rays
-from vpl.split.surface_lights import surface_lights
-from vpl.split.view import View
-from vpl.split.view_lights import ViewLights, spaced_lights
-from vpl.split.worth import Worth
-from vpl.transport.evaluation import Transport
+from vpl.split.cost_model import CostModel
+from vpl.split.emitters import emitter_sampler
+from vpl.split.emitters.learned import learning_rays
+from vpl.split.estimator import estimate
+from vpl.split.roulette import OutgoingRadiance
+from vpl.split.surface_lights import KeptLights
+from vpl.split.view import PathRules, View
 
-from .gathering import Clock, GatheringIntegrator, add_statistics
+from .gathering import GatheringIntegrator
 from .knobs import Boolean
 from .manual import manual_page
-
-# Camera rays that are followed at a time, about: half of them, but so many at least and at most. Memory that is new to
-# a process takes long to fill, which is felt in small images, and kernels are recorded anew each time
-_WAVEFRONT = 1 << 18, 1 << 20
-# Pixels darker than this share of the image's mean are lit as precisely as if they had it
-_DARK_FLOOR = 0.1
-# Nodes of the cut of a cluster, at most
-_MAX_CUT = 1000
-# Surfaces as virtual lights see them: all of them block, for what passes one is traced
-_OPAQUE = SceneTraits(False, False, True, False, False, (), (), None)
 
 
 @manual_page
@@ -132,145 +108,33 @@ class ManyLightsIntegrator(GatheringIntegrator):
 
     renders_in_parts = True
 
-    def __init__(self, props):
+    def __init__(self, props, cost_model: CostModel | None = None):
         super().__init__(props)
-        self._kept = KeptLights()
+        self.cost_model, self._kept = cost_model or CostModel(), KeptLights()
 
     def _sample(self, scene, sampler, ray, active):
         clock = Clock(Stage.SCENE)
-        radiance, valid = self._trace(self._view(scene, sampler, ray, active), clock)
-        return mi.Spectrum(radiance), valid, []
+        view = self._view(scene, sampler, ray, active)
+        kept = self._kept if self.keep_lights else None
+        found = estimate(view, self.virtual_lights, kept, self.should_stop, clock)
+        self.statistics = found.statistics
+        return mi.Spectrum(found.radiance), found.valid, []
 
     def _view(self, scene, sampler, ray, active) -> View:
         number = dr.detach(sampler.next_1d())
         seed = int(dr.reinterpret_array(mi.UInt32, number)[0])
-        # Of some sensors all rays are the same one
         grid, count = self.pixel_grid(scene, sampler), max(dr.width(ray), dr.width(number))
+        # Some sensors give a single ray for all samples
         wide = dr.zeros(mi.Float, count)
         ray.o, ray.d, ray.time = ray.o + wide, ray.d + wide, ray.time + wide
         active = mi.Bool(active) & dr.full(mi.Bool, True, count)
         dr.make_opaque(ray, active)
-        emission = emitters_of(scene, learning_rays(count))
         alike = dr.opaque(mi.Float, 1.0, -(-count // grid.samples))
-        size = grid.width, grid.samples
-        rules = Rules(self.max_depth, self.rr_depth, self.hide_emitters)
-        return View(scene, emission, Perturbed(scene), rules, ray, active, *size, seed, alike, Worth.unknown())
-
-    def _trace(self, view: View, clock: Clock):
-        """(Radiance of each camera ray, whether it is opaque in the film's alpha)."""
-        clock.begin(Stage.PILOT)
-        self.statistics = {}
-        decision = Decision.of(view, self.virtual_lights)
-        chosen, worth = decision.balance, decision.judge(view)
-        if worth is not None:
-            self.statistics["worth"] = worth
-        mi.Log(mi.LogLevel.Info, f"manylights: {chosen}")
-        lights = self._lights(view, decision.pilot.arrivals, chosen, clock)
-        limits = view.limits(lights)
-        expected = decision.expected_light(lights) if lights.all else None
-        radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
-        # Whole pixels, in parts of about the same size
-        parts = max(round(view.count / np.clip(view.count / 2, *_WAVEFRONT)), 1)
-        most = -(-view.pixels // parts) * view.samples
-        for first in range(0, view.count, most):
-            if self.should_stop():
-                break
-            lane = dr.arange(mi.UInt32, min(most, view.count - first)) + dr.opaque(mi.UInt32, first)
-            dr.eval(lane)
-            part, opaque = self._part(view, lane, first, limits, lights, chosen, expected, clock)
-            dr.scatter(radiance, part, lane)
-            dr.scatter(valid, opaque, lane)
-            dr.eval(radiance, valid)
-        clock.stop()
-        if view.scene.environment() is not None and not self.hide_emitters:
-            valid |= view.active
-        finite = dr.all(dr.isfinite(radiance))
-        dropped = int(dr.count(~finite)[0])
-        if dropped:
-            mi.Log(mi.LogLevel.Warn, f"{dropped} sample(s) with values that are not finite were dropped.")
-        self.statistics |= {"balance": chosen.reason, "dropped": dropped, "seconds": clock.seconds}
-        return dr.select(finite & (self.max_depth > 0), radiance, 0), valid & (self.max_depth > 0)
-
-    def _part(self, view: View, lane, first: int, limits: Limits, lights: ViewLights, chosen: Balance, expected, clock):
-        """(Radiance of the camera rays ``lane``, of whole pixels and from ``first`` on, whether each is opaque in the
-        film's alpha)."""
-        clock.begin(Stage.TRACED)
-        found, *vertices, _ = view.follow(lane, limits, 4, first)
-        radiance, valid = found.radiance, found.valid
-        if not lights.all:
-            return radiance, valid
-        clock.begin(Stage.CLUSTERS)
-        seed = derived_seed(view.seed, 5, first)
-        points = LitVertices.of(*vertices, view.samples, chosen.vertices, derived_seed(seed, 0))
-        # Memory for the cuts
-        del found, vertices, _
-        nearby = expected[first // view.samples :][: -(-len(lane) // view.samples)]
-        return radiance + self._gather(view, lights, chosen, points, radiance, nearby, seed, clock), valid
-
-    def _lights(self, view: View, arrivals: Arrivals, chosen: Balance, clock: Clock) -> ViewLights:
-        """Virtual lights and their trees."""
-        surfaces = self._surface_lights(view, arrivals, chosen, clock) if chosen.light_paths else None
-        if not chosen.emitters:
-            return ViewLights(surfaces)
-        clock.begin(Stage.TREE)
-        lights = view.emission.lights
-        emitters = view.emitter_lights(lights.groups(lights.points(view.count), derived_seed(view.seed, 7)))
-        self.statistics["lights"] = self.statistics.get("lights", {}) | {"emitters": emitters.count}
-        return ViewLights(surfaces, emitters)
-
-    def _surface_lights(self, view: View, arrivals: Arrivals, chosen: Balance, clock: Clock) -> LightSet | None:
-        """Virtual lights on surfaces; None where there are none."""
-        clock.begin(Stage.LIGHTS)
-        # None is followed where they are kept
-        self.statistics["light_paths"] = 0
-        make = partial(self._made_lights, view, arrivals, chosen, clock)
-        made = self._kept.find(view.scene, (view.seed, self.max_depth), make) if self.keep_lights else make()
-        self.statistics["lights"] = {"surface": made.surface.lights.count}
-        if made.group is None:
-            return None
-        return spaced_lights([made.group], made.surface.spacing(arrivals), self.max_depth)
-
-    def _made_lights(self, view: View, arrivals: Arrivals, chosen: Balance, clock: Clock) -> TreedLights:
-        """Virtual lights where the pilot's paths arrived, and their tree."""
-        # The path from a light is shorter by the two edges between camera and light, and no camera path, whose worth
-        # would be known
-        rules = replace(view.rules, max_depth=self.max_depth - 2, rr_depth=1)
-        limits = replace(view, rules=rules, worth=Worth.unknown()).limits(ViewLights())
-        seed = derived_seed(view.seed, 2)
-        made = surface_lights(view.scene, view.emission, arrivals, chosen.light_paths, limits, seed)
-        self.statistics["light_paths"] = chosen.light_paths
-        if made.lights.count == 0:
-            return TreedLights(made, None)
-        clock.begin(Stage.TREE)
-        return TreedLights(made, ScatteredGroup.of(made.lights, derived_seed(view.seed, 3)))
-
-    def _gather(self, view, lights, chosen, points: LitVertices, found, expected, seed, clock):
-        """Light of virtual lights at the ``points`` of some pixels, per camera ray.
-
-        ``expected``: light that lights should bring to each pixel, by which errors are judged together with what its
-        paths ``found``.
-        """
-        samples, count = view.samples, dr.width(found)
-        lit = dr.zeros(mi.UnpolarizedSpectrum, count)
-        dr.eval(lit)
-        if points.count == 0:
-            return lit
-        clusters = PixelClusters(points, samples)
-        clock.begin(Stage.CUTS)
-        traced = np.nan_to_num(download(channel_mean(found)), posinf=0, neginf=0)
-        level = np.maximum(traced, 0).reshape(-1, samples).mean(1) + expected
-        level = np.maximum(level, _DARK_FLOOR * level.mean())
-        # What a pair may add to what the vertices of a pixel bring together
-        allowed = chosen.error * points.kept * level[clusters.pixel]
-        shadow_rays = 0
-        for number, carrying in enumerate(lights.all):
-            transport, stream = Transport(view.scene, _OPAQUE, carrying), derived_seed(seed, 1, number)
-            shadow_rays += light_clusters(transport, clusters, allowed, _MAX_CUT, stream, lit)
-        clock.stop()
-        more = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}
-        add_statistics(self.statistics, more | {"later": points.alone})
-        # Every step-th sample stands for all
-        return lit * dr.opaque(mi.Float, samples / points.kept)
+        return View(
+            scene, emitter_sampler(scene, learning_rays(count)), Perturbed(scene),
+            PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray, active, grid.width, grid.samples, seed,
+            alike, OutgoingRadiance.unknown(), self.cost_model,
+        )  # fmt: skip
 
 
 mi.register_integrator("manylights", ManyLightsIntegrator)

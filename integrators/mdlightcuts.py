@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.arrays import download
+from vpl.core.clock import Clock
 from vpl.core.stages import Stage
 from vpl.cuts.light_cuts import Estimate, estimate_radiance
 from vpl.cuts.pixel_cuts import PixelCuts
@@ -17,7 +18,6 @@ from vpl.points.gather_tree import build_gather_tree
 from vpl.points.point_clusters import PointClusters
 
 from .common import DARK_FLOOR, ManyLightIntegrator, ShadeJob, ShadeResult
-from .gathering import Clock
 from .knobs import Fraction, Integer
 from .manual import manual_page
 

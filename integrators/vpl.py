@@ -5,11 +5,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from vpl.core.clock import Clock
 from vpl.core.stages import Stage
 from vpl.transport.evaluation import sum_all_lights
 
 from .common import ManyLightIntegrator, ShadeJob, ShadeResult
-from .gathering import Clock
 from .manual import manual_page
 
 

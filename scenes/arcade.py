@@ -1,8 +1,8 @@
-"""Write a sunlit arcade: a walk between a wall and a row of columns, under a roof of slats, open to a sky with a sun.
+"""Generate a sunlit arcade: a walk between a wall and a row of columns, under a roof of slats, beside an open court.
 
-The scene is for environment emitters behind gaps: most of the walk sees the sky through narrow openings, the sun
-falls in stripes on floor and wall, and what is bright elsewhere is lit by these stripes. Methods that draw from the
-whole environment lose most of their samples to columns and slats, those without indirect light most of the picture.
+Purpose: environment emitters behind gaps. Most of the walk sees the sky through narrow openings; sunlight forms stripes
+on floor and wall, and these stripes light the remaining surfaces. Columns and slats block most samples of the
+environment, and indirect light dominates.
 
     python scenes/arcade.py --output scenes/arcade.xml
 """
@@ -11,9 +11,9 @@ import numpy as np
 from elements import ball, box, drum, header, material, sky, sky_image, slab, tube, write_scene
 
 LENGTH, WIDTH, HEIGHT, WALL = 24.0, 4.0, 4.4, 0.35  # metres: x from 0 to LENGTH, y from 0 (columns) to WIDTH (wall)
-BAY = 3.0  # from column to column
-ARCH = 2.7  # height at which arches begin
-COURT = 12.0  # depth of the court beyond the columns
+BAY = 3.0  # distance between columns
+ARCH = 2.7  # height of the springing of the arches
+COURT = 12.0  # depth of the court behind the columns
 SKY, SUN = "arcade_sky.exr", (0.3, -0.6, 0.78)
 
 MATERIALS = [
@@ -31,7 +31,7 @@ MATERIALS = [
 
 
 def shell():
-    """Return floor, wall with doors, ends, and the roof of slats."""
+    """Yield the floor, the walls with doors, and the roof of slats."""
     yield box("tile", (0, -0.4, -WALL), (LENGTH, WIDTH, 0))
     for x in np.arange(0, LENGTH, 1.0):
         for y in np.arange(0.1 + (x % 2) * 0.5, WIDTH - 0.5, 1.0):
@@ -43,14 +43,14 @@ def shell():
         yield box("pale", (x - 0.75, WIDTH - 0.06, 0), (x + 0.75, WIDTH, 2.6))
         yield box("door", (x - 0.6, WIDTH - 0.1, 0), (x + 0.6, WIDTH - 0.05, 2.45))
         yield ball("copper", (x + 0.45, WIDTH - 0.14, 1.05), 0.05)
-    for x in np.arange(0.3, LENGTH, 0.75):  # the roof lets a third of the sky through
+    for x in np.arange(0.3, LENGTH, 0.75):  # the roof transmits a third of the sky
         yield slab("wood", (x, WIDTH / 2, HEIGHT + 0.1), (0.42, WIDTH + 0.8, 0.05), "y", 18)
     for y in (0.0, WIDTH / 2, WIDTH - 0.1):
         yield box("wood", (0, y - 0.08, HEIGHT - 0.12), (LENGTH, y + 0.08, HEIGHT + 0.02))
 
 
 def arches():
-    """Return the columns, and the arches that they carry, of leaning stones."""
+    """Yield the columns and their arches of tilted stones."""
     for x in np.arange(0, LENGTH + 0.1, BAY):
         yield box("pale", (x - 0.32, -0.32, 0), (x + 0.32, 0.32, 0.3))
         yield tube("stone", (x, 0, 0.3), (x, 0, ARCH - 0.2), 0.22)
@@ -64,7 +64,7 @@ def arches():
 
 
 def court():
-    """Return the court beyond the columns: grass, a far wall, trees."""
+    """Yield the court behind the columns: grass, a far wall, trees."""
     yield box("grass", (-6, -COURT, -WALL), (LENGTH + 6, -0.4, -0.02))
     yield box("stone", (-6, -COURT - WALL, 0), (LENGTH + 6, -COURT, 3.0))
     for x, y in ((5, -6), (11, -8.5), (17, -5.5), (22, -8)):
@@ -74,7 +74,7 @@ def court():
 
 
 def furniture(random):
-    """Return benches along the wall and pots between the columns."""
+    """Yield benches along the wall and pots between the columns."""
     for x in np.arange(4.5, LENGTH - 2, 2 * BAY):
         yield box("wood", (x - 0.9, WIDTH - 0.6, 0.42), (x + 0.9, WIDTH - 0.12, 0.48))
         for dx in (-0.7, 0.7):
@@ -87,7 +87,7 @@ def furniture(random):
 
 
 def arcade(seed):
-    """Return the scene as XML text; the seed is that of the plants."""
+    """Return the scene as XML text; the seed determines the plants."""
     command = f"arcade.py --seed {seed} --output scenes/arcade.xml"
     camera = (66, (0.7, 2.9, 1.65), (11, 1.35, 1.6))
     parts = [header(command, "An arcade in the sun", *camera, 6), *MATERIALS]
@@ -96,7 +96,7 @@ def arcade(seed):
 
 
 def texels():
-    """Return the texels of a clear sky with a sun that shines between the columns."""
+    """Return the texels of a clear sky with a sun visible between the columns."""
     return sky_image((0.12, 0.26, 0.6), (0.42, 0.48, 0.56), (0.05, 0.045, 0.035), (760, 640, 460), SUN, 5, 0.008)
 
 

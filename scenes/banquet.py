@@ -1,8 +1,8 @@
-"""Write a banquet hall: downlights in a grid at the ceiling, lamps on the tables, and strips of light in coves.
+"""Generate a banquet hall: a grid of downlights in the ceiling, lamps on the tables, and light strips in coves.
 
-The scene is for many lights of which most light what is seen, and for their reflections: 60 spots, 42 small globes and
-24 long panels that shine upwards from behind a ledge, so that half of the light comes by way of the ceiling. Nothing
-large is hidden, but every table casts soft shadows of its chairs and glasses.
+Purpose: many lights, most of them visible, and strong indirect light. 60 spots, 42 small globes and 24 long panels; the
+panels shine upwards behind a ledge, so that half of the light arrives via the ceiling. No large surface is in shadow,
+but chairs and glasses cast soft shadows.
 
     python scenes/banquet.py --output scenes/banquet.xml
 """
@@ -11,9 +11,9 @@ import numpy as np
 from elements import ball, box, corners, downlight, drum, flat, glow, header, material, tube, write_scene
 
 LENGTH, HALF, HEIGHT, WALL = 24.0, 7.0, 4.6, 0.25  # metres: x from 0 to LENGTH, |y| < HALF
-LEDGE = 3.7  # height of the ledge that hides the strips of light
+LEDGE = 3.7  # height of the ledge in front of the light strips
 TABLES, TABLE_LENGTH, TABLE_WIDTH, TABLE_HEIGHT = (-4.4, 0.0, 4.4), 16.8, 1.3, 0.76
-FIRST = 4.2  # x where the tables begin
+FIRST = 4.2  # x of the near end of the tables
 
 WARM, WHITE, AMBER = (1.0, 0.66, 0.36), (1.0, 0.86, 0.70), (1.0, 0.52, 0.2)
 MATERIALS = [
@@ -32,7 +32,7 @@ MATERIALS = [
 
 
 def shell():
-    """Return floor, ceiling with its beams, panelled walls, and the ledges in front of the coves."""
+    """Yield the floor, the ceiling with beams, panelled walls, and the ledges of the coves."""
     yield box("parquet", (0, -HALF, -WALL), (LENGTH, HALF, 0))
     yield box("plaster", (0, -HALF, HEIGHT), (LENGTH, HALF, HEIGHT + WALL))
     for x in np.arange(2.0, LENGTH, 4.0):
@@ -51,7 +51,7 @@ def shell():
 
 
 def chair(x, y, side):
-    """Return a chair that faces the table at its `side`."""
+    """Yield a chair facing the table from this `side`."""
     seat = y + side * (TABLE_WIDTH / 2 + 0.25)
     for dx in (-0.18, 0.18):
         for dy in (-0.18, 0.18):
@@ -62,7 +62,7 @@ def chair(x, y, side):
 
 
 def setting(x, y, side, random):
-    """Return a plate with cutlery, and a glass."""
+    """Yield a plate with cutlery, and a glass."""
     edge = y + side * (TABLE_WIDTH / 2 - 0.25)
     yield from drum("china", (x, edge, TABLE_HEIGHT), 0.13, 0.015)
     for dx in (-0.18, 0.18):
@@ -75,7 +75,7 @@ def setting(x, y, side, random):
 
 
 def table(y, random):
-    """Return a laid table with its cloth, chairs and bouquets."""
+    """Yield a set table with cloth, chairs and bouquets."""
     end = FIRST + TABLE_LENGTH
     low, high = y - TABLE_WIDTH / 2, y + TABLE_WIDTH / 2
     yield box("linen", (FIRST, low, TABLE_HEIGHT - 0.3), (end, high, TABLE_HEIGHT))
@@ -94,7 +94,7 @@ def table(y, random):
 
 
 def lights(random):
-    """Return the 126 lights: spots, lamps on the tables with their stands, strips in the coves."""
+    """Yield the 126 lights: spots, table lamps with stands, strips in the coves."""
     for x in np.linspace(1.0, LENGTH - 1.0, 12):
         for y in np.linspace(-5.6, 5.6, 5):
             yield downlight((x, y, HEIGHT - 0.31), 32, 16, WHITE, random)
@@ -110,7 +110,7 @@ def lights(random):
 
 
 def banquet(seed):
-    """Return the scene as XML text, the same for the same seed."""
+    """Return the scene as XML text, determined by the seed."""
     furniture, power = np.random.default_rng(7), np.random.default_rng(seed)
     command = f"banquet.py --seed {seed} --output scenes/banquet.xml"
     parts = [header(command, "A banquet hall with 126 lights", 78, (0.5, -2.3, 2.2), (11, 0.9, 1.2), 6), *MATERIALS]

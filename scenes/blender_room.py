@@ -1,9 +1,8 @@
-"""Write a room as Blender exports one: what the Mitsuba add-on's exporter makes of a small scene, without Blender.
+"""Generate a room in the format of Blender's Mitsuba add-on, without Blender.
 
-The scene is for files from there: principled materials, textures in files, meshes in PLY files, of which one has two
-materials, a sun lamp and a lamp with an area, a glowing mesh, a sky as the world, and the camera as a matrix. Names,
-values that are left at Blender's defaults, and the turn from z up to y up are those of the add-on, which hands a
-dictionary to the same writer of Mitsuba's.
+Purpose: scenes exported from Blender, with principled materials, texture files, PLY meshes (one split by material), a
+sun, an area lamp, a glowing mesh, a world sky, and a camera matrix. Names, Blender's defaults and the conversion from
+z-up to y-up follow the add-on, which also passes a dictionary to Mitsuba's XML writer.
 
     ./run -- python scenes/blender_room.py --output scenes/blender_room.xml
 """
@@ -15,9 +14,9 @@ import mitsuba as mi
 import numpy as np
 from elements import sky_image, write_image
 
-SIZE, WINDOW = (4.0, 5.0, 2.6), ((1.6, 0.9), (3.6, 2.2))  # metres; the window's corners in the wall x = 4: y and z
+SIZE, WINDOW = (4.0, 5.0, 2.6), ((1.6, 0.9), (3.6, 2.2))  # metres; window corners (y, z) in the wall x = 4
 TEXELS = 128
-# Blender's z is up, Mitsuba's y; its cameras look along their -z, Mitsuba's along z; its lamps shine along their -z
+# Axes of Blender: z up, cameras and lamps along -z; axes of Mitsuba: y up, cameras along z
 AXES = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)
 ABOUT_Y, ABOUT_X = np.diag([-1.0, 1, -1, 1]), np.diag([1.0, -1, -1, 1])
 WORLD = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
@@ -30,7 +29,7 @@ class Faces:
         self.positions, self.coordinates = [], []
 
     def quad(self, corner, along, up):
-        """Add a parallelogram that faces the direction `along` × `up`."""
+        """Add a parallelogram with normal `along` × `up`."""
         corner, along, up = (np.asarray(vector, float) for vector in (corner, along, up))
         self.positions += [corner, corner + along, corner + along + up, corner + up]
         a, b = np.linalg.norm(along), np.linalg.norm(up)
@@ -38,7 +37,7 @@ class Faces:
         return self
 
     def block(self, low, high):
-        """Add the six sides of a cuboid."""
+        """Add the six faces of a cuboid."""
         low = np.asarray(low, float)
         x, y, z = np.diag(np.subtract(high, low))
         for corner, along, up in ((low, y, x), (low, z, y), (low, x, z)):
@@ -47,13 +46,13 @@ class Faces:
         return self
 
     def mesh(self, name):
-        """The mesh, flat shaded."""
+        """Return the flat-shaded mesh."""
         quads = np.arange(len(self.positions)).reshape(-1, 4)
         return mesh(name, self.positions, quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), self.coordinates)
 
 
 def mesh(name, positions, faces, coordinates=None, normals=None):
-    """Return a mesh of Mitsuba's from one in Blender's coordinates: (n, 3), (m, 3) indices, (n, 2), (n, 3)."""
+    """Return a Mitsuba mesh from Blender coordinates: (n, 3), indices (m, 3), (n, 2), (n, 3)."""
     made = mi.Mesh(
         name, len(positions), len(faces), has_vertex_normals=normals is not None,
         has_vertex_texcoords=coordinates is not None,
@@ -71,7 +70,7 @@ def mesh(name, positions, faces, coordinates=None, normals=None):
 
 
 def ball(name, centre, radius, rings=16, segments=32):
-    """Return a UV sphere, smoothly shaded."""
+    """Return a smooth-shaded UV sphere."""
     polar = np.linspace(0, np.pi, rings + 1)[:, None]
     azimuth = np.linspace(0, 2 * np.pi, segments + 1)
     normals = np.stack(np.broadcast_arrays(
@@ -86,7 +85,7 @@ def ball(name, centre, radius, rings=16, segments=32):
 
 
 def room():
-    """Return the shell of the room in two parts, as it has two materials: walls with ceiling, and the floor."""
+    """Return the room in two parts by material: walls with ceiling, and floor."""
     x, y, z = SIZE
     (y0, z0), (y1, z1) = WINDOW
     walls = Faces()
@@ -99,7 +98,7 @@ def room():
 
 
 def table():
-    """Return a table top on four legs."""
+    """Return a table: top and four legs."""
     top = Faces().block((1.2, 3.0, 0.7), (2.8, 4.0, 0.75))
     for corner in ((1.25, 3.05), (2.69, 3.05), (1.25, 3.89), (2.69, 3.89)):
         top.block((*corner, 0), (*np.add(corner, 0.06), 0.7))
@@ -107,7 +106,7 @@ def table():
 
 
 def planks(random):
-    """Return the texels of a floor of planks, and of its roughness, in [0, 1]."""
+    """Return the colour and roughness texels, in [0, 1], of a plank floor."""
     row, column = np.mgrid[:TEXELS, :TEXELS]
     plank = column // 16
     tone = random.uniform(0.7, 1.0, TEXELS // 16)[plank] * (1 + 0.1 * np.sin(row / 3 + 7 * plank))
@@ -117,7 +116,7 @@ def planks(random):
 
 
 def write_png(path, texels):
-    """Write numbers in [0, 1] as bytes, as they are."""
+    """Write numbers in [0, 1] as bytes without colour conversion."""
     mi.Bitmap(np.uint8(np.round(texels * 255))).write(str(path))
 
 
@@ -130,7 +129,7 @@ def bitmap(file, **more):
 
 
 def principled(base_color, roughness=0.5, metallic=0.0, specular=0.5, clearcoat=0.0):
-    """Return what becomes of Blender's principled node, on both sides."""
+    """Return the add-on's translation of Blender's principled node, two-sided."""
     return {"type": "twosided", "bsdf": {
         "type": "principled", "base_color": base_color, "spec_tint": 0.0, "spec_trans": 0.0, "metallic": metallic,
         "anisotropic": 0.0, "roughness": roughness, "sheen": 0.0, "sheen_tint": 0.5, "clearcoat": clearcoat,
@@ -150,12 +149,12 @@ MATERIALS = {
 
 
 def transform(matrix):
-    """Return a transform of Blender's as Mitsuba has it."""
+    """Convert a Blender matrix to a Mitsuba transform."""
     return mi.ScalarTransform4f(AXES @ matrix)
 
 
 def placed(origin, target):
-    """Return Blender's matrix of what stands at `origin` and looks along its -z at `target`, both (3,)."""
+    """Return Blender's matrix of an object at `origin` whose -z axis points to `target`, both (3,)."""
     back = np.subtract(origin, target) / np.linalg.norm(np.subtract(origin, target))
     right = np.cross((0, 0, 1), back)
     right /= np.linalg.norm(right)
@@ -165,7 +164,7 @@ def placed(origin, target):
 
 
 def lights():
-    """Return world, sun and a lamp with an area, as the add-on converts them."""
+    """Yield world, sun and area lamp as converted by the add-on."""
     yield {"type": "envmap", "filename": "textures/sky.exr", "scale": 1.0, "to_world": transform(WORLD)}
     sun = placed((9.0, 1.0, 6.5), (1.6, 2.6, 0.0))
     yield {"type": "directional", "irradiance": rgb(12, 10.8, 9), "to_world": transform(sun @ ABOUT_X)}
@@ -180,7 +179,7 @@ def lights():
 
 
 def camera():
-    """Return Blender's camera of 28 mm."""
+    """Return a Blender camera with a focal length of 28 mm."""
     return {
         "type": "perspective", "fov_axis": "x", "fov": float(np.degrees(2 * np.arctan(18 / 28))),
         "principal_point_offset_x": 0.0, "principal_point_offset_y": -0.0, "near_clip": 0.1, "far_clip": 100.0,
@@ -191,7 +190,7 @@ def camera():
 
 
 def shapes():
-    """Return (name, mesh, material, emitter or None) of the meshes."""
+    """Yield (name, mesh, material, emitter or None) of each mesh."""
     walls, floor = room()
     lantern = {"type": "area", "radiance": rgb(9, 5.4, 2.4)}
     yield "Room-Plaster", walls.mesh("Room-Plaster"), "mat-Plaster", None
@@ -206,8 +205,8 @@ def shapes():
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--seed", type=int, default=1, help="seed of the floor's planks (default: 1)")
-    parser.add_argument("--output", type=Path, default=Path("blender_room.xml"), help="file to write; meshes and "
-                        "textures land in folders beside it (default: blender_room.xml)")  # fmt: skip
+    parser.add_argument("--output", type=Path, default=Path("blender_room.xml"), help="output file; meshes and "
+                        "textures go to folders beside it (default: blender_room.xml)")  # fmt: skip
     options = parser.parse_args(arguments)
     folder = options.output.parent
     for name in ("meshes", "textures"):

@@ -1,11 +1,11 @@
-"""Write the concourse of a railway station, lit by 613 point emitters and 219 glowing globes.
+"""Generate the concourse of a railway station with 613 point emitters and 219 glowing globes.
 
-The scene is for methods that find out, pixel by pixel, which of many lights matter. It has the lights of `GCT` in
-Donikian et al., "Accurate direct illumination using iterative adaptive sampling" (2006), Table 1: 613 point and 219
-spherical area emitters, of which about a third is visible from an average point. Here the points are stars below
-the vault, lamps behind the cornices and under the balconies, and bulbs in the side passages, booths and stairs; the
-globes hang in chandeliers and stand on columns, balustrades and the clock. Columns, piers, balusters, booths and
-arches hide them. The floor and the brass are glossy.
+Purpose: methods that learn, per pixel, which of many lights are visible. The numbers of lights match `GCT` in Donikian
+et al., "Accurate direct illumination using iterative adaptive sampling" (2006), Table 1: 613 point and 219 spherical
+area emitters, of which an average point sees about a third. Point emitters are stars below the vault, lamps behind
+cornices and under balconies, and bulbs in side passages, booths and stairs. Globes hang in chandeliers and stand on
+columns, balustrades and the clock. Columns, piers, balusters, booths and arches occlude them. Floor and brass are
+glossy.
 
     python scenes/concourse.py --output scenes/concourse.xml
 """
@@ -17,13 +17,13 @@ from elements import ball, box, bulb, corners, drum, glow, header, material, par
 
 LENGTH, HALF, HEIGHT, WALL = 60.0, 15.0, 13.0, 0.4  # metres: x from 0 to LENGTH, |y| < HALF; the vault starts at HEIGHT
 PASSAGE, PASSAGE_HEIGHT, ARCH = 22.0, 6.0, 5.2  # |y| of the outer wall; heights of the passages and their openings
-BAY = 6.0  # length along x; every bay has an opening on each side, 3.6 m wide
-BALCONY, FLOOR, RAIL = 10.6, 6.4, 1.1  # |y| of its edge, height of its floor, height of its balustrade
-MEZZANINE, LANDING = 48.0, 4.0  # x of its edge, its height
+BAY = 6.0  # length along x; each bay has an opening of 3.6 m on each side
+BALCONY, FLOOR, RAIL = 10.6, 6.4, 1.1  # balconies: |y| of the edge, height of the floor, height of the balustrade
+MEZZANINE, LANDING = 48.0, 4.0  # mezzanine: x of the edge, height
 STEPS = 20
-BOOTHS = np.arange(15.0, 43.0, 3.0)  # x of the middle of each, on the side of y < 0
+BOOTHS = np.arange(15.0, 43.0, 3.0)  # x of the booth centres, on the side y < 0
 CLOCK = (29.0, 1.5)
-RISE = 6.0  # of the vault above its foot
+RISE = 6.0  # of the vault above its springing
 
 WARM, WHITE, COOL, AMBER = (1.0, 0.66, 0.36), (1.0, 0.85, 0.68), (0.62, 0.8, 1.0), (1.0, 0.5, 0.18)
 
@@ -45,7 +45,7 @@ MATERIALS = [
 
 
 def shell():
-    """Return the floor with its inlays, the outer walls, and the end walls with tall windows, dark by night."""
+    """Yield the floor with inlays, the outer walls, and the end walls with tall windows, dark at night."""
     yield box("marble", (0, -PASSAGE, -WALL), (LENGTH, PASSAGE, 0))
     for x in np.arange(3, MEZZANINE - 7, 3.0):
         yield box("inlay", (x - 0.2, -9.5, 0), (x + 0.2, 9.5, 0.004))
@@ -63,12 +63,12 @@ def shell():
 
 
 def vault_height(y):
-    """Return the height of the vault at `y`, inside."""
+    """Return the inner height of the vault at `y`."""
     return HEIGHT + RISE * np.sqrt(np.maximum(1 - (y / HALF) ** 2, 0))
 
 
 def vault():
-    """Return the vault, of leaning slabs, and the ribs below it."""
+    """Yield the vault of tilted slabs, and its roof."""
     turn = np.linspace(0, np.pi, 13)
     y, z = HALF * np.cos(turn), HEIGHT + RISE * np.sin(turn)
     for index in range(12):
@@ -80,12 +80,12 @@ def vault():
 
 
 def sides():
-    """Return the walls on both sides with their openings, the passages behind them, and the cornices."""
+    """Yield the side walls with openings, the passages behind them, and the cornices."""
     for side in (-1, 1):
         for x in np.arange(0, LENGTH, BAY):
             for start, end in ((x, x + 1.2), (x + 4.8, x + BAY)):
                 yield box("stone", *corners(side, (start, HALF, 0), (end, HALF + 0.8, ARCH)))
-            for start, end in ((x + 1.2, x + 1.7), (x + 4.3, x + 4.8)):  # corbels, so that the openings narrow on top
+            for start, end in ((x + 1.2, x + 1.7), (x + 4.3, x + 4.8)):  # corbels, which narrow the tops of openings
                 yield box("pale", *corners(side, (start, HALF, ARCH - 0.7), (end, HALF + 0.8, ARCH)))
             if x % 12:  # walls across the passages, with doorways
                 yield box("stone", *corners(side, (x - 0.15, HALF + 0.8, 0), (x + 0.15, HALF + 3, PASSAGE_HEIGHT)))
@@ -96,7 +96,7 @@ def sides():
         yield box(
             "pale", *corners(side, (0, HALF + 0.8, PASSAGE_HEIGHT), (LENGTH, PASSAGE + WALL, PASSAGE_HEIGHT + WALL))
         )
-        # A cornice is a ledge with a lip, behind which lamps shine on to the vault.
+        # A cornice is a ledge with a lip; lamps behind the lip light the vault
         yield box("pale", *corners(side, (0, HALF - 1, HEIGHT - 1), (LENGTH, HALF, HEIGHT - 0.8)))
         yield box("pale", *corners(side, (0, HALF - 1, HEIGHT - 0.8), (LENGTH, HALF - 0.85, HEIGHT - 0.35)))
         for x in np.arange(BAY, LENGTH - 1, BAY):
@@ -104,7 +104,7 @@ def sides():
 
 
 def balconies():
-    """Return the balconies on both sides, on columns, with balustrades."""
+    """Yield the balconies on both sides with columns and balustrades."""
     for side in (-1, 1):
         yield box("pale", *corners(side, (0, BALCONY, FLOOR - 0.4), (LENGTH, HALF, FLOOR)))
         yield box("stone", *corners(side, (0, BALCONY, FLOOR + RAIL - 0.15), (LENGTH, BALCONY + 0.25, FLOOR + RAIL)))
@@ -118,14 +118,14 @@ def balconies():
 
 
 def column(x, y):
-    """Return a column between its base and its capital."""
+    """Yield a column with base and capital."""
     yield box("stone", (x - 0.6, y - 0.55, 0), (x + 0.6, y + 0.55, 0.8))
     yield tube("marble", (x, y, 0.8), (x, y, FLOOR - 0.9), 0.42)
     yield box("pale", (x - 0.6, y - 0.55, FLOOR - 0.9), (x + 0.6, y + 0.55, FLOOR - 0.4))
 
 
 def stairs():
-    """Return the mezzanine at the far end, the stairs that lead up to it, and their balustrades."""
+    """Yield the mezzanine at the far end, its stairs, and the balustrades."""
     yield box("stone", (MEZZANINE, -BALCONY, 0), (LENGTH, BALCONY, LANDING))
     for index in range(STEPS):
         x = MEZZANINE - (STEPS - index) * 0.35
@@ -142,7 +142,7 @@ def stairs():
 
 
 def booths():
-    """Return a row of ticket booths: counters, backs, partitions, canopies, window bars."""
+    """Yield a row of ticket booths: counters, backs, partitions, canopies, window bars."""
     start, end = BOOTHS[0] - 1.5, BOOTHS[-1] + 1.5
     yield box("marble", (start, -7.4, 0), (end, -7.0, 1.1))
     yield box("wood", (start, -9.4, 0), (end, -9.25, 2.9))
@@ -157,7 +157,7 @@ def booths():
 
 
 def kiosk():
-    """Return the information kiosk in the middle with its clock, and travellers and luggage about the hall."""
+    """Yield the information kiosk with its clock in the middle of the hall."""
     x, y = CLOCK
     yield from drum("marble", (x, y, 0), 1.9, 1.1)
     yield from drum("brass", (x, y, 1.1), 2.0, 0.06)
@@ -171,7 +171,7 @@ def kiosk():
 
 
 def travellers(random):
-    """Return people, roughly, with their luggage."""
+    """Yield simplified people with luggage."""
     for _ in range(20):
         x, y = random.uniform(8, 38), random.uniform(-5.5, 8.5)
         if np.hypot(x - CLOCK[0], y - CLOCK[1]) < 3:
@@ -184,7 +184,7 @@ def travellers(random):
 
 
 def chandeliers(random):
-    """Return six chandeliers with 18 globes each, in two rings that iron hoops and a central drum hide in part."""
+    """Yield six chandeliers with 18 globes each, in two rings partly hidden by iron hoops and a central drum."""
     for x, y in ((9, -4), (9, 4), (24, -4.5), (24, 4.5), (39, -4.5), (39, 4.5)):
         yield tube("bronze", (x, y, 8.6), (x, y, vault_height(y)), 0.04)
         yield from drum("brass", (x, y, 7.9), 0.45, 1.2)
@@ -199,7 +199,7 @@ def chandeliers(random):
 
 
 def globes(random):
-    """Return 219 globes with what carries them."""
+    """Yield 219 globes and their supports."""
     yield from chandeliers(random)  # 108
     for side in (-1, 1):
         for x in np.arange(0, LENGTH, BAY):
@@ -223,7 +223,7 @@ def globes(random):
 
 
 def bulbs(random):
-    """Return 613 point lights."""
+    """Yield 613 point lights."""
     for _ in range(120):  # stars
         y = random.uniform(-11, 11)
         yield bulb((random.uniform(1, LENGTH - 1), y, vault_height(y) - 0.5), 0.5, COOL, random)
@@ -247,13 +247,13 @@ def bulbs(random):
         for dx in (-1.1, 0, 1.1):
             for y in (-8.9, -7.6):
                 yield bulb((x + dx, y, 2.75), 0.9, WARM, random)
-    for index in range(13):  # along the stairs, low at their side
+    for index in range(13):  # along both sides of the stairs, near the floor
         x = MEZZANINE - 6.6 + 0.5 * index
         yield bulb((x, -4.6 if index % 2 else 4.6, 0.4), 1.2, AMBER, random)
 
 
 def concourse(seed):
-    """Return the scene as XML text, the same for the same seed."""
+    """Return the scene as XML text, determined by the seed."""
     crowd, power = np.random.default_rng(3), np.random.default_rng(seed)
     command = f"concourse.py --seed {seed} --output scenes/concourse.xml"
     camera = (74, (1.2, 6.2, 6.9), (27, -2.2, 5.2))

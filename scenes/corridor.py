@@ -1,8 +1,8 @@
-"""Write a long corridor of rooms with doors ajar, which has no lamp of its own.
+"""Generate a long corridor without lamps between rooms with partly open doors.
 
-The scene is for light that only arrives indirectly: sixteen rooms on both sides have a few lamps each, out of sight of
-the corridor, and their doors are opened a little. What is seen of the corridor is lit through these gaps and by what
-floor and walls send on. Path tracers seldom find the way back; light paths seldom find the way out.
+Purpose: purely indirect light. Sixteen rooms on both sides contain a few lamps each, invisible from the corridor. Light
+enters through the door gaps and is reflected by floor and walls. Camera paths rarely find a lamp; light paths rarely
+leave a room.
 
     python scenes/corridor.py --output scenes/corridor.xml
 """
@@ -10,9 +10,9 @@ floor and walls send on. Path tracers seldom find the way back; light paths seld
 import numpy as np
 from elements import ball, box, corners, drum, flat, glow, header, material, write_scene
 
-LENGTH, HALF, DEPTH, HEIGHT, WALL = 32.0, 1.3, 5.0, 2.9, 0.15  # metres: |y| < HALF is the corridor, up to DEPTH rooms
-ROOM = 4.0  # length of one room along x
-DOOR, DOOR_HEIGHT, HINGE = 1.0, 2.15, 1.2  # width and height of doors; where they hang, from the start of the room
+LENGTH, HALF, DEPTH, HEIGHT, WALL = 32.0, 1.3, 5.0, 2.9, 0.15  # metres; corridor: |y| < HALF, rooms: HALF < |y| < DEPTH
+ROOM = 4.0  # length of a room along x
+DOOR, DOOR_HEIGHT, HINGE = 1.0, 2.15, 1.2  # width and height of doors; distance of the hinge from the start of the room
 
 COLOURS = [
     (1.0, 0.66, 0.36), (0.62, 0.80, 1.0), (1.0, 0.85, 0.68), (1.0, 0.5, 0.2),
@@ -31,7 +31,7 @@ MATERIALS = [
 
 
 def shell():
-    """Return floor, ceiling and outer walls."""
+    """Yield floor, ceiling and outer walls."""
     yield box("linoleum", (0, -DEPTH, -WALL), (LENGTH, DEPTH, 0))
     yield box("plaster", (0, -DEPTH, HEIGHT), (LENGTH, DEPTH, HEIGHT + WALL))
     for x in (-WALL, LENGTH):
@@ -42,7 +42,7 @@ def shell():
 
 
 def room(side, start, random):
-    """Return the walls of a room, its door ajar, its furniture and its lamps."""
+    """Yield the walls of a room, the partly open door, furniture and lamps."""
     hinge = start + HINGE
     yield box("plaster", *corners(side, (start, HALF, 0), (hinge, HALF + WALL, HEIGHT)))
     yield box("plaster", *corners(side, (hinge + DOOR, HALF, 0), (start + ROOM, HALF + WALL, HEIGHT)))
@@ -65,7 +65,7 @@ def room(side, start, random):
 
 
 def things(random):
-    """Return what stands in the corridor: lockers, a bench, boxes, balls that were left."""
+    """Yield the objects in the corridor: lockers, a bench, balls."""
     for x, side in ((6.4, 1), (15.0, -1), (23.2, 1)):
         yield box("steel", *corners(side, (x, HALF - 0.35, 0), (x + 0.5, HALF, 1.75)))
     yield box("oak", (11.1, HALF - 0.45, 0.4), (12.5, HALF - 0.05, 0.46))
@@ -78,7 +78,7 @@ def things(random):
 
 
 def corridor(seed):
-    """Return the scene as XML text, the same for the same seed."""
+    """Return the scene as XML text, determined by the seed."""
     random = np.random.default_rng(seed)
     command = f"corridor.py --seed {seed} --output scenes/corridor.xml"
     camera = (72, (0.5, -0.35, 1.6), (10, 0.1, 1.3))

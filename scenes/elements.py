@@ -1,5 +1,5 @@
-"""Building blocks of the generated scenes, as XML text: what hall.py has, and what the other generators share
-beyond it (glossy materials, turned slabs, emitters, skies, the command line).
+"""Building blocks of the generated scenes as XML text: those of hall.py, and further shared ones (glossy materials,
+rotated slabs, emitters, skies, the command line).
 """
 
 import argparse
@@ -9,7 +9,7 @@ import numpy as np
 import OpenEXR
 from hall import ball, box, corners, numbers, spectrum
 
-__all__ = ["ball", "box", "corners", "numbers", "spectrum"]  # hall.py's, for those who import from here
+__all__ = ["ball", "box", "corners", "numbers", "spectrum"]  # re-exported from hall.py
 
 SKY_SIZE = 128, 64  # texels of a sky, longitude by latitude
 
@@ -32,8 +32,8 @@ HEADER = """<!-- Made by: python scenes/{command}
 
 
 def header(command, title, fov, origin, target, depth=2):
-    """Return the opening of a scene: the scene parameters and the camera. `command` is the line that makes it, `depth`
-    the usual `max_depth`."""
+    """Return the head of a scene: parameters and camera. `command` generates the scene; `depth` is the default
+    `max_depth`."""
     script = command.split()[0]
     return HEADER.format(
         command=command,
@@ -47,7 +47,7 @@ def header(command, title, fov, origin, target, depth=2):
 
 
 def material(name, colour, gloss=None, roughness=0.2):
-    """Return a two-sided material: diffuse, or with the `gloss` of "plastic" or "metal"."""
+    """Return a two-sided material: diffuse, or with `gloss` "plastic" or "metal"."""
     if gloss is None:
         inner = f'<bsdf type="diffuse"><rgb name="reflectance" value="{numbers(colour)}"/></bsdf>'
     else:
@@ -63,8 +63,8 @@ def material(name, colour, gloss=None, roughness=0.2):
 
 
 def slab(name, centre, size, axis, angle):
-    """Return a cuboid of the given size, turned by `angle` degrees about the `axis` "x", "y" or "z" through its
-    centre: unlike hall.py's boxes, it may lean."""
+    """Return a cuboid rotated by `angle` degrees about the `axis` "x", "y" or "z" through its centre; `box` rotates
+    only about vertical axes."""
     return (
         f'<shape type="cube"><transform name="to_world"><scale value="{numbers(np.asarray(size) / 2)}"/>'
         f'<rotate {axis}="1" angle="{angle:.4g}"/><translate value="{numbers(centre)}"/></transform>'
@@ -73,7 +73,7 @@ def slab(name, centre, size, axis, angle):
 
 
 def tube(name, start, end, radius):
-    """Return a cylinder without lids."""
+    """Return a cylinder without caps."""
     return (
         f'<shape type="cylinder"><point name="p0" value="{numbers(start)}"/><point name="p1" value="{numbers(end)}"/>'
         f'<float name="radius" value="{radius:g}"/><ref id="{name}"/></shape>'
@@ -81,17 +81,17 @@ def tube(name, start, end, radius):
 
 
 def drum(name, base, radius, height):
-    """Return an upright cylinder with a lid, standing on the point `base`."""
+    """Yield a vertical cylinder with a lid, standing on the point `base`."""
     x, y, z = base
     yield tube(name, base, (x, y, z + height), radius)
     yield flat("disk", name, (x, y, z + height), (0, 0, 1), (radius, radius))
 
 
 def flat(kind, name, centre, facing, half, emitter=""):
-    """Return a "rectangle" or a "disk" of half-sizes `half` that faces the direction `facing`, with an emitter if
-    given. The first half-size is the horizontal one of an upright shape, the one along x of a lying one."""
+    """Return a "rectangle" or "disk" with half-sizes `half` and normal `facing`, optionally with an emitter. The first
+    half-size is horizontal for a vertical shape, and along x for a horizontal shape."""
     centre, facing = np.asarray(centre, float), np.asarray(facing, float)
-    # Mitsuba's lookat needs an up vector of another direction; the shape's own y axis follows it.
+    # The up vector of `lookat`, which becomes the y axis of the shape, must not be parallel to its direction
     up = "0, 0, 1" if abs(facing[2]) < 0.9 * np.linalg.norm(facing) else "0, 1, 0"
     return (
         f'<shape type="{kind}"><transform name="to_world"><scale x="{half[0]:.3g}" y="{half[1]:.3g}"/>'
@@ -101,12 +101,12 @@ def flat(kind, name, centre, facing, half, emitter=""):
 
 
 def glow(radiance, colour, random):
-    """Return an area emitter whose strength varies about `radiance`, to be put into a shape."""
+    """Return an area emitter with a random radiance around `radiance`, as a child of a shape."""
     return f'<emitter type="area">{spectrum("radiance", radiance, colour, random)}</emitter>'
 
 
 def bulb(position, intensity, colour, random):
-    """Return a point light whose strength varies about `intensity`."""
+    """Return a point emitter with a random intensity around `intensity`."""
     return (
         f'<emitter type="point"><point name="position" value="{numbers(position)}"/>'
         f"{spectrum('intensity', intensity, colour, random)}</emitter>"
@@ -114,7 +114,7 @@ def bulb(position, intensity, colour, random):
 
 
 def sky(file):
-    """Return an environment map that is upright where z is up."""
+    """Return an environment map rotated to z-up."""
     return (
         f'<emitter type="envmap"><string name="filename" value="{file}"/>'
         '<transform name="to_world"><rotate x="1" angle="90"/></transform></emitter>'
@@ -122,12 +122,12 @@ def sky(file):
 
 
 def sky_image(zenith, horizon, ground, sun, direction, width, halo):
-    """Return the texels of a sky: a gradient from `horizon` to `zenith`, `ground` below, and a soft `sun` of that
-    radiance about `direction`, `width` degrees across, in a faint halo of `halo` times the radiance."""
+    """Return the texels of a sky: a gradient from `horizon` to `zenith`, `ground` below, and a soft `sun` of this
+    radiance around `direction`, `width` degrees wide, with a halo of `halo` times the radiance."""
     columns, rows = SKY_SIZE
     azimuth = (np.arange(columns) + 0.5) / columns * 2 * np.pi
     polar = (np.arange(rows)[:, None] + 0.5) / rows * np.pi
-    # As `sky` turns it: longitude 0 is +y, a quarter further is +x.
+    # With the rotation of `sky`, longitude 0 is +y and longitude 90° is +x
     directions = np.stack(
         [np.sin(polar) * np.sin(azimuth), np.sin(polar) * np.cos(azimuth), np.cos(polar) + 0 * azimuth], axis=-1
     )
@@ -147,7 +147,7 @@ def write_image(path, image):
 
 
 def downlight(position, cutoff, intensity, colour, random):
-    """Return a spot that shines straight down, whose strength varies about `intensity`."""
+    """Return a spot emitter pointing straight down, with a random intensity around `intensity`."""
     below = numbers(np.subtract(position, (0, 0, 1)))
     return (
         f'<emitter type="spot"><transform name="to_world"><lookat origin="{numbers(position)}" target="{below}" '
@@ -157,11 +157,11 @@ def downlight(position, cutoff, intensity, colour, random):
 
 
 def write_scene(document, name, make, images=None, arguments=None, counts=None):
-    """The command line of a generator: write `make(seed, **counts)` to the output, which is `name`.xml by default, and
-    the textures of `images` (name: texels) beside it. Each of the `counts` (name: usual number) is an option."""
+    """Run the command line of a generator: write `make(seed, **counts)` to the output (default: `name`.xml), and
+    textures `images` (name -> texels) beside it. Each entry of `counts` (name -> default) becomes an option."""
     command_line = parser(document, f"{name}.xml")
     for what, usual in (counts or {}).items():
-        command_line.add_argument(f"--{what}", type=int, default=usual, help=f"how many (default: {usual})")
+        command_line.add_argument(f"--{what}", type=int, default=usual, help=f"number of {what} (default: {usual})")
     options = command_line.parse_args(arguments)
     output = options.output or Path(f"{name}.xml")
     given = {what: getattr(options, what) for what in counts or {}}
@@ -177,8 +177,8 @@ def write_scene(document, name, make, images=None, arguments=None, counts=None):
 
 
 def parser(document, name):
-    """Return a command line with the options that all generators have; `document` is the script's docstring."""
+    """Return an argument parser with the options common to all generators; `document` is the script's docstring."""
     parsed = argparse.ArgumentParser(description=document.split("\n")[0])
-    parsed.add_argument("--seed", type=int, default=1, help="seed of what varies by chance (default: 1)")
-    parsed.add_argument("--output", type=Path, help=f"file to write (default: {name}); others land in its folder")
+    parsed.add_argument("--seed", type=int, default=1, help="seed of random variations (default: 1)")
+    parsed.add_argument("--output", type=Path, help=f"output file (default: {name}); further files go to its folder")
     return parsed

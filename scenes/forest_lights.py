@@ -1,11 +1,10 @@
-"""Write a clearing in a dark forest, lit by 138 lanterns and by a moonlit sky behind the trees.
+"""Generate a forest clearing at night with 138 lanterns and a moonlit sky behind the trees.
 
-The scene is for methods that find out, pixel by pixel, which of many lights matter. It has the lights of `Ponderosa`
-in Donikian et al., "Accurate direct illumination using iterative adaptive sampling" (2006), Table 1: 138 point lights
-and an environment map, all of them visible from somewhere, but only few percent from an average point. Here the lights
-hang in shades and cages on strings and posts, in a cabin, under the roofs of two stalls and among the trees, and the
-sky is hidden by some hundred trees of thousands of leaves each. The trees are instances of meshes that are written
-beside the scene, as is the sky.
+Purpose: methods that learn, per pixel, which of many lights are visible. The numbers of lights match `Ponderosa` in
+Donikian et al., "Accurate direct illumination using iterative adaptive sampling" (2006), Table 1: 138 point lights and
+an environment map; an average point sees a few percent of the lights. The lights hang in shades and cages on strings
+and posts, in a cabin, under the roofs of two stalls and among the trees. About a hundred trees with thousands of leaves
+each occlude the sky. The trees are instances of meshes written beside the scene, as is the sky.
 
     python scenes/forest_lights.py --output scenes/forest_lights.xml
 """
@@ -16,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from elements import box, bulb, drum, header, material, numbers, parser, sky, sky_image, slab, tube, write_image
 
-CLEARING = 6.0  # metres, its radius; the ground is 2 * GROUND wide
+CLEARING = 6.0  # metres, radius of the clearing; the ground is 2 * GROUND wide
 GROUND = 45.0
 CAMERA, TARGET = (-1.3, -6.0, 1.8), (0.9, 2.2, 2.15)
 CABIN = (0.6, 5.0, 2.6, 6.2, 2.4)  # x, x, y, y, height of the walls
 DOOR, WINDOW = (1.2, 2.1, 0.0, 2.0), (3.0, 4.2, 0.95, 1.75)  # x, x, z, z in the cabin's front wall
-STALLS = ((-4.6, 1.2, 58.0), (-2.9, 4.6, 28.0))  # x, y, turned by degrees from facing -y
+STALLS = ((-4.6, 1.2, 58.0), (-2.9, 4.6, 28.0))  # x, y, rotation in degrees from facing -y
 POSTS = ((-1.9, -0.6), (1.2, -2.6), (3.3, 0.6), (-0.4, 2.4), (4.4, -1.6), (-3.2, -2.2), (2.1, 1.6), (-1.6, 3.6))
 SKY = "forest_sky.exr"
 TREES, BUSHES = 105, 60
@@ -48,7 +47,7 @@ MATERIALS = [
 
 
 def lathe(profile, sides):
-    """Return triangles (n, 3, 3) of the surface that a profile of (radius, z) sweeps about the z axis."""
+    """Return the triangles (n, 3, 3) of the surface of revolution of a profile of (radius, z) about the z axis."""
     turn = np.arange(sides + 1) / sides * 2 * np.pi
     ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=-1)
     rings = [radius * ring + (0, 0, z) for radius, z in profile]
@@ -59,7 +58,7 @@ def lathe(profile, sides):
 
 
 def leaves(places, outward, length, width, random):
-    """Return a triangle at each of the `places`, which points `outward` but for some chance."""
+    """Return a triangle at each of `places`, pointing approximately `outward`."""
     outward = outward + random.normal(0, 0.35, outward.shape)
     outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
     across = np.cross(outward, random.normal(0, 1, outward.shape))
@@ -68,8 +67,8 @@ def leaves(places, outward, length, width, random):
 
 
 def crown(low, high, reach, droop, branches, random):
-    """Return the triangles of a tree's crown from height `low` to `high`: branches about the axis, `reach(t)` metres
-    long at t of the height, with leaves along each."""
+    """Return the triangles of a tree crown from height `low` to `high`: leaves along branches around the axis; `reach`
+    maps the relative height to the length of a branch in metres."""
     t = np.repeat(np.sort(random.uniform(0, 1, branches)) ** 0.9, LEAVES)
     azimuth = np.repeat(random.uniform(0, 2 * np.pi, branches), LEAVES)
     along = random.uniform(0.15, 1, t.shape) ** 0.8
@@ -81,7 +80,7 @@ def crown(low, high, reach, droop, branches, random):
 
 
 def bush(random):
-    """Return the triangles of a bush: leaves about a flattened ball."""
+    """Return the triangles of a bush: leaves around a flattened ball."""
     outward = random.normal(0, 1, (900, 3))
     outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
     places = outward * random.uniform(0.4, 0.7, (900, 1)) * (1, 1, 0.75) + (0, 0, 0.4)
@@ -89,7 +88,7 @@ def bush(random):
 
 
 def meshes():
-    """Return the triangles of each mesh file by its name, the same at every call."""
+    """Return mesh file name -> triangles, deterministic."""
     random = np.random.default_rng(11)
     return {
         "forest_trunk.ply": lathe([(0.26, -0.1), (0.17, 1.0), (0.13, 7.0), (0.02, 13.0)], 9),
@@ -101,7 +100,7 @@ def meshes():
 
 
 def write_mesh(path, triangles):
-    """Write a binary PLY file; no two triangles share vertices, so that each is flat."""
+    """Write a binary PLY file; triangles share no vertices and so are flat-shaded."""
     vertices = np.round(triangles.reshape(-1, 3), 3).astype("<f4")
     faces = np.empty(len(triangles), [("count", "u1"), ("vertices", "<i4", 3)])
     faces["count"], faces["vertices"] = 3, np.arange(len(vertices)).reshape(-1, 3)
@@ -112,7 +111,7 @@ def write_mesh(path, triangles):
 
 
 def groups():
-    """Return what is instanced: trees, a bush, a shade that is open below, a lantern in a cage."""
+    """Yield the shape groups for instances: trees, a bush, a shade open at the bottom, a lantern cage."""
 
     def mesh(name, file):
         return (
@@ -145,7 +144,7 @@ def instance(group, position, scale=1.0, angle=0.0):
 
 
 def tree_places(random):
-    """Draw where trees stand: outside the clearing, the denser the nearer, none in another or in the cabin."""
+    """Sample tree positions: outside the clearing, denser near it, apart from each other and from the cabin."""
     places = []
     while len(places) < TREES:
         distance, azimuth = CLEARING + 0.5 + 24 * random.random() ** 1.6, random.uniform(0, 2 * np.pi)
@@ -159,7 +158,7 @@ def tree_places(random):
 
 
 def forest(random):
-    """Return the ground, the trees and the bushes, and the places of the trees."""
+    """Return the ground, trees and bushes, and the positions of the trees."""
     places = tree_places(random)
     parts = [box("soil", (-GROUND, -GROUND, -0.5), (GROUND, GROUND, 0))]
     for index, (x, y) in enumerate(places):
@@ -177,7 +176,7 @@ def forest(random):
 
 
 def cabin():
-    """Return the log cabin: courses of logs about door and windows, a gable roof, a porch, a table inside."""
+    """Yield the log cabin: courses of logs around door and window, a gable roof, a porch, a table inside."""
     x0, x1, y0, y1, top = CABIN
     for index, z in enumerate(np.arange(0, top, 0.24)):
         out, high = 0.04 * (index % 2), min(z + 0.24, top)
@@ -192,7 +191,7 @@ def cabin():
         yield box("log", (x1 - 0.18, y0 + 0.18, z), (x1 + out, y1, high))
         yield box("log", (x0, y1 - 0.18, z), (x1, y1, high))
     ridge, width = (y0 + y1) / 2, (y1 - y0) / 2
-    for index in range(6):  # the gables, in steps
+    for index in range(6):  # stepped gables
         inset = width * (index + 0.6) / 6
         for x in (x0, x1 - 0.18):
             yield box("log", (x, y0 + inset, top + 0.22 * index), (x + 0.18, y1 - inset, top + 0.22 * (index + 1)))
@@ -213,7 +212,7 @@ def cabin():
 
 
 def stall(x, y, angle, random):
-    """Return a stall with goods: counter, back, sides, posts and a low sloping roof."""
+    """Yield a stall with goods: counter, back, sides, posts and a low sloping roof."""
 
     def part(name, low, high):
         centre = np.array((x, y, 0))
@@ -224,7 +223,7 @@ def stall(x, y, angle, random):
     for side in (-1, 1):
         yield part("log", (min(side * 1.2, side * 1.15), -0.2, 0), (max(side * 1.2, side * 1.15), 0.75, 2.1))
         yield part("log", (side * 1.17 - 0.04, -0.85, 0), (side * 1.17 + 0.04, -0.77, 2.1))
-    for index in range(5):  # the roof rises to the back
+    for index in range(5):  # the roof rises towards the back
         yield part(
             "canvas", (-1.4, -1.05 + 0.4 * index, 2.1 + 0.06 * index), (1.4, -0.6 + 0.4 * index, 2.14 + 0.06 * index)
         )
@@ -236,20 +235,20 @@ def stall(x, y, angle, random):
 
 
 def shaded(position, intensity, colour, random):
-    """Return a lantern in a shade: its light goes down, as far as the rim allows."""
+    """Yield a lantern in a shade, which limits its light to downward directions."""
     x, y, z = position
     yield instance("shade", position)
     yield bulb((x, y, z + 0.19), intensity, colour, random)
 
 
 def caged(position, intensity, colour, random):
-    """Return a lantern in a cage: its light goes through the gaps between bars."""
+    """Yield a lantern in a cage, whose bars occlude part of its light."""
     yield instance("cage", position, angle=random.uniform(0, 360))
     yield bulb(position, intensity, colour, random)
 
 
 def strings(random):
-    """Return 60 lanterns in shades on five ropes across the clearing, which sag between their ends."""
+    """Yield 60 lanterns in shades on five sagging ropes across the clearing."""
     for azimuth, shift in ((20, -2.4), (65, 0.6), (110, 2.2), (160, -0.8), (150, 3.0)):
         along = np.array((np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))))
         middle, last = shift * np.array((-along[1], along[0])), None
@@ -264,13 +263,13 @@ def strings(random):
 
 
 def lanterns(places, random):
-    """Return all 138 lights and what they hang in; `places` are those of the trees."""
+    """Yield all 138 lights and their fittings; `places` are the positions of the trees."""
     yield from strings(random)  # 60
     for x, y in POSTS:  # 8
         yield box("iron", (x - 0.03, y - 0.03, 0), (x + 0.03, y + 0.03, 1.3))
         yield from caged((x, y, 1.46), 5, WARM, random)
     x0, x1, y0, y1, _ = CABIN
-    for x in np.linspace(x0 + 0.5, x1 - 0.5, 6):  # 18 in the cabin, hidden from outside but for door and window
+    for x in np.linspace(x0 + 0.5, x1 - 0.5, 6):  # 18 in the cabin, visible from outside through door and window only
         for y, z in ((y0 + 0.6, 2.3), (4.4, 2.0), (y1 - 0.5, 2.3)):
             yield bulb((x, y, z), 2.5, WHITE, random)
     for x in np.linspace(x0 + 0.4, x1 - 0.4, 4):  # 4 at the porch
@@ -280,13 +279,13 @@ def lanterns(places, random):
         for along in np.linspace(-0.95, 0.95, 8):
             yield bulb((x + along * cosine + 0.75 * sine, y + along * sine - 0.75 * cosine, 2.03), 1.2, WHITE, random)
     near = sorted(places, key=lambda place: np.hypot(place[0], place[1] - 3))
-    for x, y in near[:32]:  # 32 among the trees, on the side towards the clearing
+    for x, y in near[:32]:  # 32 among the trees, on their sides facing the clearing
         scale = 1 - 0.5 / np.hypot(x, y)
         yield from caged((x * scale, y * scale, random.uniform(1.2, 3.2)), 9, AMBER, random)
 
 
 def clearing(seed):
-    """Return the scene as XML text, the same for the same seed."""
+    """Return the scene as XML text, determined by the seed."""
     plants, power = np.random.default_rng(5), np.random.default_rng(seed)
     command = f"forest_lights.py --seed {seed} --output scenes/forest_lights.xml"
     woods, places = forest(plants)
@@ -296,7 +295,7 @@ def clearing(seed):
 
 
 def night_sky():
-    """Return the texels of a sky at dusk with a bright moon, which stands high enough to shine into the clearing."""
+    """Return the texels of a dusk sky with a bright moon, high enough to light the clearing."""
     return sky_image((0.6, 1.0, 2.2), (2.6, 1.8, 1.7), (0.02, 0.02, 0.02), (600, 680, 800), (-0.4, 0.3, 1), 5, 0.004)
 
 

@@ -1,11 +1,11 @@
-"""Write a hall with many lights: the scene that many-light methods are for.
+"""Generate a hall with many lights, the standard scene for many-light methods.
 
-A two-storey hall (36 m long, a nave with pillars, galleries above twelve side rooms whose doors stand ajar) holds any
-number of lights of mixed kinds: bulbs on strings across the nave and in the rooms (point emitters), uplights at the
-pillars and wall washers in the galleries (spots, whose light arrives by way of ceilings and walls), globes and panels
-(small area emitters). Most lights are hidden from most points, each contributes something somewhere, and every surface
-is diffuse, so a path tracer that picks its lights uniformly is noisy while the image itself is simple. Neither the
-total power nor the building depends on the number of lights, so renders with different numbers of lights compare.
+A two-storey hall (36 m long; a nave with pillars; galleries above twelve side rooms with partly open doors) contains
+any number of lights: bulbs on strings across the nave and in the rooms (point emitters), uplights at the pillars and
+wall washers in the galleries (spots, whose light arrives via ceilings and walls), globes and panels (small area
+emitters). Most lights are occluded from most points, every light contributes somewhere, and all surfaces are diffuse:
+uniform light selection gives noisy images of a simple scene. The total power and the building do not depend on the
+number of lights, so that renders with different numbers are comparable.
 
     python scenes/hall.py --lights 1000 --seed 1 --output scenes/hall.xml
 """
@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-LENGTH, NAVE, SIDE = 36.0, 4.5, 9.5  # metres: x from 0 to LENGTH, |y| < NAVE is the nave, up to SIDE are the rooms
+LENGTH, NAVE, SIDE = 36.0, 4.5, 9.5  # metres: 0 < x < LENGTH; nave: |y| < NAVE, rooms: NAVE < |y| < SIDE
 ROOM_HEIGHT, HEIGHT, WALL = 3.8, 8.0, 0.2
-ROOM = 6.0  # length of one side room along x
+ROOM = 6.0  # length of a side room along x
 DOOR_WIDTH, DOOR_HEIGHT = 1.3, 2.5
 
 WARM, WHITE, COOL = (1.0, 0.62, 0.3), (1.0, 0.85, 0.68), (0.6, 0.78, 1.0)
@@ -54,7 +54,7 @@ HEADER = """<!-- Made by: python scenes/hall.py --lights {lights} --seed {seed}
 
 
 def numbers(values, digits=4):
-    """Format numbers for XML, to `digits` significant digits."""
+    """Format numbers for XML with `digits` significant digits."""
     return ", ".join(f"{value:.{digits}g}" for value in values)
 
 
@@ -67,7 +67,7 @@ def material(name):
 
 
 def box(name, low, high, pivot=None, angle=0.0):
-    """Return a cuboid from corner `low` to corner `high` (metres), turned by `angle` degrees about the vertical axis
+    """Return a cuboid between the corners `low` and `high` (metres), rotated by `angle` degrees about the vertical axis
     through `pivot` (x, y)."""
     low, high = np.asarray(low, float), np.asarray(high, float)
     turn = ""
@@ -82,7 +82,7 @@ def box(name, low, high, pivot=None, angle=0.0):
 
 
 def shell():
-    """Return the floor, ceiling and outer walls, and the galleries."""
+    """Yield the floor, ceiling and outer walls, and the galleries."""
     yield box("floor", (0, -SIDE, -WALL), (LENGTH, SIDE, 0))
     yield box("plaster", (0, -SIDE, HEIGHT), (LENGTH, SIDE, HEIGHT + WALL))
     for x in (-WALL, LENGTH):
@@ -94,7 +94,7 @@ def shell():
 
 
 def railing(side):
-    """Return the handrail of a gallery and its posts, whose many gaps cast many shadows."""
+    """Yield the handrail of a gallery and its closely spaced posts."""
     bottom, top = ROOM_HEIGHT + WALL, ROOM_HEIGHT + 1.2
     yield box("wood", *corners(side, (0, NAVE, top - 0.1), (LENGTH, NAVE + 0.12, top)))
     for x in np.arange(0.6, LENGTH, 0.6):
@@ -108,7 +108,7 @@ def corners(side, low, high):
 
 
 def rooms(random):
-    """Return the walls of the side rooms, with a door ajar and some furniture in each."""
+    """Yield the walls of the side rooms, each with a partly open door and furniture."""
     for index in range(12):
         side, start = (-1 if index < 6 else 1), (index % 6) * ROOM
         door = start + random.uniform(1.2, ROOM - 1.2 - DOOR_WIDTH)
@@ -117,7 +117,7 @@ def rooms(random):
         yield box("plaster", *corners(side, (door + DOOR_WIDTH, y[0], 0), (start + ROOM, y[1], top)))
         yield box("plaster", *corners(side, (door, y[0], DOOR_HEIGHT), (door + DOOR_WIDTH, y[1], top)))
         yield box("plaster", *corners(side, (start + ROOM - WALL, y[1], 0), (start + ROOM, SIDE, top)))
-        hinge = door + DOOR_WIDTH  # on the far side, so that the camera sees what the gap lets out
+        hinge = door + DOOR_WIDTH  # on the far side, so that the light of the gap is visible to the camera
         leaf = corners(side, (door, NAVE - 0.05, 0.02), (hinge, NAVE, DOOR_HEIGHT - 0.03))
         yield box("wood", *leaf, pivot=(hinge, side * NAVE), angle=side * random.uniform(25, 75))
         shelf = start + random.uniform(1.0, ROOM - 3.0)
@@ -127,7 +127,7 @@ def rooms(random):
 
 
 def nave(random):
-    """Return the pillars, the banners between them, and the statues on their plinths."""
+    """Yield the pillars, the banners between them, and statues on plinths."""
     for index in range(7):
         x = min(max(index * ROOM, 0.3), LENGTH - 0.3)
         for side in (-1, 1):
@@ -145,7 +145,7 @@ def nave(random):
 
 
 def ball(name, centre, radius, emitter=""):
-    """Return a sphere, with an emitter if given."""
+    """Return a sphere, optionally with an emitter."""
     return (
         f'<shape type="sphere"><point name="center" value="{numbers(centre)}"/>'
         f'<float name="radius" value="{radius:g}"/><ref id="{name}"/>{emitter}</shape>'
@@ -153,13 +153,14 @@ def ball(name, centre, radius, emitter=""):
 
 
 def spectrum(name, power, colour, random):
-    """Return an `<rgb>` of the given strength: `power` spread by a factor of about two either way, `colour` varied."""
+    """Return an `<rgb>` with a random strength around `power` (within a factor of about two) and a varied colour."""
     tint = np.asarray(colour) * random.uniform(0.85, 1.0, 3)
     return f'<rgb name="{name}" value="{numbers(power * random.lognormal(0, 0.7) * tint, 3)}"/>'
 
 
 def room_of(random):
-    """Draw a side room; return its colour and a function from (along, across, z) in [0, 1]² × metres to a position."""
+    """Choose a random side room; return its colour and a function from (along, across, z) in [0, 1]² × metres to
+    positions."""
     index = random.integers(12)
     side, start = (-1 if index < 6 else 1), (index % 6) * ROOM
 
@@ -170,7 +171,7 @@ def room_of(random):
 
 
 def point(random, power):
-    """Return a bulb: on one of nine strings across the nave, in a side room, or above a gallery."""
+    """Return a bulb on one of nine strings across the nave, in a side room, or above a gallery."""
     where = random.random()
     if where < 0.25:
         string, t = random.integers(9), random.uniform(-1, 1)
@@ -191,7 +192,7 @@ def point(random, power):
 
 
 def spot(random, power):
-    """Return an uplight at a pillar, a wall washer in a gallery, or a spot from the ceiling on to a statue."""
+    """Return an uplight at a pillar, a wall washer in a gallery, or a ceiling spot on a statue."""
     where, side = random.random(), random.choice((-1, 1))
     if where < 0.45:
         x = random.integers(0, 7) * ROOM + random.choice((-0.55, 0.55))
@@ -204,7 +205,7 @@ def spot(random, power):
         index = random.integers(1, 6)
         target = np.array((index * ROOM, 1.3 * (-1) ** index, 1.5))
         origin, cutoff, colour = (target[0] + random.choice((-2.5, 2.5)), side * 3.0, HEIGHT - 0.6), 14, WHITE
-    # The narrower a beam of the same flux, the brighter its axis.
+    # At equal flux a narrower beam has a higher intensity
     power *= 0.6 / (1 - np.cos(np.radians(cutoff)))
     return (
         f'<emitter type="spot"><transform name="to_world"><lookat origin="{numbers(origin)}" '
@@ -214,9 +215,9 @@ def spot(random, power):
 
 
 def area(random, power):
-    """Return a globe that hangs in the nave or in a gallery, or a panel on the ceiling of a side room."""
+    """Return a globe in the nave or in a gallery, or a panel on the ceiling of a side room."""
     if random.random() < 0.5:
-        # Large and not too bright: few samples per pixel would otherwise measure how well they smooth its edge.
+        # Large and moderately bright: otherwise antialiasing of its edge would dominate the error at few samples
         radius = round(random.uniform(0.12, 0.2), 3)
         nave, side = random.random() < 0.3, random.choice((-1, 1))
         across, height = (random.uniform(2.2, 3.4), 4.8) if nave else (random.uniform(NAVE + 1, SIDE - 0.6), 6.2)
@@ -235,8 +236,8 @@ def area(random, power):
 
 
 def lights(count, random):
-    """Return `count` lights: a tenth area, three tenths spot, the rest point emitters; total power is constant."""
-    power = 1500.0 / count  # radiant intensity of an average bulb, W/sr
+    """Yield `count` lights with constant total power: 10% area, 30% spot, otherwise point emitters."""
+    power = 1500.0 / count  # mean radiant intensity of a bulb, W/sr
     areas, spots = count // 10, 3 * count // 10
     yield from (area(random, power) for _ in range(areas))
     yield from (spot(random, power) for _ in range(spots))
@@ -244,10 +245,10 @@ def lights(count, random):
 
 
 def hall(count, seed):
-    """Return the scene as XML text, the same for the same number of lights (at least 1) and seed."""
+    """Return the scene as XML text, determined by the number of lights (at least 1) and the seed."""
     if count < 1:
         raise ValueError(f"a hall needs at least one light, not {count}")
-    # Two streams, so that the building does not change with the number of lights or their seed.
+    # Two random streams, so that the building does not depend on the number of lights or on the seed
     building, lamps = np.random.default_rng(7), np.random.default_rng(seed)
     parts = [HEADER.format(lights=count, seed=seed), *map(material, MATERIALS)]
     parts += [*shell(), *rooms(building), *nave(building), *lights(count, lamps), "</scene>"]
@@ -258,7 +259,7 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--lights", type=int, default=1000, metavar="N", help="number of lights (default: 1000)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the lights (default: 1)")
-    parser.add_argument("--output", type=Path, default=Path("hall.xml"), help="file to write (default: hall.xml)")
+    parser.add_argument("--output", type=Path, default=Path("hall.xml"), help="output file (default: hall.xml)")
     options = parser.parse_args(arguments)
     try:
         options.output.write_text(hall(options.lights, options.seed))

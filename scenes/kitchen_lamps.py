@@ -1,11 +1,11 @@
-"""Write a kitchen lit by 72 area emitters, most of which are hidden from most points.
+"""Generate a kitchen with 72 area emitters, most of them occluded from most points.
 
-The scene is for methods that find out, pixel by pixel, which of many lights matter. It has the lights of `Kitchen` in
+Purpose: methods that learn, per pixel, which of many lights are visible. The number of lights matches `Kitchen` in
 Donikian et al., "Accurate direct illumination using iterative adaptive sampling" (2006), Table 1: 72 area lights, of
-which about one in six is visible from an average point. Here they are recessed ceiling panels, strips under the
-cabinets, in the shelves and at the plinths, coves above the cabinets, bulbs in shades, and the lamps of a pantry whose
-door stands half open. Metal, stone and lacquer are glossy. With `--windows` (`Kitchen 2` there) the sky shines in
-too, through the two windows behind the camera and nowhere else.
+which an average point sees about one in six. The lights are recessed ceiling panels, strips under the cabinets, in the
+shelves and at the plinths, coves above the cabinets, bulbs in shades, and lamps of a pantry with a half-open door.
+Metal, stone and lacquer are glossy. With `--windows` (the paper's `Kitchen 2`) the sky also shines through two windows
+behind the camera.
 
     python scenes/kitchen_lamps.py --output scenes/kitchen_lamps.xml
     python scenes/kitchen_lamps.py --windows --output scenes/kitchen_windows.xml
@@ -17,17 +17,17 @@ from pathlib import Path
 import numpy as np
 from elements import ball, box, drum, flat, glow, header, material, parser, sky, sky_image, tube, write_image
 
-WIDTH, DEPTH, HEIGHT, WALL = 6.4, 5.6, 2.8, 0.2  # metres; the camera looks from the wall y = 0 along y
-PANTRY_X, PANTRY_Y = 4.2, 3.6  # near corner of the pantry, outside of its walls
-DOOR = (4.5, 5.3, 2.1)  # from x to x, and its height
-WINDOWS = ((0.8, 2.6), (3.4, 5.2))  # from x to x
+WIDTH, DEPTH, HEIGHT, WALL = 6.4, 5.6, 2.8, 0.2  # metres; the camera looks along +y from the wall y = 0
+PANTRY_X, PANTRY_Y = 4.2, 3.6  # near corner of the pantry, outside its walls
+DOOR = (4.5, 5.3, 2.1)  # start x, end x, height
+WINDOWS = ((0.8, 2.6), (3.4, 5.2))  # start x, end x
 SILL, LINTEL = 0.9, 2.3
-COUNTER, CABINETS = 0.9, (1.45, 2.2)  # height of the worktop; from z to z
+COUNTER, CABINETS = 0.9, (1.45, 2.2)  # height of the worktop; lower and upper z
 TABLE = (2.5, 2.35)
 SKY = "kitchen_sky.exr"
 
 WARM, WHITE, COOL = (1.0, 0.66, 0.36), (1.0, 0.87, 0.72), (0.7, 0.85, 1.0)
-DOWN, UP, NEAR = (0, 0, -1), (0, 0, 1), (0, -1, 0)
+DOWN, UP = (0, 0, -1), (0, 0, 1)
 
 MATERIALS = [
     material("lamp", (0.5, 0.5, 0.5)),
@@ -50,17 +50,17 @@ MATERIALS = [
 
 
 def back(low, high):
-    """Return the corners of a box at the back wall: along it, out from it, up."""
+    """Return the corners of a box at the back wall from coordinates (along the wall, away from the wall, up)."""
     return (low[0], DEPTH - high[1], low[2]), (high[0], DEPTH - low[1], high[2])
 
 
 def left(low, high):
-    """Return the corners of a box at the left wall: along it (away from the camera), out from it, up."""
+    """Return the corners of a box at the left wall from coordinates (along the wall, away from the wall, up)."""
     return (low[1], low[0], low[2]), (high[1], high[0], high[2])
 
 
 def shell():
-    """Return floor, ceiling and walls, with two windows in the wall behind the camera."""
+    """Yield floor, ceiling and walls, with two windows in the wall behind the camera."""
     outer = (-WALL, WIDTH + WALL), (-WALL, DEPTH + WALL)
     yield box("floor", (outer[0][0], outer[1][0], -WALL), (outer[0][1], outer[1][1], 0))
     yield box("plaster", (outer[0][0], outer[1][0], HEIGHT), (outer[0][1], outer[1][1], HEIGHT + WALL))
@@ -81,13 +81,13 @@ def shell():
 
 
 def pantry():
-    """Return the pantry in the far right corner: walls, the door half open, shelves with jars."""
+    """Yield the pantry in the far right corner: walls, the half-open door, shelves with jars."""
     x, y = PANTRY_X, PANTRY_Y
     start, end, top = DOOR
     yield box("plaster", (x, y, 0), (x + 0.1, DEPTH, HEIGHT))
     for low, high in (((x, 0), (start, HEIGHT)), ((end, 0), (WIDTH, HEIGHT)), ((start, top), (end, HEIGHT))):
         yield box("plaster", (low[0], y - 0.1, low[1]), (high[0], y, high[1]))
-    # It opens towards the camera with the hinge on the right, so that the gap is seen.
+    # The door opens towards the camera with its hinge on the right, so that the gap is visible
     yield box("wood", (start, y - 0.14, 0.01), (end, y - 0.1, top - 0.02), (end, y - 0.1), 52)
     yield box("wood", (start - 0.08, y - 0.12, 0), (start, y - 0.1, top + 0.08))
     yield box("wood", (start, y - 0.12, top), (end, y - 0.1, top + 0.08))
@@ -99,7 +99,7 @@ def pantry():
 
 
 def counter(side, start, end):
-    """Return base cabinets along the wall `side`: plinth, doors with handles, worktop, splashback."""
+    """Yield base cabinets along the wall `side`: plinth, doors with handles, worktop, splashback."""
     yield box("black", *side((start, 0, 0), (end, 0.5, 0.1)))
     yield box("cream", *side((start, 0, 0.1), (end, 0.56, COUNTER - 0.04)))
     yield box("granite", *side((start, 0, COUNTER - 0.04), (end, 0.62, COUNTER)))
@@ -111,7 +111,7 @@ def counter(side, start, end):
 
 
 def cabinets(side, start, end):
-    """Return closed cabinets on the wall `side`."""
+    """Yield closed cabinets on the wall `side`."""
     low, high = CABINETS
     yield box("cream", *side((start, 0, low), (end, 0.34, high)))
     doors = np.linspace(start, end, round((end - start) / 0.44) + 1)
@@ -121,7 +121,7 @@ def cabinets(side, start, end):
 
 
 def shelves(side, start, end, random):
-    """Return three bays of open shelves, two storeys high, and the crockery on them."""
+    """Yield three bays of open shelves in two tiers, with crockery."""
     low, high = CABINETS
     middle = (low + high) / 2
     yield box("cream", *side((start, 0, low), (end, 0.02, high)))
@@ -139,7 +139,7 @@ def shelves(side, start, end, random):
 
 
 def stove():
-    """Return the cooker with its pots and the range hood above it."""
+    """Yield the cooker with pots and the range hood above."""
     yield box("black", *back((1.95, 0.05, COUNTER), (2.75, 0.56, COUNTER + 0.01)))
     yield box("steel", *back((1.93, 0.58, 0.2), (2.77, 0.6, COUNTER - 0.06)))
     yield box("black", *back((2.03, 0.6, 0.3), (2.67, 0.61, 0.7)))
@@ -164,7 +164,7 @@ def stove():
 
 
 def appliances():
-    """Return the fridge and the sink, and a niche for the coffee machine on the left counter."""
+    """Yield the fridge, the sink, and a niche for the coffee machine on the left counter."""
     yield box("steel", (0, 1.5, 0.02), (0.68, 2.3, 1.95))
     yield box("black", (0.68, 1.5, 1.2), (0.69, 2.3, 1.215))
     for low, high in ((0.7, 1.15), (1.27, 1.7)):
@@ -179,7 +179,7 @@ def appliances():
 
 
 def table(random):
-    """Return the table, laid for four, and its chairs."""
+    """Yield the table, set for four, and its chairs."""
     x, y = TABLE
     yield box("wood", (x - 0.9, y - 0.45, 0.72), (x + 0.9, y + 0.45, 0.76))
     for dx in (-0.82, 0.82):
@@ -197,7 +197,7 @@ def table(random):
 
 
 def chair(x, y, angle):
-    """Return a chair whose back is on the side of smaller y, then turned about itself."""
+    """Yield a chair with its back towards smaller y, rotated by `angle` about its centre."""
 
     def part(low, high):
         centre = np.array((x, y, 0))
@@ -212,7 +212,7 @@ def chair(x, y, angle):
 
 
 def pendant(x, y, z, random):
-    """Return a bulb in a shade that is open below, on a cord from the ceiling; `z` is the shade's rim."""
+    """Yield a pendant lamp: a bulb in a shade open at the bottom, on a cord from the ceiling; `z`: rim of the shade."""
     yield tube("copper", (x, y, z), (x, y, z + 0.18), 0.13)
     yield flat("disk", "copper", (x, y, z + 0.18), UP, (0.13, 0.13))
     yield tube("black", (x, y, z + 0.18), (x, y, HEIGHT), 0.006)
@@ -220,14 +220,14 @@ def pendant(x, y, z, random):
 
 
 def sconce(x, y, random):
-    """Return a bulb on the wall, behind a screen that lets the light go up, down and to the sides."""
+    """Yield a wall lamp: a bulb behind a screen open at the top, bottom and sides."""
     yield box("copper", (x - 0.09, y - 0.17, 1.8), (x + 0.09, y - 0.16, 2.0))
     yield box("copper", (x - 0.02, y - 0.16, 1.79), (x + 0.02, y, 1.8))
     yield ball("lamp", (x, y - 0.09, 1.9), 0.035, glow(220, WARM, random))
 
 
 def ceiling_lamps(random):
-    """Return 12 panels in frames that hide them from far away, and 3 lamps of the range hood."""
+    """Yield 12 ceiling panels in frames that limit their visibility, and 3 lamps of the range hood."""
     for x in (0.9, 2.4, 3.9, 5.4):
         for y in (0.9, 2.1, 3.2):
             for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
@@ -240,7 +240,7 @@ def ceiling_lamps(random):
 
 
 def strips(random):
-    """Return 36 strips and discs at the furniture: under cabinets, in shelves, at plinths, above cabinets, a niche."""
+    """Yield 36 strips at the furniture: under cabinets, in shelves, at plinths, above cabinets."""
     low, high = CABINETS
     middle = (low + high) / 2
 
@@ -270,7 +270,7 @@ def strips(random):
 
 
 def lamps(random):
-    """Return all 72 lights and what they are mounted in."""
+    """Yield all 72 lights with their fittings."""
     yield from ceiling_lamps(random)  # 15
     yield from strips(random)  # 36
     x, y = TABLE
@@ -288,7 +288,7 @@ def lamps(random):
 
 
 def kitchen(seed, windows=False):
-    """Return the scene as XML text, the same for the same seed; `windows` lets the sky in."""
+    """Return the scene as XML text, determined by the seed; `windows` adds the sky."""
     furniture, power = np.random.default_rng(7), np.random.default_rng(seed)
     name, option = ("kitchen_windows", "--windows ") if windows else ("kitchen_lamps", "")
     command = f"kitchen_lamps.py {option}--seed {seed} --output scenes/{name}.xml"
@@ -301,13 +301,13 @@ def kitchen(seed, windows=False):
 
 
 def kitchen_sky():
-    """Return the texels of a clear sky whose low sun stands behind the camera."""
+    """Return the texels of a clear sky with a low sun behind the camera."""
     return sky_image((0.6, 1.2, 2.6), (2.2, 2.4, 2.8), (0.16, 0.15, 0.12), (1600, 1300, 900), (0.35, -1, 0.42), 6, 0.01)
 
 
 def main(arguments=None):
     command_line = parser(__doc__, "kitchen_lamps.xml, or kitchen_windows.xml")
-    command_line.add_argument("--windows", action="store_true", help=f"let the sky in, and write it too ({SKY})")
+    command_line.add_argument("--windows", action="store_true", help=f"add the sky, and write its texture {SKY}")
     options = command_line.parse_args(arguments)
     output = options.output or Path("kitchen_windows.xml" if options.windows else "kitchen_lamps.xml")
     try:

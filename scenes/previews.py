@@ -1,5 +1,5 @@
-"""Render the small pictures beside the scenes, by `lightcuts` with adaptive direct light, the forest by direct light,
-the veils with emitters that are virtual lights.
+"""Render the preview pictures of the scenes by `lightcuts` with adaptive direct light. Exceptions: direct light alone
+for the forest, emitters as virtual lights for the veils.
 
 ./run -- python scenes/previews.py [NAME...]
 """
@@ -11,12 +11,12 @@ import mitsuba as mi
 
 FOLDER = Path(__file__).resolve().parent
 WIDTH, SAMPLES, FEW_SAMPLES, DEPTH, DEEP = 192, 16, 4, 8, 24
-DIRECT = ("forest_lights",)  # light paths among so many leaves would take minutes
-BEHIND_MASKS = ("veils",)  # which emitter sampling does not pass, as in Mitsuba's integrators
+DIRECT = ("forest_lights",)  # tracing light paths through the leaves takes minutes
+BEHIND_MASKS = ("veils",)  # next-event estimation does not pass masks, as in Mitsuba's integrators
 
 
 def preview(name):
-    """Write NAME.png beside NAME.xml, in the shape of the scene's own film."""
+    """Write NAME.png beside NAME.xml, with the aspect ratio of the scene's film."""
     path = FOLDER / f"{name}.xml"
     film = mi.load_file(str(path)).sensors()[0].film().size()
     height = round(WIDTH * film[1] / film[0])

@@ -1,10 +1,9 @@
-"""Write a hall with rows of gauze veils on both sides of an aisle.
+"""Generate a hall with rows of gauze veils on both sides of an aisle.
 
-The scene is for shadow rays that are expensive: what lets light pass unscattered is found surface by surface, and rays
-from wall to wall meet a dozen of them. With `--veils` it tells at what cost of a ray a method that traces few of them
-pays; without veils it is a plain room. Next-event estimation does not pass veils, in Mitsuba's integrators as here, so
-that `path` finds the emitters behind them by chance only; `direct="vpl"` sees them. Every veil on the way to a surface
-is an edge of the path.
+Purpose: expensive shadow rays. Rays between walls intersect a dozen masks, surface by surface. `--veils` varies the
+cost of a ray, to find the cost above which a method with few rays pays off; without veils the hall is a plain room.
+Next-event estimation does not pass veils, as in Mitsuba's integrators; `path` finds emitters behind veils only by BSDF
+sampling, and `direct="vpl"` includes their light. Each veil counts as an edge of the path.
 
     python scenes/veils.py --output scenes/veils.xml
 """
@@ -13,7 +12,7 @@ import numpy as np
 from elements import ball, box, drum, flat, glow, header, material, numbers, write_scene
 
 LENGTH, HALF, HEIGHT, WALL, AISLE = 9.0, 3.0, 3.4, 0.15, 0.9  # metres; walls are at |y| = HALF
-OPACITY = 0.05  # share of the light that a veil stops
+OPACITY = 0.05  # fraction of the light blocked by a veil
 COLOURS = [(1.0, 0.88, 0.72), (1.0, 0.8, 0.6), (0.8, 0.9, 1.0)]
 MATERIALS = [
     material("lamp", (0.6, 0.6, 0.6)),
@@ -30,7 +29,7 @@ GAUZE = (
 
 
 def shell():
-    """Return floor, ceiling, and walls of which two are coloured."""
+    """Yield floor, ceiling and walls, two of them coloured."""
     yield box("floor", (-WALL, -HALF, -WALL), (LENGTH, HALF, 0))
     yield box("plaster", (-WALL, -HALF, HEIGHT), (LENGTH, HALF, HEIGHT + WALL))
     yield box("red", (-WALL, HALF, 0), (LENGTH, HALF + WALL, HEIGHT))
@@ -40,7 +39,7 @@ def shell():
 
 
 def things(random):
-    """Return lamps at the ceiling, and pedestals with balls and boxes on them."""
+    """Yield ceiling lamps, and pedestals with balls and boxes."""
     for x in (1.5, 4.5, 7.5):
         for side in (-1, 1):
             colour = COLOURS[random.integers(len(COLOURS))]
@@ -56,7 +55,7 @@ def things(random):
 
 
 def hangings(count, random):
-    """Return the veils, one half on either side of the aisle: upright, along the hall, turned a little."""
+    """Yield the veils, half on each side of the aisle: vertical, along the hall, slightly rotated."""
     for number in range(count):
         side, row = (-1, 1)[number % 2], (number // 2 + 0.5) / ((count + 1) // 2)
         place = (0.5 * LENGTH + random.uniform(-0.3, 0.3), side * (AISLE + row * (HALF - AISLE - 0.2)), 0.5 * HEIGHT)
@@ -65,7 +64,7 @@ def hangings(count, random):
 
 
 def hall(seed, veils):
-    """Return the scene as XML text, the same for the same seed."""
+    """Return the scene as XML text, determined by the seed."""
     random = np.random.default_rng(seed)
     command = f"veils.py --seed {seed} --veils {veils} --output scenes/veils.xml"
     camera = (75, (0.2, -0.3, 1.7), (6, 0.3, 1.3))

@@ -1,24 +1,24 @@
-"""The parts that many-light integrators share, and those of single methods; nothing here knows an integrator.
+"""Components of the many-light integrators. No module here imports an integrator.
 
-Data flows one way: a scene's emitters send out light paths, which leave virtual lights, over which trees are built;
-camera rays end at gather points, over which trees are built too; a method decides which lights stand for which at which
-points; pairs of a point and a light are shaded, their shadow rays traced, and what arrives is summed.
+Data flow: light paths start at the emitters of a scene and deposit virtual lights, which light trees cluster. Camera
+rays end at gather points, which point trees cluster. A method selects representative lights for each gather point.
+The renderer then shades pairs of a point and a light, traces a shadow ray for each pair, and sums the contributions.
 
-Packages, each of which imports only from those above it (tests/test_layers.py):
+A package imports only from packages above it in this table (tests/documents/test_layers.py):
 
 =============  =================================================================================================
 ``core``       arrays between NumPy and Dr.Jit, random numbers, Morton codes, parameters of scene objects, the backend
-``lights``     emitters, light paths, virtual lights, light trees; all lights of one render
-``points``     camera paths, gather points, their surfaces and materials' bounds, trees over them, slices
-``transport``  what a light sends to a point, whether it arrives, bounds on what a cluster sends
-``direct``     direct light of emitters: next-event estimation, and adaptive sampling with learned probabilities [IAS]
+``lights``     emitters, light paths, virtual lights, light trees; all lights of a render
+``points``     camera paths, gather points, surfaces, bounds of materials, point trees, slices
+``transport``  contribution of a light to a point, its visibility, upper bounds for clusters
+``direct``     direct light of emitters: next-event estimation, adaptive sampling with learned probabilities [IAS]
 ``cuts``       Lightcuts, Multidimensional Lightcuts, IlluminationCut: [LC], [MDLC], [IC]
 ``matrix``     LightSlice and matrix sampling and recovery: [LS], [MSR]
-``split``      the image of ``path`` from virtual lights and what they leave out: the plugin ``manylights``
+``split``      the image of ``path`` from virtual lights and a traced remainder: the plugin ``manylights``
 =============  =================================================================================================
 
-To read one method, begin with its plugin in ``integrators/`` (the method ``shade``), then with the map that the
-``__init__`` of its package holds.
+To read a method, start at ``shade`` of its plugin in ``integrators/`` and continue with the overview in the
+``__init__`` of its package.
 
 - [LC] Walter et al. 2005, "Lightcuts: a scalable approach to illumination"
 - [MDLC] Walter et al. 2006, "Multidimensional lightcuts"

@@ -1,4 +1,4 @@
-// Viewers come to life when they come near the window; keys go to the one in the middle of it.
+// Start viewers lazily when they approach the window; direct keys to the current viewer.
 
 const roots = [...document.querySelectorAll(".viewer")], viewers = new Map();
 
@@ -12,7 +12,7 @@ const arrivals = new IntersectionObserver((entries) => {
 }, { rootMargin: "1000px" });
 for (const root of roots) arrivals.observe(root);
 
-// The viewer that fills the screen, or has the focus, or is nearest to the middle of the window.
+// The current viewer: full-screen, else focused, else nearest to the middle of the window.
 function current() {
   const distance = (root) => {
     const box = root.getBoundingClientRect();
@@ -22,7 +22,7 @@ function current() {
     || roots.toSorted((a, b) => distance(a) - distance(b))[0];
 }
 
-// Go to the viewer of the next scene, or the one before, and show there what is shown here.
+// Go to the viewer of the next or previous scene and transfer the view.
 function go(by) {
   const here = current(), there = roots[roots.indexOf(here) + by];
   if (!there) return;
@@ -45,7 +45,7 @@ const keys = {
 
 document.addEventListener("keydown", (event) => {
   if (!roots.length || event.ctrlKey || event.metaKey || event.altKey) return;
-  // Buttons keep the space, and fields all keys, for themselves.
+  // Buttons handle the space key, form fields handle all keys.
   if (event.target.closest?.("input, select, summary") || (event.key === " " && event.target.closest?.("button, a"))) return;
   const viewer = viewerOf(current()), digit = event.code.match(/^(?:Digit|Numpad)([1-9])$/);
   if (digit) viewer[event.shiftKey ? "showBeside" : "show"](digit[1] - 1);

@@ -1,15 +1,15 @@
-// The pixels of comparison/page_images.py: codes, their numbers, and the colours that they are shown in.
+// Decode and colour the images of comparison/page_images.py.
 
 const BITS_LEFT_OUT = 3;
 const palettes = JSON.parse(document.getElementById("palettes").textContent);
 
-// Number of every code of a colour: half-precision numbers without sign.
+// Number of every colour code, an unsigned half-precision number.
 const linear = Float32Array.from({ length: 1 << (15 - BITS_LEFT_OUT) }, (_, code) => {
   const half = code << BITS_LEFT_OUT, exponent = half >> 10, mantissa = half & 1023;
   return exponent ? 2 ** (exponent - 15) * (1 + mantissa / 1024) : (2 ** -14 * mantissa) / 1024;
 });
 
-// Decode a picture into codes, one after another pixel by pixel.
+// Decode a picture into an array of codes, pixel by pixel.
 async function decode(packed) {
   const bytes = Uint8Array.from(atob(packed.data), (letter) => letter.charCodeAt(0));
   const inflated = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
@@ -32,8 +32,8 @@ const percent = (value) => `${Number((100 * value).toPrecision(2))}%`;
 const logarithmic = (value, [low, high]) => Math.log(value / low) / Math.log(high / low);
 const sRGB = (value) => (value <= 0.0031308 ? 12.92 * value : 1.055 * value ** (1 / 2.4) - 0.055);
 
-// What maps of errors mean: the number of a code, its place from 0 to 1 on the scale of colours, what is written at the
-// top, middle and bottom of that, all at an exposure in stops (of which FLIP knows nothing), and the number in words.
+// Error maps: number of a code, position on the colour scale (0 to 1), labels at its top, middle and bottom, at an
+// exposure in stops (ignored by FLIP), and the number as text.
 const { range, stored, whitest } = palettes.scales;
 const maps = {
   relative: {
@@ -57,7 +57,7 @@ const maps = {
   flip: { number: (code) => code / 255, place: (value) => value, ends: () => ["1", "", "0"], text: (value) => value.toFixed(2) },
 };
 
-// The colour, three bytes, of every code.
+// Colour (three bytes) of every code.
 function colours(kind, stops) {
   const map = maps[kind], count = kind === "distance" ? linear.length : 256, found = new Uint8Array(3 * count);
   for (let code = 0; code < count; code++) {
@@ -67,7 +67,7 @@ function colours(kind, stops) {
   return found;
 }
 
-// Paint a picture of a kind ("image", or one of the maps) in a canvas of its own.
+// Paint a picture of a kind ("image", or a map) in a new canvas.
 function paint(packed, codes, kind, stops) {
   const canvas = Object.assign(document.createElement("canvas"), { width: packed.width, height: packed.height });
   const context = canvas.getContext("2d"), pixels = context.createImageData(packed.width, packed.height);
@@ -84,7 +84,7 @@ function paint(packed, codes, kind, stops) {
   return canvas;
 }
 
-// Paint the scale of colours of a kind, from the highest down.
+// Paint the colour scale of a kind, the highest value on top.
 function paintScale(canvas, kind) {
   Object.assign(canvas, { width: 1, height: 256 });
   const context = canvas.getContext("2d"), pixels = context.createImageData(1, 256);

@@ -1,6 +1,6 @@
 // Dragging with any pointer.
 
-// Call `move` with the pointer's steps, where it is and where it came from, while it is held down on an element, then `end`.
+// While a pointer is held down on an element, call `move` with its current and previous position; finally call `end`.
 function drag(element, move, end = () => {}) {
   element.addEventListener("pointerdown", (event) => {
     if (event.button !== 0 || (event.target !== element && event.target.tagName !== "CANVAS")) return;

@@ -1,4 +1,4 @@
-// The pictures of all integrators below the stage, in step with it: what it shows of A and B, or an inset.
+// Pictures of all integrators below the stage, which show the region of the stage or of the inset.
 
 class Tiles {
   constructor(viewer, root) {
@@ -25,7 +25,7 @@ class Tiles {
     return this.inset || this.viewer.region();
   }
 
-  // Draw all again, if they are shown.
+  // Redraw the visible pictures.
   async draw() {
     const { viewer, figures } = this, shown = this.are_shown || Boolean(this.inset);
     viewer.find(".tiles").classList.toggle("drawn", shown);
@@ -48,7 +48,7 @@ class Tiles {
     if (this.inset) this.measure();
   }
 
-  // Write the mean relative error inside the inset.
+  // Display the mean relative error inside the inset.
   async measure() {
     const [x, y, width, height] = this.inset;
     for (const [index, view] of this.viewer.views.entries()) {

@@ -1,7 +1,7 @@
-// The pictures of a scene: two of them, A and B, in place, split by a line that can be dragged, or flipped.
+// Viewer of a scene: pictures A and B in the same place, split by a draggable line, or flipped.
 
-const HIGHEST = 640; // CSS pixels of a stage, unless it fills the screen
-const FURTHEST = 64; // zoom
+const HIGHEST = 640; // CSS pixels, maximum height of a stage outside full screen
+const FURTHEST = 64; // maximum zoom
 
 class Viewer {
   constructor(root) {
@@ -11,12 +11,12 @@ class Viewer {
     Object.assign(this, { views, exposure, metric, stage: this.find(".stage") });
     this.decoded = new Map(); // packed picture -> codes
     this.painted = new Map(); // index of a view, kind and exposure -> canvas
-    this.split = 0.5; // of the stage's width
+    this.split = 0.5; // position of the line, fraction of the stage's width
     this.flipping = false;
     this.flipped = false;
-    this.picking = false; // an inset
-    this.zoom = 1; // 1 fits
-    this.origin = [0, 0]; // of the picture on the stage, CSS pixels
+    this.picking = false; // the user selects an inset
+    this.zoom = 1; // 1: fit
+    this.origin = [0, 0]; // CSS pixels, position of the picture on the stage
     for (const select of [this.find(".a"), this.find(".b")]) {
       views.forEach((view, index) => select.add(new Option(view.title, index)));
     }
@@ -28,7 +28,7 @@ class Viewer {
     this.repaint();
   }
 
-  // What is shown first: the last settings of the first and of the last label, or of the only one and the reference.
+  // Initial A and B: the last settings of the first and of the last label; with a single label, B is the reference.
   first() {
     const labels = this.views.map((view) => view.label), own = labels.filter((label) => label !== null);
     const last = [own[0], own.at(-1)].map((label) => labels.lastIndexOf(label));
@@ -67,7 +67,7 @@ class Viewer {
     for (const element of [this.root, this.find(".tiles")]) sizes.observe(element);
   }
 
-  // --- What is shown ---
+  // --- Selection of pictures ---
 
   get kind() {
     return this.find(".kind").value;
@@ -77,13 +77,13 @@ class Viewer {
     return Number(this.find(".exposure").value);
   }
 
-  // Indices of the views that can be seen.
+  // Indices of the visible views.
   visible() {
     const [a, b] = [".a", ".b"].map((name) => Number(this.find(name).value));
     return this.flipping ? [this.flipped ? b : a] : [a, b];
   }
 
-  // Show one picture, whole.
+  // Show a single picture.
   show(index) {
     if (!this.views[index]) return;
     this.find(".a").value = index;
@@ -91,7 +91,7 @@ class Viewer {
     this.repaint();
   }
 
-  // Show a picture on the right of the line.
+  // Show a picture to the right of the line.
   showBeside(index) {
     if (!this.views[index]) return;
     this.find(".b").value = index;
@@ -99,7 +99,7 @@ class Viewer {
     this.repaint();
   }
 
-  // Show what another viewer does, as far as there is the same.
+  // Adopt the view of another viewer where this scene has the same pictures.
   adopt(other) {
     for (const name of [".a", ".b"]) {
       const title = other.views[other.find(name).value].title;
@@ -114,7 +114,7 @@ class Viewer {
   }
 
   flip() {
-    this.flipped = this.flipping ? !this.flipped : true; // from the split, A being known, to B
+    this.flipped = this.flipping ? !this.flipped : true; // from split, show B first
     this.flipping = true;
     this.place();
   }
@@ -153,7 +153,7 @@ class Viewer {
     this.place();
   }
 
-  // --- Zoom, and the part that is seen ---
+  // --- Zoom and visible region ---
 
   wheel(event) {
     if (!event.ctrlKey && !event.metaKey && !this.root.classList.contains("full")) {
@@ -170,7 +170,7 @@ class Viewer {
     this.place();
   }
 
-  // Zoom by a factor about a point of the stage; 0 fits again.
+  // Zoom by a factor about a point of the stage; 0: fit.
   scale(factor, about) {
     const old = this.zoom;
     this.zoom = factor ? Math.min(FURTHEST, Math.max(1, old * factor)) : 1;
@@ -178,7 +178,7 @@ class Viewer {
     this.place();
   }
 
-  // CSS pixels of the stage that a pixel of the picture takes when it fits.
+  // CSS pixels per pixel of the picture at zoom 1.
   get fit() {
     const { width, height } = this.views[0].image, isFull = this.root.classList.contains("full");
     const others = this.find(".controls").offsetHeight + this.find(".tiles").offsetHeight + 80;
@@ -187,13 +187,13 @@ class Viewer {
     return Math.min((this.find(".screen").clientWidth - beside) / width, Math.max(200, highest) / height);
   }
 
-  // The part of the picture that is seen: [x, y, width, height] in its pixels.
+  // Visible region of the picture: [x, y, width, height] in its pixels.
   region() {
     const { width, height } = this.views[0].image, pixel = this.fit * this.zoom;
     return [-this.origin[0] / pixel, -this.origin[1] / pixel, width / this.zoom, height / this.zoom];
   }
 
-  // The pixel of the picture at a place of the window.
+  // Pixel of the picture at a position of the window.
   pixelAt({ x, y }) {
     const box = this.stage.getBoundingClientRect(), pixel = this.fit * this.zoom, { width, height } = this.views[0].image;
     const inside = (value, size) => Math.min(size - 1, Math.max(0, Math.floor(value / pixel)));
@@ -245,7 +245,7 @@ class Viewer {
     return this.decoded.get(packed);
   }
 
-  // The kind in which a view is shown: references have no errors against themselves.
+  // Kind of map shown for a view; the reference has no error maps and appears as an image.
   kindOf(view) {
     return view.maps[this.kind] ? this.kind : "image";
   }
@@ -271,7 +271,7 @@ class Viewer {
     }
     const indices = [".a", ".b"].map((name) => Number(this.find(name).value));
     const pictures = await Promise.all(indices.map((index) => this.picture(index)));
-    if (turn !== this.turn) return; // something else was asked for meanwhile
+    if (turn !== this.turn) return; // superseded by a later request
     ["under", "over"].forEach((name, i) => {
       const canvas = this.find(`.${name}`);
       Object.assign(canvas, { width: pictures[i].width, height: pictures[i].height });
@@ -286,7 +286,7 @@ class Viewer {
     this.stage.dataset.painted = turn;
   }
 
-  // Put canvases, line, frame and names where they belong.
+  // Position canvases, line, frame and names.
   place() {
     if (!this.names) return;
     const under = this.find(".under"), over = this.find(".over"), handle = this.find(".handle"), { fit } = this;

@@ -1,7 +1,7 @@
 """Contents of the site, from the lists of links of docs/index.md, and what pages need only outside of the site.
 
 Each part of the front page with links to pages of docs/ becomes a part of the sidebar; pages that it does not name are
-added to the last. Plugins are below the page that tells which one to take.
+added to the last. Plugins are below the page docs/choosing.md.
 """
 
 import re
@@ -18,7 +18,7 @@ REDIRECTION = '<!doctype html><meta http-equiv="refresh" content="0; url={0}"><a
 
 
 def add_contents(_app, page, source):
-    """Append the contents to the pages that have some."""
+    """Append contents to the front page and to the parent page of plugins."""
     if page == "docs/index":
         source[0] += "".join(_toctree(entries, title) for title, entries in parts(source[0]).items())
     elif page == PARENT_OF_PLUGINS:
@@ -26,7 +26,7 @@ def add_contents(_app, page, source):
 
 
 def parts(text):
-    """{title: entries of its toctree} of the front page, with pages that it does not name in the last part."""
+    """Entries of the toctree of each part of the front page, {title: entries}. Unnamed pages are in the last part."""
     found, rest = {}, {file.stem for file in DOCS.glob("*.md")} - {"index"}
     for part in text.split("\n## ")[1:]:
         title, _, body = part.partition("\n")

@@ -1,4 +1,4 @@
-"""Formulas as MathML, which browsers draw by themselves: the site needs no network."""
+"""Formulas as MathML, which browsers draw without a library from the network."""
 
 from docutils import nodes
 from docutils.utils.math import latex2mathml

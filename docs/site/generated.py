@@ -1,5 +1,7 @@
-"""Pages that are written before the site is read: the plugins', from their docstrings, and those of files of code that
-other pages link to; and links to these files, which lead to the pages instead."""
+"""Pages generated before Sphinx reads its sources: manual pages from docstrings of plugins, listings of linked code.
+
+Links to files of code lead to these pages.
+"""
 
 import re
 from pathlib import Path
@@ -23,12 +25,12 @@ CODE_PAGE = """\
 
 
 def code_page(file):
-    """The page that shows a file of code."""
+    """Path of the page with the listing of a file of code."""
     return CODE_PAGES / (".".join(file.relative_to(ROOT).with_suffix("").parts) + ".rst")
 
 
 def write_pages(_app):
-    """Write one page a plugin and one a linked file of code, where it has changed, and remove what is left over."""
+    """Write changed pages of plugins and of linked files of code, and remove obsolete pages."""
     mi.set_variant("llvm_ad_rgb")
     import integrators
 
@@ -57,7 +59,7 @@ def linked_code():
 
 
 class FileLinks(SphinxTransform):
-    """Links to files of Python: those that name the file lead to its code, others to the manual page of the plugin."""
+    """Links to Python files: to the listing if the link names the file, otherwise to the manual page of the plugin."""
 
     default_priority = 500
 

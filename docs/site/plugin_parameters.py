@@ -7,7 +7,7 @@ TITLES, WIDTHS = ("Parameter", "Type", "Description"), (20, 12, 68)
 
 
 class PluginParameters(SphinxDirective):
-    """Table of parameters. Its content is one list, of which every entry is a list of three."""
+    """Table of parameters. The content is a list of lists of three entries: name, type, description."""
 
     has_content = True
 

@@ -1,17 +1,17 @@
-"""Foundations of all other packages: no light, no gather point, no method.
+"""Foundations of the other packages, independent of lights, gather points and methods.
 
-- ``arrays``: the only safe ways between NumPy and Dr.Jit (``upload``, ``download``); which values count as numbers
-  (``usable``, ``finite_or_zero``); rows worked off in chunks that fit in memory (``chunks``)
-- ``sampling``: seeds derived from seeds, samplers of any width, rows chosen by weight (``Choice``, ``RowChoice``,
-  ``find_interval``), evenly spread samples (``SpreadSamples``)
-- ``loops``: long loops of kernels, recorded once
-- ``shared_code``: shapes that differ in numbers alone are compiled once
-- ``garbage``: blocks that Python's cyclic collector does not disturb
+- ``arrays``: safe copies between NumPy and Dr.Jit (``upload``, ``download``), validity of values (``usable``,
+  ``finite_or_zero``), chunks of rows that fit in memory (``chunks``)
+- ``sampling``: derived seeds, samplers of any width, discrete distributions (``Choice``, ``RowChoice``,
+  ``find_interval``), low-discrepancy samples (``SpreadSamples``)
+- ``loops``: kernel loops recorded once
+- ``shared_code``: kernels shared by shapes that differ only in numbers
+- ``garbage``: code blocks without Python's cyclic garbage collector
 - ``morton``: codes and orders along a Morton curve
-- ``cones``: axes of cones around directions, and how their cosines are rounded
-- ``stages``: names of a render's stages, by which its seconds are kept
+- ``cones``: axes of direction cones, rounding of cone cosines
+- ``stages``: names of the stages of a render, keys of its timings
 - ``parameters``: parameters of scene objects, read without ``mitsuba.traverse``
-- ``registry``: a number for each of some shapes or emitters
-- ``exclusive``: objects that serve one thread at a time
-- ``backend``: what has to be right underneath Mitsuba, checked before it goes wrong
+- ``registry``: table from shapes or emitters to numbers
+- ``exclusive``: objects for use by one thread at a time
+- ``backend``: checks of the system libraries below Mitsuba
 """

@@ -1,8 +1,8 @@
-"""Arrays that move between NumPy and Dr.Jit, in the only two ways that are safe.
+"""Safe copies of arrays between NumPy and Dr.Jit.
 
-On the LLVM backend ``mi.Float(ndarray)`` aliases NumPy's memory, and kernels read it in whole packets, past the end
-when the length is no multiple of the packet width.  Memory that Dr.Jit allocated is padded, so every upload goes
-through :func:`upload`.
+On the LLVM backend ``mi.Float(ndarray)`` aliases NumPy's memory. Kernels read whole packets, and so read past the end
+of an array whose length is not a multiple of the packet width. Memory that Dr.Jit allocates is padded; therefore every
+upload uses :func:`upload`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _NUMPY_DTYPES = {
 
 
 def upload(array_type, values):
-    """Copy a NumPy array into memory that Dr.Jit owns.
+    """Copy a NumPy array into memory owned by Dr.Jit.
 
     Parameters: ``array_type``, a flat Dr.Jit type such as ``mi.Float``; ``values``, any array, which is flattened in C
     order and converted to the type's precision.  Returns an evaluated array of ``values.size`` entries.
@@ -39,7 +39,7 @@ def upload(array_type, values):
 
 
 def upload_vectors(vector_type, rows):
-    """Copy rows (n, k) of NumPy to vectors of k entries, such as ``mi.Point3f``, as :func:`upload` does."""
+    """Copy the rows (n, k) of a NumPy array to vectors of k entries (e.g. ``mi.Point3f``) by :func:`upload`."""
     return vector_type(*(upload(mi.Float, column) for column in rows.T))
 
 
@@ -49,49 +49,53 @@ def download(values):
     dr.sync_thread()
     if dr.depth_v(type(values)) == 1:
         return np.array(values.numpy(), copy=True)
-    # Channel by channel: making one array of a vector compiles a kernel for every width
+    # Download channel by channel: a joint array of the vector compiles a kernel for every width
     return np.stack(np.broadcast_arrays(*(download(channel) for channel in values)), axis=1)
 
 
 def ranges(first: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """The numbers first[i] .. first[i] + size[i] - 1 for one i after another, of NumPy arrays."""
+    """Concatenate the integer ranges first[i] .. first[i] + size[i] - 1."""
     return np.repeat(first - np.cumsum(size) + size, size) + np.arange(size.sum())
 
 
 def add_at(target, values, index):
-    """Add values to some entries of an array, several to the same one if need be; to be evaluated by the caller.
+    """Add ``values`` to the entries ``index`` of an array; duplicate indices are allowed. The caller evaluates.
 
-    Left to itself, ``dr.scatter_add`` keeps copies of small targets whose width it bakes into the kernel, which is then
-    compiled anew for every size.
+    ``ReduceMode.Local`` keeps the kernel independent of the size of ``target``. By default ``dr.scatter_add``
+    duplicates small targets and compiles their width into the kernel.
     """
     dr.scatter_add(target, values, index, mode=dr.ReduceMode.Local)
 
 
 def spectrum_to_rgb(spectrum) -> mi.Color3f:
-    """Widen an unpolarized spectrum of one or three channels to three (mono: the same value three times)."""
+    """Convert an unpolarized spectrum of one or three channels to RGB (mono: equal channels)."""
     return mi.Color3f(spectrum[0]) if dr.size_v(mi.Spectrum) == 1 else mi.Color3f(spectrum)
 
 
 def rgb_to_spectrum(rgb):
-    """The inverse of :func:`spectrum_to_rgb`."""
+    """Invert :func:`spectrum_to_rgb`."""
     return mi.Spectrum(rgb[0]) if dr.size_v(mi.Spectrum) == 1 else mi.Spectrum(rgb)
 
 
 def channel_mean(spectrum):
-    """Mean over the channels of every lane.  (``dr.mean`` bakes the number of lanes into the kernel, which is then
-    compiled anew for every size.)"""
+    """Mean over the channels, per lane.
+
+    ``dr.mean`` compiles the number of lanes into the kernel, which is then compiled again for every size.
+    """
     return dr.sum(spectrum) * (1.0 / dr.size_v(type(spectrum)))
 
 
 def ones(count: int):
-    """A spectrum of ones, as evaluated arrays that are distinct for every channel: arrays shared by the channels would
-    make the kernels that first use them other kernels than those that follow."""
+    """Spectrum of ones with a separate evaluated array for each channel.
+
+    Arrays shared by channels change the first kernels that use them, which are then compiled twice.
+    """
     channels = [dr.opaque(mi.Float, 1.0, count) for _ in range(dr.size_v(mi.UnpolarizedSpectrum))]
     return mi.UnpolarizedSpectrum(*channels)
 
 
 def select_record(mask, chosen, otherwise):
-    """``dr.select`` for the fields of a dataclass; those that are None stay so."""
+    """Apply ``dr.select`` to every field of a dataclass; fields of ``otherwise`` that are None remain None."""
     return type(otherwise)(
         **{
             name: None if value is None else dr.select(mask, getattr(chosen, name), value)
@@ -100,42 +104,43 @@ def select_record(mask, chosen, otherwise):
     )
 
 
-# Radiances and intensities above count as infinite: sums over lights and samples must stay in single precision's range
+# Larger radiances and intensities count as infinite: sums over lights and samples must not overflow single precision
 LARGEST_VALUE = 1e30
 
-# Entries of matrices, or pairs, that are worked on at a time: bounds the memory whatever the size of the image
+# Matrix entries or pairs in one chunk: limits the memory independently of the image size
 ENTRIES = 1 << 23
 
 
-# Of a count on the device: as good as no limit
+# Maximum of a UInt32: no limit in practice
 NO_LIMIT = 0xFFFFFFFF
 
 
 def upload_limit(limit: float):
-    """A largest count, math.inf for none, as an opaque UInt32: the kernel is the same whatever it is."""
+    """Upload an upper limit of a count (math.inf: none) as an opaque UInt32, so that kernels do not depend on it."""
     return dr.opaque(mi.UInt32, int(min(limit, NO_LIMIT)))
 
 
 def usable(value):
-    """Mask of where a radiance, an intensity or a density is a number from 0 to ``LARGEST_VALUE``; NumPy or Dr.Jit."""
+    """Mask of the radiances, intensities or densities from 0 to ``LARGEST_VALUE``; NumPy or Dr.Jit."""
     return (value >= 0) & (value <= LARGEST_VALUE)
 
 
 def carries_light(colours: np.ndarray) -> np.ndarray:
-    """Mask (n,) of colours (n, 3) whose mean is positive in single precision, by which light trees are built."""
+    """Mask (n,) of the colours (n, 3) with a positive mean in single precision, the precision of light trees."""
     with np.errstate(invalid="ignore", over="ignore"):
         return colours.mean(1, dtype=np.float64).astype(np.float32) > 0
 
 
 def finite_or_zero(spectrum):
-    """Replace values that are infinite (see :func:`usable`), negative or not a number by 0, so that one bad texel
-    cannot spoil an image."""
+    """Replace infinite (see :func:`usable`), negative and NaN values by 0, so that a bad texel affects only itself."""
     return dr.select(usable(spectrum), spectrum, 0)
 
 
 def chunks(sizes: np.ndarray, most: int):
-    """Yield ranges of consecutive rows, (first, one past the last), of at most ``most`` entries together, or of one row
-    that alone has more.  ``sizes`` (n,): entries of each row."""
+    """Yield ranges (first, last + 1) of consecutive rows with at most ``most`` entries together.
+
+    A row with more entries forms a range alone. ``sizes`` (n,): entries of each row.
+    """
     ends, first = np.cumsum(sizes), 0
     while first < len(ends):
         before = ends[first - 1] if first else 0
@@ -145,6 +150,6 @@ def chunks(sizes: np.ndarray, most: int):
 
 
 def even_chunks(rows: int, width: int = 1, most: int | None = None):
-    """Chunks, as of :func:`chunks`, of ``rows`` rows of ``width`` entries each; by default at most ENTRIES together."""
+    """Split ``rows`` rows of ``width`` entries into chunks of at most ``most`` (default: ENTRIES) entries each."""
     step = max((most or ENTRIES) // width, 1)
     return ((first, min(first + step, rows)) for first in range(0, rows, step))

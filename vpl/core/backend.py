@@ -1,12 +1,12 @@
-"""Libraries underneath Mitsuba that have to be right, checked before they go wrong in ways that nobody can read.
+"""Checks of the system libraries below Mitsuba, with errors that state the remedy.
 
-Two libraries come from the system and not with the Python wheels. Without libatomic, ``import drjit`` (and so
-``import mitsuba``) dies with a NameError that names neither. And libLLVM, which compiles every kernel of the ``llvm_*``
-variants, is found but refused up to version 14, reported as missing, while versions 15 and 16 are accepted and then
-abort the whole process at the first kernel that computes a minimum. This module turns each of these into one error that
-says what to do.
+Two libraries come from the system, not from the Python wheels:
 
-It imports nothing but the standard library until a function is called, so that it can be asked first.
+- libatomic: if absent, ``import drjit`` and ``import mitsuba`` fail with a NameError that does not mention libatomic.
+- libLLVM, the compiler of all kernels of the ``llvm_*`` variants: Dr.Jit refuses versions up to 14 and reports them as
+  missing. It accepts versions 15 and 16, which abort the process at the first kernel with a minimum.
+
+On import, this module uses the standard library alone, so that other modules can call it before Dr.Jit is loaded.
 """
 
 import os
@@ -21,11 +21,11 @@ _HOW_TO_GET_LLVM = (
 
 
 def import_drjit() -> ModuleType:
-    """Import and return ``drjit``; a missing system library is an ImportError that names it and the fix."""
+    """Import ``drjit``; raises an ImportError that names a missing system library and the remedy."""
     try:
         import drjit
     except NameError as error:
-        # drjit's own handler of the failed import stumbles over a name; the loader's message is the error's context.
+        # The exception handler in drjit fails itself; the context of its error is the loader's message
         raise ImportError(
             f"Dr.Jit could not load its binary part: {error.__context__ or error}. If this is about libatomic.so.1: "
             "install it (Debian and Ubuntu: apt install libatomic1), or start by ./run, which provides it."
@@ -34,10 +34,10 @@ def import_drjit() -> ModuleType:
 
 
 def check_backend(variant: str) -> None:
-    """Raise a RuntimeError with the fix if the kernels of a Mitsuba variant cannot be compiled on this machine.
+    """Raise a RuntimeError with the remedy if this machine cannot compile the kernels of a Mitsuba variant.
 
-    Call it before ``mi.set_variant(variant)``, or at least before the first kernel. Only libLLVM is checked; variants
-    that do not need it, such as ``cuda_ad_rgb``, pass.
+    Call it before ``mi.set_variant(variant)``, or at the latest before the first kernel. Only libLLVM is checked;
+    variants without it, such as ``cuda_ad_rgb``, pass.
     """
     if not variant.startswith("llvm_"):
         return
@@ -45,7 +45,7 @@ def check_backend(variant: str) -> None:
     if major >= OLDEST_LLVM:
         return
 
-    # Dr.Jit answers -1 for a library that is missing and for one that it refuses as too old.
+    # Dr.Jit returns -1 both for a missing library and for a refused old version
     found = f"LLVM {major}, which Dr.Jit found, is too old" if major >= 0 else "Dr.Jit found none, or only an older one"
     path = os.environ.get("DRJIT_LIBLLVM_PATH")
     where = f" DRJIT_LIBLLVM_PATH is {path!r}." if path else ""

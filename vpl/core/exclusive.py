@@ -1,4 +1,4 @@
-"""Objects that serve one thread at a time: who else would use them is told, instead of getting a wrong image."""
+"""Exclusive use of objects by a thread: a second thread gets an error instead of a wrong image."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from threading import Lock, get_ident
 
 import mitsuba as mi
 
-# By the identity of objects in use: the thread that uses them
+# Thread that uses an object, by the identity of the object
 _USERS: dict[int, int] = {}
 _LOCK = Lock()
 
 
 @contextmanager
 def exclusive(**objects):
-    """Use ``objects``, named as they are called, in this thread alone while the block runs.  Blocks of one thread may
-    hold each other.
+    """Reserve ``objects`` (keyword: name for messages) for this thread while the block runs.
 
-    Raises a RuntimeError, which is logged too, that names an object which another thread is using.
+    Blocks of the same thread may be nested. Raises and logs a RuntimeError that names an object in use by another
+    thread.
     """
     thread = get_ident()
     with _LOCK:
@@ -26,8 +26,8 @@ def exclusive(**objects):
         _USERS.update(dict.fromkeys(taken, thread))
     if others:
         refusal = (
-            f"another thread is rendering with the same {others[0]}: give each thread one of its own (load the scene "
-            "once for each), or render one image after the other"
+            f"another thread is rendering with the same {others[0]}: give each thread its own (load the scene once for "
+            "each), or render one image after the other"
         )
         mi.Log(mi.LogLevel.Warn, refusal)
         raise RuntimeError(refusal)

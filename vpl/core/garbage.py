@@ -1,4 +1,4 @@
-"""Python's cyclic collector, kept from letting go of what is in use."""
+"""Suspension of Python's cyclic garbage collector."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import gc
 from contextlib import contextmanager
 from threading import Lock
 
-# Blocks that run with the collector stopped, and whether it ran before the first of them
+# Number of active blocks, and whether the collector was enabled before the first
 _STOPPED = {"blocks": 0, "ran": True}
 _LOCK = Lock()
 
 
 @contextmanager
 def garbage_kept():
-    """Keep Python's cyclic collector from running while the block runs, in any thread.
+    """Suspend Python's cyclic garbage collector in all threads while the block runs.
 
-    A scene that it lets go while a frozen function is recorded makes that fail, or ends the process; between two calls,
-    Dr.Jit records anew.
+    A scene collected during the recording of a frozen function makes the recording fail or ends the process; a scene
+    collected between two calls makes Dr.Jit record again.
     """
     with _LOCK:
         if not _STOPPED["blocks"]:

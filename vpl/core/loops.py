@@ -1,4 +1,4 @@
-"""Kernels that are long, recorded no more often than need be."""
+"""Kernel loops recorded as rarely as possible."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import drjit as dr
 
 
 def recorded_once(function: Callable) -> Callable:
-    """A function whose loops are recorded once.
+    """Decorate a function so that Dr.Jit records its loops once.
 
-    Dr.Jit looks for what a loop does not change, and records the body again without it: where paths are followed, all
-    shapes and materials of the scene once more.  What these loops do not change they have to ``exclude`` themselves,
-    and arrays that they scatter to, which Dr.Jit takes out of the loop's state by recording it again.
+    By default Dr.Jit searches for loop invariants and records the body again without them. In a path-tracing loop this
+    repeats the code of all shapes and materials. The loops must ``exclude`` their invariants explicitly, and also the
+    arrays that they scatter to, which Dr.Jit would remove from the loop state by another recording.
     """
 
     @wraps(function)

@@ -1,4 +1,4 @@
-"""Morton codes: positions in a grid to places along a curve (NumPy only)."""
+"""Morton codes of grid cells, and the order of points along a Morton curve (NumPy only)."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ _MASKS = (0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C
 
 
 def interleave(cells: np.ndarray) -> np.ndarray:
-    """Codes of cells, (n,) uint64 from (n, 3) numbers from 0 to 2^21 - 1, whose fractions are dropped.
+    """Morton codes (n,) uint64 of cells (n, 3) with coordinates from 0 to 2^21 - 1; fractions are dropped.
 
-    Bit k of the cell along axis a becomes bit 3k + a.
+    Bit k of the coordinate along axis a becomes bit 3k + a.
     """
     code = np.zeros(len(cells), np.uint64)
     for axis in range(3):
@@ -25,13 +25,13 @@ def interleave(cells: np.ndarray) -> np.ndarray:
 
 
 def morton_order(points: np.ndarray, bits: int = 21) -> np.ndarray:
-    """Indices of points, (n, 3), along a Morton curve through a cube around them, with ``bits`` an axis: (n,) int64.
+    """Indices (n,) int64 of points (n, 3) along a Morton curve through their bounding cube, ``bits`` per axis.
 
-    Cells are found in the points' own precision.
+    Cells are computed in the precision of the points.
     """
     low = points.min(axis=0)
     extent = float((points.max(axis=0) - low).max())
     cells = 2**bits - 1
-    # Of an extent next to nothing, which is as good as none, the inverse is infinite
+    # The inverse of a tiny extent overflows; points of a tiny extent share a cell
     scale = cells / extent if extent > cells * float(np.finfo(points.dtype).tiny) else 0.0
     return np.argsort(interleave(np.minimum((points - low) * scale, cells)), kind="stable")

@@ -1,4 +1,4 @@
-"""Registry table: numbers of shapes or emitters, by the index that Mitsuba's registry has given to each."""
+"""Table of numbers for shapes or emitters, indexed by Mitsuba's registry."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from .arrays import upload
 
 @dataclass(init=False)
 class RegistryTable:
-    """A number for each of some objects, 0 for all others.
+    """Number of each listed object; 0 for unlisted objects.
 
-    Kernels hold neither indices nor how many there are: shapes are loaded in parallel, and registered in another order
-    in every process, which would have to compile them anew.  A dataclass, as :class:`vpl.lights.perturbed.Perturbed`,
-    which holds one, is given to functions that Dr.Jit freezes.
+    Indices and their count are arrays, not constants of kernels: Mitsuba loads shapes in parallel and registers them
+    in a different order in each process, so constants would prevent the reuse of cached kernels. A dataclass, because
+    Dr.Jit traverses it (e.g. in :class:`vpl.lights.perturbed.Perturbed`) as an argument of frozen functions.
     """
 
-    _numbers: object
-    _size: object
+    _numbers: mi.UInt32
+    _size: mi.UInt32
 
     def __init__(self, indices, numbers):
-        """``indices`` (n,) of objects of one kind in the registry, which counts each kind by itself, from 1;
-        ``numbers``: that of each, not negative, or one for all."""
+        """``indices`` (n,): registry indices, from 1, of objects of one kind; ``numbers``: the non-negative number of
+        each, or one number for all."""
         indices = np.asarray(indices, np.int64)
-        # An array of one entry would make other kernels
+        # At least two entries: an array of one entry changes the kernels
         table = np.zeros(max(int(indices.max(initial=0)) + 1, 2), np.uint32)
         table[indices] = numbers
         self._numbers, self._size = upload(mi.UInt32, table), dr.opaque(mi.UInt32, len(table))
 
     def at(self, pointers, active=True):
-        """Number (UInt32) of the object that each pointer of that kind leads to; 0 of others and of none, and where not
-        active."""
+        """Number (UInt32) of the object behind each pointer; 0 for unlisted objects, null pointers and inactive
+        lanes."""
         index = dr.reinterpret_array(mi.UInt32, pointers)
         return dr.gather(mi.UInt32, self._numbers, index, active & (index < self._size))

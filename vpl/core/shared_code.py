@@ -1,4 +1,4 @@
-"""Code that kernels share: shapes that differ in numbers alone are compiled once."""
+"""Kernel code shared by shapes that differ only in numbers."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import drjit as dr
 
 from .parameters import parameters_of
 
-# Shapes whose numbers Mitsuba 3.9.1 leaves where kernels hold them, so that each of them is compiled for itself
+# Shape whose numbers Mitsuba 3.9.1 compiles into kernels as literals, which multiplies the code by the number of shapes
 _HELD = "Rectangle"
 
 
 def share_code(scene) -> None:
-    """Let kernels fetch where rectangles lie, instead of holding it.
+    """Make the transformations of rectangles opaque, so that kernels load them from memory.
 
-    Values stay as they are, and so do images; only kernels made from then on are others.  With 46 rectangles a kernel
-    that samples points on them has 415 operations instead of 2156, and is compiled in 0.05 s instead of 0.18.
+    Values and images do not change; kernels compiled afterwards do. With 46 rectangles a kernel that samples points on
+    them has 415 operations instead of 2156 and compiles in 0.05 s instead of 0.18 s.
     """
     places = [parameters_of(shape, below=False)["to_world"] for shape in scene.shapes() if shape.class_name() == _HELD]
     held = [to_world for to_world in places if to_world.matrix[0, 0].state == dr.VarState.Literal]

@@ -1,6 +1,6 @@
-"""Names of the stages of a render, by which its seconds are kept: what methods write and comparisons read.
+"""Names of the stages of a render, the keys of its timings.
 
-Who wants to know which stage a render is in listens, and is told as each begins, in the thread that renders.
+A listener is called at the start of each stage, in the rendering thread.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from enum import StrEnum
 
 
 class Stage(StrEnum):
-    """A stage of a render; its value is the key in ``statistics["seconds"]``."""
+    """Stage of a render; the value is the key in ``statistics["seconds"]``."""
 
     # ---- Every integrator
     SCENE = "scene"  # emitters and materials are read
@@ -25,10 +25,10 @@ class Stage(StrEnum):
     TREE = "tree"  # light trees are built
     PROBE = "probe"  # materials are probed
     PILOT = "pilot"  # the mean radiance is estimated
-    EVALUATE = "evaluate"  # what was chosen is shaded and traced
+    EVALUATE = "evaluate"  # selected lights are shaded and traced
 
     # ---- Lightcuts and Multidimensional Lightcuts
-    ESTIMATE = "estimate"  # the radiance that error bounds are compared with
+    ESTIMATE = "estimate"  # radiance that error bounds refer to
     CUT = "cut"
     GATHER_TREE = "gather_tree"
     THRESHOLD = "threshold"
@@ -54,7 +54,7 @@ class Stage(StrEnum):
 
     # ---- The split of `manylights`
     LIGHTS = "lights"  # surface lights find their irradiance
-    TRACED = "traced"  # what virtual lights do not carry
+    TRACED = "traced"  # the remainder that virtual lights do not carry
     CLUSTERS = "clusters"  # gather vertices of pixels are clustered
     CUTS = "cuts"  # their light cuts are chosen, shaded and traced
 
@@ -64,7 +64,7 @@ _LISTENER: ContextVar[Callable[[Stage], None] | None] = ContextVar("listener", d
 
 @contextmanager
 def listening(listener: Callable[[Stage], None]):
-    """While the block runs, ``listener`` is called with every stage that begins in this thread; what it raises ends the
+    """Call ``listener`` with every stage that starts in this thread while the block runs. Its exceptions end the
     render."""
     token = _LISTENER.set(listener)
     try:
@@ -74,7 +74,7 @@ def listening(listener: Callable[[Stage], None]):
 
 
 def tell(stage: Stage) -> None:
-    """Say that a stage begins."""
+    """Report the start of a stage to the listener."""
     listener = _LISTENER.get()
     if listener is not None:
         listener(stage)

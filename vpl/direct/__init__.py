@@ -1,8 +1,8 @@
 """Direct light of emitters: by next-event estimation, or by iterative adaptive sampling [IAS].
 
-``emitter_sampling`` stands by itself: one emitter sample and one BSDF sample, as in Mitsuba's ``path``
-(``direct="nee"``).  All else is [IAS]: plugins ``adaptivedirect`` and ``unoccludeddirect``, and ``direct="adaptive"``.
-How data flows, which is also the order to read in::
+``emitter_sampling`` is independent of the other modules: next-event estimation as in Mitsuba's ``path``
+(``direct="nee"``).  The other modules implement [IAS] for the plugins ``adaptivedirect`` and ``unoccludeddirect`` and
+for ``direct="adaptive"``.  Data flow, and reading order::
 
     emitters -> emitter_pieces, environment_regions -> sources, emitter_clusters -.
                                                                                    >- cluster_cuts -> site_table
@@ -10,18 +10,18 @@ How data flows, which is also the order to read in::
 
     site_table -> passes (cluster_probabilities -> cluster_sampling, again and again) or all_sources -> radiance
 
-- ``adaptive``: the driver: sites, groups and cuts of an image; what is sampled, and what is summed
-- ``sources``: everything that lights directly as rows of arrays; ``emitter_pieces``: area emitters as triangles,
-  parallelograms, disks and spheres; ``environment_regions``: the environment emitter as regions, which
-  ``environment_strata`` finds (Agarwal et al. 2003)
-- ``emitter_clusters``: cluster trees over sources [IAS section 4.3.1]; ``cluster_cuts``: the clusters that light a
-  group of points, by solid angle [IAS section 4.3]
-- ``sites``: blocks of 8 × 8 pixels, classes of normals [IAS section 4.1]; ``site_table``: sites, clusters and
-  statistics as kernels read them
-- ``cluster_probabilities``: the learned probability of each cluster, from the uniform, the block's and the pixel's
-  function [IAS equations 4 to 6]
-- ``cluster_sampling``: the kernels: a cluster, a source, a point on it, its shadow ray
-- ``passes``: passes, their combination, and when a pixel is done [IAS sections 4.2, 5.8 and 5.9]
-- ``all_sources``: the plain sum over all sources, where it is cheaper
-- ``unoccluded_passes``: the reference method: a fixed density, proportional to unoccluded light [IAS section 5.1]
+- ``adaptive``: driver.  Builds sites, groups and cuts of an image, then samples or sums the sources of each group
+- ``sources``: arrays of the sources of direct light
+- ``emitter_pieces``: area emitters cut into triangles, parallelograms, disks and spheres
+- ``environment_regions``: the environment emitter cut into regions, by the strata of ``environment_strata`` [SIS]
+- ``emitter_clusters``: cluster trees over sources [IAS section 4.3.1]
+- ``cluster_cuts``: clusters that light a group of points, by solid angle [IAS section 4.3]
+- ``sites``: blocks of 8 × 8 pixels and classes of normals [IAS section 4.1]
+- ``site_table``: arrays of sites, clusters and statistics for kernels
+- ``cluster_probabilities``: learned cluster probabilities: a blend of the uniform, block and pixel functions [IAS
+  equations 4 to 6]
+- ``cluster_sampling``: kernels that draw a cluster, a source, a point on the source, and trace the shadow ray
+- ``passes``: passes, their combination, and the stopping rule of a pixel [IAS sections 4.2, 5.8 and 5.9]
+- ``all_sources``: the plain sum over all sources, for groups with few
+- ``unoccluded_passes``: reference method, with a fixed density proportional to unoccluded light [IAS section 5.1]
 """

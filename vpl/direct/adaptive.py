@@ -1,8 +1,8 @@
 """Direct light at all gather points of an image, from few sources or many [IAS].
 
-Points become sites, sites form groups, groups get their cuts through the sources; then each is lit by the cheaper of
-two ways: by iterative adaptive sampling (:mod:`vpl.direct.passes`) or, where its sources are few, by summing over all
-of them (:mod:`vpl.direct.all_sources`).
+Gather points form sites, sites form groups, and each group gets a cut through the sources.  A group with few sources is
+lit by the plain sum (:mod:`vpl.direct.all_sources`), a group with many by iterative adaptive sampling
+(:mod:`vpl.direct.passes`).
 
 [IAS] Donikian et al. 2006, Accurate direct illumination using iterative adaptive sampling.
 """
@@ -26,27 +26,29 @@ from ..points.surfaces import Batch, LambertianSurface, make_batches
 from .all_sources import SourceRounds
 from .cluster_cuts import GroupCuts, cut_clusters, has_wide_source
 from .passes import SiteEstimates, SitePasses
-from .site_table import Scenery, SiteTable
+from .site_table import PassContext, SiteTable
 from .sites import Sites, bound_groups, divide_points
 from .sources import Sources
 from .unoccluded_passes import UnoccludedPasses
 
-# Entries (pairs of a site and a cluster) that are worked on at a time: some 28 bytes each
+# Entries (pairs of a site and a cluster) processed at a time, some 28 bytes each
 _ENTRIES = 12_000_000
-# Sums trace twice as many rays in a second as passes do, have no noise, and two passes are needed at least
-_SUM_WORTH = 4
-# Sites of the pilot, which finds the mean radiance of the image
+# Number of sources, in samples of a pass, up to which a group is summed.  A sum traces twice as many rays a second and
+# has no variance.  Sampling takes at least two passes
+_SUM_ADVANTAGE = 4
+# Sites of the pilot, which estimates the mean radiance of the image
 _PILOT_SITES = 1024
-# Clusters whose unoccluded contribution is less than this share of the light at a group of points may be coarse
+# Clusters below this fraction of a group's unoccluded light may be coarse
 FAINT_SHARE = 0.005
 FIELDS = ("noise", "passes", "shadow_rays", "visible")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DirectOptions:
-    """Options that users choose, under the names of the properties of ``adaptivedirect`` and ``unoccludeddirect``.
+    """Properties of ``adaptivedirect`` and ``unoccludeddirect``, under the same names.
 
-    ``lights``: "clusters", "all" or "auto"; or "unoccluded", the reference method.
+    ``lights``: "clusters", "all" or "auto"; or "unoccluded", the reference method.  ``cluster_angle``: steradians [IAS
+    section 5.7]; ``max_passes``, ``max_samples`` of a pixel: [IAS section 5.9]; ``time``: seconds, 0 for no limit.
     """
 
     error: float = 0.03
@@ -62,15 +64,19 @@ class DirectOptions:
 
 @dataclass
 class DirectLight:
-    """Per gather point: ``radiance``; ``noise``: estimated standard error over radiance; ``passes``; ``shadow_rays``,
-    shared out among the points of a site; ``visible``: share of the samples that found light. Float but the radiance.
-    ``clusters``: how many light each point, summed."""
+    """Direct light, one value for every gather point.
 
-    radiance: object
-    noise: object
-    passes: object
-    shadow_rays: object
-    visible: object
+    - ``noise``: estimated standard error over radiance
+    - ``shadow_rays``: rays of the site divided by its number of points
+    - ``visible``: fraction of samples that found light
+    - ``clusters``: sizes of cuts, summed over points
+    """
+
+    radiance: mi.UnpolarizedSpectrum
+    noise: mi.Float
+    passes: mi.Float
+    shadow_rays: mi.Float
+    visible: mi.Float
     clusters: int = 0
 
 
@@ -80,7 +86,8 @@ def light_directly(
 ) -> DirectLight:  # fmt: skip
     """Direct light of ``sources`` at all gather points.
 
-    ``level``: mean radiance of the image, which ``dark_floor`` is a fraction of; estimated where it is None.
+    ``level``: mean radiance of the image, the unit of ``dark_floor``; None lets a pilot estimate it.
+    ``stopped``: called before every pass; True ends the render.
     """
     start = perf_counter()
     found, clusters = np.zeros((points.count, 3 + len(FIELDS)), np.float32), 0
@@ -115,7 +122,7 @@ class _BatchLight:
         position, normal = download(batch.position), download(batch.normal)
         generator = np.random.default_rng(seed)
         self._single = options.lights == "unoccluded"  # sources instead of clusters
-        # Only the reference method takes the points of a site in their order
+        # The reference method visits the points of a site one after another, in random order
         self.sites = divide_points(pixel, grid.width, position, normal, generator if self._single else None)
         two_sided = np.zeros(batch.count, bool)
         if batch.proxy.without_cosines:
@@ -125,25 +132,27 @@ class _BatchLight:
         self._choose()
 
     def _choose(self) -> None:
-        """Cuts of all groups, which of them sum over all sources, and their share of BSDF samples."""
+        """Choose the cut, the method (sum or passes) and the number of BSDF samples of every group."""
         options, count = self.options, self._bounds.count
         self._cuts = self._cut(np.arange(count), options.cluster_angle)
         group = self._cuts.group
-        held = (self.nodes.last.astype(np.int64) - self.nodes.first)[self._cuts.node]
-        # Sources of each group, and how many of them have an extent
-        self._held, extended = (np.bincount(group, x, count) for x in (held, self.nodes.extended[self._cuts.node]))
+        sources = (self.nodes.last.astype(np.int64) - self.nodes.first)[self._cuts.node]
+        # Number of sources in each group's cut, and of sources with an extent
+        self._source_count, extended = (
+            np.bincount(group, number, count) for number in (sources, self.nodes.extended[self._cuts.node])
+        )
         self._summed = np.full(count, options.lights == "all")
         if options.lights == "auto" and self._beyond is None:
-            a_pass = np.maximum(SiteEstimates.samples_per_cluster * self._cuts.size, SiteEstimates.least_samples)
-            self._summed = (extended == 0) & (self._held <= _SUM_WORTH * a_pass)
-        # Emitter samples alone are enough for small sources and diffuse surfaces, unless light comes by way of a mirror
+            of_pass = np.maximum(SiteEstimates.samples_per_cluster * self._cuts.size, SiteEstimates.least_samples)
+            self._summed = (extended == 0) & (self._source_count <= _SUM_ADVANTAGE * of_pass)
+        # Small sources on diffuse surfaces need no BSDF samples, unless light arrives by way of delta surfaces
         self._bsdf = np.ones(count) * options.bsdf_share
         if isinstance(self.batch.surfaces, LambertianSurface) and self._beyond is None:
             self._bsdf *= has_wide_source(self.nodes, self._bounds, self._cuts)
 
     def _cut(self, groups, solid_angle: float) -> GroupCuts:
         cuts = cut_clusters(self.nodes, self._bounds.select(groups), solid_angle, FAINT_SHARE)
-        # Where light comes by way of mirrors, BSDF samples are taken even if nothing lights a group directly
+        # With delta surfaces a group without sources still needs BSDF samples, and so a cut that is not empty
         return cuts if self._beyond is None or self.nodes.count == 0 else cuts.without_empty()
 
     @property
@@ -152,7 +161,7 @@ class _BatchLight:
         return int((self.sites.points * self._cuts.size[self.sites.group]).sum())
 
     def pilot(self, seed: int) -> float:
-        """Mean radiance of the batch's points, roughly: one pass over some of the groups."""
+        """Estimate the mean radiance of the batch by one pass over some of the groups."""
         order = np.random.default_rng(seed).permutation(self._bounds.count)
         sites = self.sites.per_group[order]
         enough = (np.cumsum(sites) <= _PILOT_SITES) & (np.cumsum(sites * self._cuts.size[order]) <= _ENTRIES)
@@ -161,22 +170,22 @@ class _BatchLight:
         passes = SitePasses(*self._task(part, self._cuts.select(chosen), chosen), 0.0, self.options)
         passes.max_passes = 1
         if self._single:
-            # As many as the method itself takes
+            # The sample count of the method itself
             passes.estimates.least_samples = passes.estimates.most_samples = self.options.samples_per_ray
         passes.run(self._two_sided, seed, lambda number: False)
         return float(np.average(passes.result()[0].mean(1), weights=part.points))
 
     def _task(self, part: Sites, cuts: GroupCuts, groups):
-        """(Scenery, share of the pixel's rays, share of BSDF samples) of the sites of some groups."""
+        """(PassContext, fraction of the pixel's rays, BSDF samples per emitter sample) of the sites of some groups."""
         table = SiteTable.of(part, cuts)
         return (
-            Scenery(*self._common, table, self._beyond),
+            PassContext(*self._common, table, self._beyond),
             part.points / self.grid.samples,
             self._bsdf[groups][part.group],
         )
 
     def solve(self, level: float, seed: int, stopped, deadline: float) -> np.ndarray:
-        """The columns of :class:`DirectLight` per point, the radiance as three."""
+        """Compute (n, 3 + len(FIELDS)) float32: RGB radiance of every point, then its FIELDS."""
         per_site = np.zeros((self.sites.count, 3 + len(FIELDS)), np.float32)
         start, spent, number = perf_counter(), 0, 0
         for summed in (True, False):
@@ -192,10 +201,10 @@ class _BatchLight:
         return per_point
 
     def _own_reflectance(self) -> np.ndarray:
-        """Reflectance of every point over the mean of its site's, (n, channels) or 1.
+        """Reflectance of every point relative to the mean of its site, (n, channels) or (1,).
 
-        The points of a site share what arrives and not what they reflect: under filters wider than a pixel, textures
-        stay as sharp as they are. The mean over the site remains what was estimated.
+        The points of a site share incident light, and each keeps its own reflectance.  Textures thus stay sharp under
+        filters wider than a pixel.  The mean over the site is unchanged.
         """
         if self.sites.count == self.batch.count:
             return np.ones(1)
@@ -205,26 +214,26 @@ class _BatchLight:
         return np.where(mean > 0, own / np.where(mean > 0, mean, 1), 1)
 
     def _portions(self, groups: np.ndarray, summed: bool):
-        """Divide groups into portions that need little enough memory."""
+        """Divide groups into portions of at most _ENTRIES entries."""
         if summed:
-            entries = self._held[groups]
+            entries = self._source_count[groups]
         else:
-            size = self._held if self._single else self._cuts.size
+            size = self._source_count if self._single else self._cuts.size
             entries = size[groups] * self.sites.per_group[groups]
         for first, last in chunks(entries, _ENTRIES):
             yield groups[first:last]
 
     def _light(self, groups, summed: bool, level, seed, halted):
-        """Light some groups: (their sites, what :meth:`SiteEstimates.result` says of them)."""
+        """Light some groups: (their sites, result of :meth:`SiteEstimates.result`)."""
         single = summed or self._single
         part, cuts = self.sites.select(groups), self._cut(groups, 0.0) if single else self._cuts.select(groups)
-        scenery, share, bsdf = self._task(part, cuts, groups)
+        context, share, bsdf = self._task(part, cuts, groups)
         if summed:
-            # Where it was chosen by itself, no source has an extent
-            method = SourceRounds(scenery, part, share, bsdf * (self.options.lights == "all"), level, self.options)
+            # "auto" sums only over sources without extent, which BSDF samples cannot hit
+            method = SourceRounds(context, part, share, bsdf * (self.options.lights == "all"), level, self.options)
             method.run(seed, halted)
         else:
-            method = (UnoccludedPasses if self._single else SitePasses)(scenery, share, bsdf, level, self.options)
+            method = (UnoccludedPasses if self._single else SitePasses)(context, share, bsdf, level, self.options)
             method.run(self._two_sided, seed, halted)
         return part, method.result()
 
@@ -236,5 +245,5 @@ class _BatchLight:
 
 
 def _halted(stopped, until: float, number: int) -> bool:
-    """Whether to stop before a pass; for want of time never before the first."""
+    """Whether to stop before a pass; the deadline never stops the first one."""
     return stopped() or (number > 0 and perf_counter() > until)

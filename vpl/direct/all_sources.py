@@ -1,8 +1,8 @@
-"""Direct light as the plain sum over all sources, one shadow ray each: the method to beat where they are few.
+"""Direct light by the plain sum over the sources, with one shadow ray for each: cheapest for few sources.
 
-The loop over the sources runs in step for all points of a group, so their rays stay close together.  Where a site is
-one point and no source has an extent, one round is exact.  Elsewhere every round takes other points of the site and of
-the sources, and rounds go on until two halves agree.
+The points of a group loop over the sources in step, with coherent rays.  One round is exact for sites of a
+single point lit by sources without extent.  Otherwise every round draws new points on the site and on the sources, and
+rounds continue until the estimates of two halves agree.
 """
 
 from __future__ import annotations
@@ -13,32 +13,32 @@ import numpy as np
 from ..core.arrays import download, upload
 from ..core.sampling import derived_seed
 from .cluster_sampling import Drawn, sum_sources
-from .site_table import Lanes, Scenery
+from .site_table import Lanes, PassContext
 from .sites import Sites
 
-_LEAST_ROUNDS = 2  # of each half, before their difference is believed
+_LEAST_ROUNDS = 2  # rounds of each half before the difference of the halves can end the sum
 
 
 class SourceRounds:
-    """Rounds of summing over all sources for the sites of a table whose clusters are single sources.
+    """Sums over all sources, in rounds, for the sites of a table with single sources as clusters.
 
-    Other arguments as in :class:`vpl.direct.passes.SiteEstimates`, and so is :meth:`result`.
+    ``share``, ``bsdf_share``, ``level``: see :class:`vpl.direct.passes.SiteEstimates`.
     """
 
-    def __init__(self, scenery: Scenery, sites: Sites, share, bsdf_share, level: float, options):
-        self.scenery, self.sites, self.share, self.bsdf_share = scenery, sites, share, bsdf_share
+    def __init__(self, context: PassContext, sites: Sites, share, bsdf_share, level: float, options):
+        self.context, self.sites, self.share, self.bsdf_share = context, sites, share, bsdf_share
         self.level, self.options = level, options
-        count = scenery.table.count
+        count = context.table.count
         self.total, self.rounds = np.zeros((2, count, 3)), np.zeros((2, count), np.int64)
         self.rays, self.seen, self.samples = np.zeros(count), np.zeros(count), np.zeros(count)
 
     def run(self, seed: int, halted) -> None:
-        """Sum until all groups are done.  ``halted``: asked before every round."""
-        table = self.scenery.table
+        """Sum until all groups converge.  ``halted``: called with the number of every round before it; True stops."""
+        table = self.context.table
         if table.entries == 0:
             return
         size = download(table.size).astype(np.int64)
-        extended = self.scenery.sources.nodes.extended[download(table.node)].any() or self.bsdf_share.any()
+        extended = self.context.sources.nodes.extended[download(table.node)].any() or self.bsdf_share.any()
         noisy = (size > 0) & (extended | (self.sites.points > 1))
         active = np.flatnonzero(size)
         for number in range(2 * self.options.max_samples):
@@ -60,18 +60,18 @@ class SourceRounds:
     def _round(self, active, half: int, size, seed: int) -> Drawn:
         bsdf = np.ceil(size[active] * self.bsdf_share[active])
         columns = (active, np.full(len(active), half), np.ones(len(active)), bsdf)
-        return sum_sources(self.scenery, Lanes(*(upload(mi.UInt32, column) for column in columns)), seed)
+        return sum_sources(self.context, Lanes(*(upload(mi.UInt32, column) for column in columns)), seed)
 
     def _unfinished(self) -> np.ndarray:
-        """Groups whose mean squared error, as the difference of the halves shows it, is still too large."""
+        """Mask of the groups with an estimated mean squared error above the allowed one, (g,) bool."""
         level, variance = self._estimate()
         first = self.sites.group_first[:-1]
         allowed = np.square(level.mean(1)) + (self.options.dark_floor * self.level) ** 2
-        found, wanted = (np.add.reduceat(x, first) for x in (variance * self.share, self.options.error**2 * allowed))
-        return found > wanted
+        error, limit = (np.add.reduceat(x, first) for x in (variance * self.share, self.options.error**2 * allowed))
+        return error > limit
 
     def _estimate(self):
-        """(Radiance (s, 3), half the squared difference of the halves' means over channels)."""
+        """(Radiance (s, 3), its variance (s,): a quarter of the squared difference of the halves' channel means)."""
         rounds = np.maximum(self.rounds, 1)
         means = self.total / rounds[..., None]
         counted = self.rounds > 0
@@ -80,7 +80,7 @@ class SourceRounds:
         return means.sum(0) / both[:, None], np.square(difference) / 4
 
     def result(self):
-        """Per site: radiance (s, 3), its estimated variance, rounds, rays, and the share of samples that saw light."""
+        """Per site: radiance (s, 3), variance, rounds, rays, and the fraction of samples that found light."""
         radiance, variance = self._estimate()
         seen = self.seen / np.maximum(self.samples, 1)
         return radiance, variance, self.rounds.max(0), self.rays, np.minimum(seen, 1)

@@ -1,11 +1,10 @@
 """Clusters of sources that light a group of gather points: cuts through the cluster forest [IAS section 4.3].
 
-A cluster is fine enough where its bounding sphere fills less than a given solid angle from every point of the group;
-single sources always are.  Clusters that cannot light any point of the group are left out: those behind its surfaces,
-and those that face away from it.  One cut serves a whole group of neighbouring points (all those that share statistics)
-rather than each point, so that the statistics of a cluster mean the same thing at every point of the group.
+A cluster is fine enough if its bounding sphere subtends less than a given solid angle from every point of the group.  A
+single source always is.  Clusters that cannot light any point of the group are left out: clusters behind its surfaces,
+and clusters that face away.  The points of a group share one cut, and the statistics of the clusters.
 
-Departure from the paper: clusters that send little light may fill more.
+Departure from the paper: clusters that send little light may subtend a larger solid angle.
 """
 
 from __future__ import annotations
@@ -17,19 +16,22 @@ import numpy as np
 from ..core.arrays import even_chunks, ranges
 from .sources import Nodes
 
-# Sources without neighbours that fill more than this, in steradians, are hard to sample by area alone
+# Solid angle of a single source above which sampling by area alone is inefficient, sr
 _WIDE = 0.1
-# What a cluster fills at most, in steradians, however little light it sends
+# Largest solid angle of a faint cluster, sr
 _FAINT_ANGLE = 0.3
-# Pairs of a group and a node that are looked at together, some 300 bytes each; a cut has rarely more nodes than this
+# Pairs of a group and a node processed together, some 300 bytes each; usual upper bound of the nodes of a cut
 _PAIRS, _USUAL_CUT = 1 << 20, 1024
-_SLACK = 1e-5  # angles below are rounded towards keeping a cluster
+_SLACK = 1e-5  # tolerance of angles, rad: rounding keeps a cluster rather than losing it
 
 
 @dataclass
 class PointGroups:
-    """Groups of gather points: ``low``, ``high`` (g, 3): boxes of their positions; ``axis`` (g, 3), ``cone_cos`` (g,):
-    cones of their normals on the side that is lit, with a cosine of -1 where both are.  All float64."""
+    """Groups of gather points, all arrays float64.
+
+    ``low``, ``high`` (g, 3): boxes of positions; ``axis`` (g, 3), ``cone_cos`` (g,): cones of normals on the lit side,
+    with a cosine of -1 for two-sided surfaces.
+    """
 
     low: np.ndarray
     high: np.ndarray
@@ -47,7 +49,7 @@ class PointGroups:
 
 @dataclass
 class GroupCuts:
-    """Cuts in one array: group g has the nodes ``node[first[g] : first[g + 1]]``, in rising order."""
+    """Cuts in one array: group g has the nodes ``node[first[g] : first[g + 1]]``, in ascending order."""
 
     node: np.ndarray
     first: np.ndarray
@@ -68,7 +70,7 @@ class GroupCuts:
         return GroupCuts(self.node[ranges(self.first[groups], size)], np.concatenate([[0], np.cumsum(size)]))
 
     def without_empty(self) -> GroupCuts:
-        """These cuts, with the first node for groups that have none."""
+        """These cuts, with the first node for groups without any."""
         empty = np.flatnonzero(self.size == 0)
         size = np.maximum(self.size, 1)
         node = np.insert(self.node, self.first[empty], np.zeros(len(empty), np.uint32))
@@ -78,11 +80,11 @@ class GroupCuts:
 def cut_clusters(nodes: Nodes, groups: PointGroups, solid_angle: float, faint_share: float = 0.0) -> GroupCuts:
     """The coarsest clusters that are fine enough, per group; a ``solid_angle`` of 0 gives single sources.
 
-    Clusters that fill at most ``solid_angle`` steradians are, and so are those up to 0.3 steradians whose unoccluded
-    contribution is less than ``faint_share`` of the group's light: their statistics hardly matter.
+    A cluster is fine enough if it subtends at most ``solid_angle`` steradians.  A faint cluster, with less than
+    ``faint_share`` of the group's unoccluded light, may subtend up to 0.3 steradians.
     """
     roots, pairs = _roots(nodes), [np.zeros((2, 0), np.int64)]
-    # How far cuts go down is not known: few groups at a time where there are many nodes
+    # The depth of cuts is unknown, so the number of groups in a chunk allows for cuts of the usual size
     width = max(1, min(nodes.count, _USUAL_CUT) if solid_angle > 0 else nodes.count)
     for first, last in even_chunks(groups.count, width, _PAIRS):
         chosen = np.arange(first, last)
@@ -98,8 +100,10 @@ def cut_clusters(nodes: Nodes, groups: PointGroups, solid_angle: float, faint_sh
 
 
 def _descend(nodes: Nodes, groups: PointGroups, group, node, solid_angle: float):
-    """(2, k) groups and nodes: the coarsest clusters from those given on that fill less than ``solid_angle`` and may
-    light their group."""
+    """Descend from pairs of a group and a node to the coarsest nodes that are fine enough and may light the group.
+
+    Returns groups and nodes, (2, k) int64.
+    """
     found = [np.zeros((2, 0), np.int64)]
     while len(group):
         lit = _may_light(nodes, node, groups, group)
@@ -116,7 +120,7 @@ def _descend(nodes: Nodes, groups: PointGroups, group, node, solid_angle: float)
 
 
 def _unoccluded_light(nodes: Nodes, node, groups: PointGroups, group) -> np.ndarray:
-    """Unoccluded irradiance at the middle of a group that faces a cluster, roughly."""
+    """Estimate the unoccluded irradiance of a cluster at the middle of a group that faces it."""
     extent = np.linalg.norm(groups.high - groups.low, axis=1)[group] / 2
     offset = nodes.centroid[node] - ((groups.low + groups.high) / 2)[group]
     nearest = np.maximum(nodes.radius[node], extent)
@@ -125,7 +129,7 @@ def _unoccluded_light(nodes: Nodes, node, groups: PointGroups, group) -> np.ndar
 
 
 def has_wide_source(nodes: Nodes, groups: PointGroups, cuts: GroupCuts) -> np.ndarray:
-    """Whether a group's cut has a source at a finite place that fills a large solid angle, (g,) bool."""
+    """Whether a group's cut has a source at a finite position of more than 0.1 steradians, (g,) bool."""
     group, node = cuts.group, cuts.node.astype(np.int64)
     nearest = np.clip(nodes.center[node], groups.low[group], groups.high[group]) - nodes.center[node]
     wide = np.square(nodes.radius[node]) > _squared_sine(_WIDE) * np.einsum("ij,ij->i", nearest, nearest)
@@ -133,7 +137,7 @@ def has_wide_source(nodes: Nodes, groups: PointGroups, cuts: GroupCuts) -> np.nd
 
 
 def _squared_sine(solid_angle: float) -> float:
-    """Of half the angle of a cone: 2 pi (1 - cos) is its solid angle."""
+    """Squared sine of the half-angle of a cone of a solid angle, 2 pi (1 - cos)."""
     return 1 - max(0.0, 1 - solid_angle / (2 * np.pi)) ** 2
 
 
@@ -153,7 +157,7 @@ def _roots(nodes: Nodes) -> np.ndarray:
 
 
 def _may_light(nodes: Nodes, node, groups: PointGroups, group) -> np.ndarray:
-    """Whether a cluster can light any point of a group, pair by pair; errs on the side of yes."""
+    """Whether a cluster may light any point of a group, pair by pair; conservative."""
     infinite = nodes.infinite[node]
     middle, extent = (groups.low + groups.high) / 2, np.linalg.norm(groups.high - groups.low, axis=1) / 2
     offset = np.where(infinite[:, None], nodes.axis[node], nodes.center[node] - middle[group])
@@ -161,7 +165,7 @@ def _may_light(nodes: Nodes, node, groups: PointGroups, group) -> np.ndarray:
     blur = np.where(infinite, 0.0, nodes.radius[node] + extent[group])
     apart = distance > blur
     to_light = offset / np.where(distance > 0, distance, 1)[:, None]
-    # The angle by which the direction differs between the points of the group and those of the cluster
+    # Largest angle between directions from points of the group to points of the cluster
     spread = np.arcsin(np.minimum(blur / np.where(apart, distance, np.inf), 1))
     cone = np.arccos(np.clip(nodes.cone_cos[node], -1, 1))
 

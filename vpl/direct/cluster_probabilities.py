@@ -1,7 +1,10 @@
-"""Probabilities with which a site samples its clusters [IAS section 4.1].
+"""Cluster probabilities of sites [IAS section 4.1].
 
-First by the unoccluded contribution of each cluster; then more and more by what the samples of the site and of its
-whole group found.
+The first pass samples in proportion to unoccluded contributions.  Later passes rely increasingly on the samples of the
+site and of its group.
+
+Departure from the paper: its uniform function gives every cluster the same probability.  Here the function without
+feedback is proportional to unoccluded contributions, apart from a constant fraction.
 """
 
 from __future__ import annotations
@@ -12,30 +15,30 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import channel_mean, finite_or_zero
-from .site_table import SEEN, Scenery, SiteTable, Statistics
+from .site_table import SEEN, PassContext, SiteTable, Statistics
 
-# Every cluster gets this share of the mean importance of a site's clusters, for what the estimate does not see
+# Least importance of a cluster, relative to the mean over the site's clusters: covers errors of the estimate
 _LEAST_SHARE = 0.01
-# Of the share without feedback, what is spread evenly over a site's clusters
+# Fraction of the uniform function that is constant over a site's clusters
 _EVEN_SHARE = 0.1
 
 
 @dataclass
 class Mixture:
-    """Blend of the functions of a pass [IAS eq. 6]: shares of the uniform, the block's and the pixel's; weight of the
-    belief that all is visible, in samples."""
+    """Weights of the uniform, block and pixel functions in a pass [IAS eq. 6]; ``prior``: number of imaginary samples
+    that found everything visible."""
 
-    uniform: object
-    block: object
-    pixel: object
-    prior: object
+    uniform: mi.Float
+    block: mi.Float
+    pixel: mi.Float
+    prior: mi.Float
 
 
 def cluster_importance(surface, normal, two_sided, node):
-    """Unoccluded contribution (mean over channels) of a cluster to the radiance of a surface, roughly.
+    """Estimate the unoccluded contribution (mean over channels) of a cluster to the radiance of a surface.
 
-    From the point of its bounding sphere that stands highest above the surface, so that what is partly below the
-    horizon counts; facing as much as any of its sources could.
+    Uses the point of the bounding sphere highest above the surface, so that a cluster partly below the horizon counts,
+    and the largest emission cosine of any source in the cluster.
     """
     infinite, radius = node.infinite, dr.maximum(node.radius, 0)
     lift = dr.select(two_sided, mi.Vector3f(0), mi.Vector3f(normal))
@@ -52,15 +55,15 @@ def cluster_importance(surface, normal, two_sided, node):
 
 
 @dr.syntax
-def update_importance(scenery: Scenery, two_sided, sites):
-    """Set the importance of all entries of some sites, positive.  ``two_sided``: Bool per point of the batch."""
-    table, importance, sources = scenery.table, scenery.importance, scenery.sources
+def update_importance(context: PassContext, two_sided, sites):
+    """Set the importance of the entries of some sites, positive.  ``two_sided``: Bool per point of the batch."""
+    table, importance, sources = context.table, context.importance, context.sources
     size, cut, entry, first, members = (
         dr.gather(mi.UInt32, column, sites)
         for column in (table.size, table.cut, table.entry, table.member_first, table.members)
     )
     middle = dr.gather(mi.UInt32, table.member_row, first + members // 2)
-    surface, normal = scenery.batch.surfaces_at(middle), dr.gather(mi.Normal3f, scenery.batch.normal, middle)
+    surface, normal = context.batch.surfaces_at(middle), dr.gather(mi.Normal3f, context.batch.normal, middle)
     both = dr.gather(mi.Bool, two_sided, middle)
     total, k = dr.zeros(mi.Float, dr.width(sites)), dr.zeros(mi.UInt32, dr.width(sites))
     while dr.hint(k < size, exclude=[sources, table, surface, normal, both, importance, cut, entry, size]):
@@ -80,8 +83,10 @@ def update_importance(scenery: Scenery, two_sided, sites):
 
 @dr.syntax
 def sum_over_groups(table: SiteTable, statistics: Statistics, totals, place):
-    """Update ``totals``, sums over the sites of each group per node of its cut, at the given places: a tuple of
-    (samples, samples that saw the source, gain), Float."""
+    """Update sums over the sites of a group, for each node of its cut.
+
+    ``totals``: Float arrays (samples, samples that saw the source, gain); ``place``: indices of nodes to update.
+    """
     entries = dr.opaque(mi.UInt32, table.entries)
     at, stride, sites = (
         dr.gather(mi.UInt32, column, place) for column in (table.group_entry, table.group_stride, table.group_sites)
@@ -109,15 +114,15 @@ def _statistics_of(statistics: Statistics, entry, entries):
 
 
 @dr.syntax
-def update_probabilities(scenery: Scenery, of_groups, mixture: Mixture, sites):
-    """Set the probabilities of all entries of some sites [IAS eq. 4 to 6].
+def update_probabilities(context: PassContext, of_groups, mixture: Mixture, sites):
+    """Set the probabilities of the entries of some sites [IAS eq. 4 to 6].
 
-    C / sqrt(u) of [IAS] eq. 4 is importance × gain / sqrt(seen share) here, where ``mixture.prior`` samples that saw
-    their source and found what was expected are added to those of the block, and as many that behaved like the block to
-    those of the pixel.
+    C / sqrt(u) of [IAS] eq. 4 is importance × gain / sqrt(fraction of samples that saw the source).  The block gets
+    ``mixture.prior`` imaginary samples that found the expected light.  The pixel gets the same number of imaginary
+    samples with the averages of the block.
     """
-    table, importance, statistics = scenery.table, scenery.importance, scenery.statistics
-    probability = scenery.probability
+    table, importance, statistics = context.table, context.importance, context.statistics
+    probability = context.probability
     entries = dr.opaque(mi.UInt32, table.entries)
     size, cut, entry = (dr.gather(mi.UInt32, column, sites) for column in (table.size, table.cut, table.entry))
     sums, k = dr.zeros(mi.Vector3f, dr.width(sites)), dr.zeros(mi.UInt32, dr.width(sites))
@@ -126,6 +131,7 @@ def update_probabilities(scenery: Scenery, of_groups, mixture: Mixture, sites):
         k += 1
     dr.eval(sums)
     shares = mi.Vector3f(mixture.uniform, mixture.block, mixture.pixel)
+    # Normalised functions [IAS eq. 5], blended [IAS eq. 6]
     scale = dr.select(sums > 0, shares / sums, 0)
     scale /= dr.sum(scale * sums)
     even = _EVEN_SHARE * scale.x * sums.x / mi.Float(size)
@@ -142,7 +148,7 @@ def update_probabilities(scenery: Scenery, of_groups, mixture: Mixture, sites):
 
 
 def _guides(importance, statistics, of_groups, prior, entries, entry, node):
-    """Importance of entries without feedback, with the block's and with the pixel's."""
+    """Importance of entries without feedback, with block feedback, and with pixel feedback."""
     level = dr.gather(mi.Float, importance, entry)
     samples, seen, gain = (dr.gather(mi.Float, values, node) for values in of_groups)
     block_gain, block_seen = (gain + prior) / (samples + prior), (seen + prior) / (samples + prior)
@@ -151,6 +157,7 @@ def _guides(importance, statistics, of_groups, prior, entries, entry, node):
     pixel_seen = (seen + prior * block_seen) / (samples + prior)
 
     def guide(gain, seen):
+        """C / sqrt(u) [IAS eq. 4]."""
         return dr.select(seen > 0, level * gain * dr.rsqrt(seen), 0)
 
     return mi.Vector3f(level, guide(block_gain, block_seen), guide(pixel_gain, pixel_seen))

@@ -1,26 +1,25 @@
-"""Light cluster trees: omnidirectional lights in one, oriented lights in six by their main axis (NumPy only).
+"""Light cluster trees: one for omnidirectional lights, six for oriented lights by main axis (NumPy only).
 
-Lights are paired greedily from the bottom up, always the two clusters whose bounding sphere is smallest [IAS, section
-4.3.1]. Lights that differ too much never meet in a cluster: those that radiate everywhere have a tree of their own,
-oriented ones have a tree for each of the directions +X, −X, +Y, −Y, +Z, −Z that is nearest to theirs. A renderer walks
-down until a cluster's sphere subtends a small enough solid angle.
+Lights are paired greedily from the bottom up: each merge makes the smallest possible bounding sphere [IAS, section
+4.3.1]. Omnidirectional lights have a tree of their own. Oriented lights have a tree for each of +X, −X, +Y, −Y, +Z, −Z,
+by the direction nearest to the light's axis. A renderer descends until a cluster's sphere subtends a small enough solid
+angle.
 
-Joining two clusters only ever makes their spheres larger, so a pair of which each is the other's best partner will be
-paired by the greedy algorithm too, whatever it does before: all such pairs may merge at once. With every cluster
-looking at all others, the locally-ordered clustering of vpl/lights/clustering.py thus builds the greedy trees, up to
-ties.
+A merge never shrinks a sphere. Two clusters that are mutual best partners thus remain partners in the greedy algorithm,
+and every mutual pair may merge at once. With an unlimited search window, the locally-ordered clustering of
+vpl/lights/clustering.py builds the greedy trees, up to ties.
 
 Departures from the paper:
 
-- While a tree has more than 256 clusters left, they look only at the 32 neighbours to either side along a Morton curve.
-  The radii of 3,000 random lights' clusters sum up to 1.6% more in a plane, 3% more in a cube than those of the greedy
-  tree, which takes time quadratic in the number of lights.
-- Where there is less than one mutual pair to 64 clusters, as among lights whose distances grow exponentially, others
-  join their best partner too: the greedy tree is a chain there, as deep as there are lights.
-- A cluster's sphere is the smallest around the spheres of its two children, which is larger than the smallest around
-  its lights. How the paper finds its spheres, it does not say.
-- Clusters have a cone of directions, which the paper does not mention: within one of the six trees directions are up to
-  110 degrees apart, and what a cluster shines on is bounded better by the cone than by the tree's axis.
+- While a tree has more than 256 clusters, the search window is 32 neighbours to either side along a Morton curve.
+  Compared with the greedy tree, which takes quadratic time, the radii of the clusters of 3,000 random lights sum up to
+  1.6% more in a plane and 3% more in a cube.
+- With less than one mutual pair in 64 clusters, clusters without a mutual partner merge, too. Otherwise lights at
+  exponentially growing distances would form a chain, as deep as the number of lights.
+- A cluster's sphere is the smallest around the spheres of its two children, which may exceed the smallest around the
+  lights. The paper does not specify its spheres.
+- Clusters have a cone of directions, absent in the paper. Directions in one of the six trees are up to 110 degrees
+  apart, and the cone bounds the lit directions better than the tree's axis.
 
 [IAS] Donikian et al. 2006, Accurate direct illumination using iterative adaptive sampling.
 """
@@ -41,37 +40,36 @@ from ..lights.clustering import (
     require_rows,
 )
 
-# Clusters look at this many neighbours to either side, or at all others where they are no more than _FEW
+# Search window to either side along the curve; up to _FEW clusters the window is unlimited
 _WINDOW, _FEW = 32, 256
-# Clusters to a mutual pair that are too many: up to 30 occur among random lights
+# Clusters per mutual pair above which clusters without a mutual partner merge: up to 30 occur among random lights
 _RARE = 64
-# No extent, and no sum of intensities of up to 10^8 lights, exceeds float64 then
+# Extents, and sums of the intensities of up to 10^8 lights, stay within float64
 _LARGEST = 1e300
-# Distances are enlarged and cosines lowered by these before they bound something. No more than six roundings of 2^-53
-# go into a distance plus a radius, the worth of some 25 into the cosine of an angle between two axes plus another.
+# Safety margins of bounds: factor on distances, decrement of cosines. A distance plus a radius has at most six
+# roundings of 2^-53; the cosine of a sum of two angles has some 25.
 _OUTWARD = 1 + 2.0**-50
 _COSINE_ROUNDING = 2.0**-48
 
 
 @dataclass(frozen=True)
 class ClusterForest:
-    """Up to seven trees over n lights, all in one array of m nodes, in preorder and one tree after another.
+    """Up to seven trees over n lights in one array of m nodes, tree after tree, each in preorder.
 
-    The children of the inner node i are i + 1 and escape[i + 1]; for a leaf, escape[i] == i + 1. To walk all trees,
-    start at i = 0; refine by i = i + 1; take or skip a whole subtree by i = escape[i]; stop at m.
+    The children of the inner node i are i + 1 and escape[i + 1]; for a leaf, escape[i] == i + 1. A walk over every tree
+    starts at i = 0, descends by i = i + 1, skips a subtree by i = escape[i], and ends at m.
 
-    center, radius: (m, 3) and (m,) float64, world units: a sphere that contains the children's spheres, those of leaves
-      being the lights' own. That holds for these very numbers; only checking it in float64 again needs a tolerance, of
-      some 1e-15 relative to the radius.
-    axis, cone_cos: (m, 3) and (m,) float64, unit axis and cosine of the half-angle of a cone that contains the cones of
-      all lights below; +z and -1 for lights that radiate everywhere.
+    center, radius: (m, 3) and (m,) float64, world units: a sphere around the children's spheres; the light's own sphere
+      for leaves. A check of the containment in float64 needs a tolerance of some 1e-15 relative to the radius.
+    axis, cone_cos: (m, 3) and (m,) float64, unit axis and cosine of the half-angle of a cone around the cones of the
+      lights below; +z and -1 for omnidirectional lights.
     intensity: (m,) float64, summed over the lights below.
-    centroid: (m, 3) float64, world units: mean of the centres of the lights below, weighted by their intensities.
+    centroid: (m, 3) float64, world units: intensity-weighted mean of the centres of the lights below.
     escape: (m,) uint32, the node that follows this node's subtree.
     first, last: (m,) uint32: the node's lights are leaf_order[first:last].
     depth: (m,) uint32, edges from the root of the node's tree.
-    roots: (t,) uint32, the trees' first nodes: that of the lights that radiate everywhere, then +X, -X, +Y, -Y, +Z, -Z,
-      less those without lights; m == 2n - t.
+    roots: (t,) uint32, the first node of each tree that has lights: omnidirectional, then +X, -X, +Y, -Y, +Z, -Z;
+      m == 2n - t.
     leaf_order: (n,) uint32, the caller's indices of the lights in preorder.
     """
 
@@ -90,16 +88,16 @@ class ClusterForest:
 
 
 def build_cluster_forest(center, radius, axis, cone_cos, intensity) -> ClusterForest:
-    """Cluster lights into trees; the module's docstring says how.
+    """Cluster lights into trees by the algorithm of the module's docstring.
 
     center, radius: (n, 3) and (n,) float64, world units, up to 1e300: the lights' bounding spheres, of radius 0 for
       points; n may be 0.
     axis, cone_cos: (n, 3) unit vectors and (n,) float64: axis and cosine of the half-angle of a cone around the normals
-      of the light's surface, within 90 degrees of which it emits; 1 for a flat light. The cosine -1 marks a light that
-      radiates everywhere, whose axis is ignored.
+      of the light's surface, which emits within 90 degrees of a normal; 1 for a flat light. The cosine -1 marks an
+      omnidirectional light, with an axis that is ignored.
     intensity: (n,) float64, positive, up to 1e300, any unit.
 
-    Raises ValueError, naming the argument and the first bad light, where an input is not as described.
+    Raises ValueError, naming the argument and the first invalid light, for invalid input.
     """
     center, radius, axis, cone_cos, intensity = _validate(center, radius, axis, cone_cos, intensity)
     kind = _kinds(axis, cone_cos)
@@ -126,7 +124,7 @@ def build_cluster_forest(center, radius, axis, cone_cos, intensity) -> ClusterFo
 
 
 def _validate(center, radius, axis, cone_cos, intensity):
-    """Return the inputs as float64 arrays, axes normalised; raise ValueError for what is not as asked."""
+    """Return float64 arrays with normalised axes; raise ValueError for invalid input."""
     arrays = {"center": center, "radius": radius, "axis": axis, "cone_cos": cone_cos, "intensity": intensity}
     for name, value in arrays.items():
         array = arrays[name] = np.asarray(value, np.float64)
@@ -145,18 +143,18 @@ def _validate(center, radius, axis, cone_cos, intensity):
     with np.errstate(over="ignore"):
         length = np.linalg.norm(axis, axis=1)
     require_rows(np.abs(length - 1) < 1e-3, "axis", axis, "of unit length")
-    # A negative zero would be the least of all costs, which are compared by their bits
+    # Comparison by bits would make a negative zero the least cost
     return center, radius + 0.0, axis / length[:, None], cone_cos, intensity
 
 
 def _kinds(axis, cone_cos):
-    """The lights' trees, (n,) from 0 to 6: everywhere, then +X, -X, +Y, -Y, +Z, -Z, the first of them where equal."""
+    """Tree of each light, (n,) int64: 0 omnidirectional, then +X, -X, +Y, -Y, +Z, -Z; the first in case of ties."""
     main = np.argmax(np.stack([axis, -axis], axis=2).reshape(-1, 6), axis=1)
     return np.where(cone_cos == -1, 0, 1 + main)
 
 
 def _allocate(counts):
-    """A forest of trees over so many lights each, with its roots, and with cones of lights that radiate everywhere."""
+    """Allocate a forest of trees with ``counts`` lights, with roots set and every cone omnidirectional."""
     lights = np.cumsum([0, *counts])
     nodes = 2 * lights[-1] - len(counts)
     index = {name: np.empty(nodes, np.uint32) for name in ("escape", "first", "last", "depth")}
@@ -174,7 +172,7 @@ def _allocate(counts):
 
 
 def _fill_links(forest, nodes, leaf, leaves, depth):
-    """Link the nodes of one tree, a slice, to each other and to its lights, in preorder."""
+    """Set escape, first, last and depth of the nodes of a tree (a slice), and the order of its lights."""
     trees_before = np.searchsorted(forest.roots, nodes.start)
     is_leaf = leaves == 1
     first = (nodes.start + trees_before) // 2 + np.cumsum(is_leaf) - is_leaf
@@ -185,7 +183,7 @@ def _fill_links(forest, nodes, leaf, leaves, depth):
 
 
 def _cluster(spheres):
-    """Rounds of merges, as vpl/lights/clustering.py describes them, of (4, n) spheres along the curve."""
+    """Rounds of merges of (4, n) spheres along the curve: see vpl/lights/clustering.py."""
     extent = np.ptp(spheres[:3], axis=1).max() + spheres[3].max() or 1.0
 
     def relative_cost(first, second):
@@ -200,7 +198,7 @@ def _cluster(spheres):
 
 
 def _distance(first, second):
-    """Distances of pairs of points, the first three rows of both arrays; neither overflows nor underflows."""
+    """Distances of pairs of points, the first three rows of both arrays, without overflow or underflow."""
     x, y, z = (first[axis] - second[axis] for axis in range(3))
     return np.hypot(np.hypot(x, y), z)
 
@@ -208,20 +206,20 @@ def _distance(first, second):
 def _joined_radius(first, second):
     """Radii of the smallest spheres around pairs of spheres (4, ...), apart from rounding."""
     both = 0.5 * (_distance(first, second) + (first[3] + second[3]))
-    # The larger sphere's where it contains the other
+    # The sphere of one may contain both
     return np.maximum(both, np.maximum(first[3], second[3]))
 
 
 def _join_spheres(first, second):
     """Smallest spheres around pairs of spheres, all (4, r).
 
-    Every radius is found from the very centre that is returned, so that the sphere holds both however that was rounded.
+    The radius is computed from the rounded centre, so that the sphere contains both in spite of rounding.
     """
     distance = _distance(first, second)
     beyond = np.minimum(_joined_radius(first, second) - first[3], distance)
     share = np.divide(beyond, distance, out=np.zeros_like(distance), where=distance > 0)
     center = first[:3] + share * (second[:3] - first[:3])
-    # Exactly the second's where that contains the first
+    # Exact if the second sphere contains the first
     center = np.where(share == 1, second[:3], center)
     reach = []
     for sphere in (first, second):
@@ -231,20 +229,21 @@ def _join_spheres(first, second):
 
 
 def _join_moments(first, second):
-    """Centroids and intensities of pairs of clusters, all (4, r); no product with an intensity that may overflow."""
+    """Centroids and intensities of pairs of clusters, all (4, r), without overflow."""
     total = first[3] + second[3]
     centroid = first[:3] + second[3] / total * (second[:3] - first[:3])
     return np.concatenate([centroid, total[None]])
 
 
 def _cone_cosines(axes, directions, cosines, leaves, depth):
-    """Cosines of the half-angles of all nodes' cones, rounded to the wider side but for the leaves', (2n - 1,).
+    """Cosines of the half-angles of the cones of every node, rounded down except at leaves, (2n - 1,).
 
-    All in preorder: axes (3, 2n - 1), directions (3, n) and cosines (n,) of the lights, leaves and depth (2n - 1,).
+    Arguments in preorder: axes (3, 2n - 1), directions (3, n) and cosines (n,) of the lights, leaves and depth
+    (2n - 1,).
     """
 
     def reach(node, light):
-        # Half the chord rather than the cosine, which tells no small angles apart
+        # From half the chord, because the cosine does not resolve small angles
         chord = _distance(axes.take(node, axis=1), light)
         return 2 * np.arcsin(np.minimum(0.5 * chord, 1)) + light[3]
 

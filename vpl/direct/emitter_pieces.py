@@ -1,8 +1,8 @@
-"""Area emitters cut into flat pieces: triangles, parallelograms, disks and spheres as rows of one array.
+"""Area emitters cut into pieces: triangles, parallelograms, disks and spheres in one array.
 
-Sampling a point on an emitter, or the density of having sampled it, then needs no virtual call: kernels stay as small
-as they are for one emitter, however many shapes the scene has.  Shapes of another form (cylinders, for example) stay
-whole and are sampled by their own routine; so are disks with a textured emission.
+Sampling a point on a piece, or evaluating its density, needs no virtual call, so the size of kernels does not depend on
+the number of shapes.  Cylinders and other shapes, and disks with textured emission, stay whole and are sampled by
+Mitsuba's routine.
 """
 
 from __future__ import annotations
@@ -20,28 +20,27 @@ from ..lights.emitters import AreaEmitters, registered_shapes
 from ..lights.spheres import Sphere, sphere_coordinates
 
 PARALLELOGRAM, TRIANGLE, DISK, SPHERE, SHAPE = range(5)
-# Normals in single precision that differ by no more are the same
+# Largest difference of equal normals in single precision
 _ROUNDING = 1e-6
 
 
 @dataclass
 class PieceSample:
-    """Points on pieces, one per lane: position, normal of the side that emits (of smooth meshes the shading normal, of
-    any length), texture coordinates, and the density per solid angle at the reference point (0 where the piece shows it
-    its back)."""
+    """Points on pieces, one per lane.  ``n``: normal of the emitting side, not normalised; the shading normal on smooth
+    meshes.  ``pdf``: density per solid angle at the reference point, 0 on the back."""
 
-    p: object
-    n: object
-    uv: object
-    pdf: object
+    p: mi.Point3f
+    n: mi.Normal3f
+    uv: mi.Point2f
+    pdf: mi.Float
 
 
 class EmitterPieces:
-    """All area emitters of a scene as k pieces.
+    """The area emitters of a scene, cut into k pieces; arrays are float64.
 
-    ``center`` (k, 3), ``radius`` (k,): bounding spheres, world units; ``axis`` (k, 3), ``cone_cos`` (k,): cones around
-    the normals of flat pieces, and a cosine of -1 for all others, which emit everywhere; ``intensity`` (k,): radiance
-    (mean over channels) times the largest projected area.  All float64.
+    ``center`` (k, 3), ``radius`` (k,): bounding spheres, world units; ``axis`` (k, 3), ``cone_cos`` (k,): cones of
+    normals, with a cosine of -1 for omnidirectional pieces; ``intensity`` (k,): radiance (mean over channels) times
+    area, or times the mean projected area of curved pieces.
     """
 
     def __init__(self, scene, area: AreaEmitters):
@@ -76,11 +75,11 @@ class EmitterPieces:
         self._records = upload(mi.Float, records)
 
     def _face(self, kind, normal, shading, smooth):
-        """Cones of directions that pieces face."""
+        """Compute the cone of normals of every piece."""
         flat = (kind <= DISK)[:, None]
         self.axis = np.where(flat, normal, (0.0, 0.0, 1.0))
         self.cone_cos = np.where(flat[:, 0], 1.0, -1.0)
-        # What is interpolated between three normals lies within any cone of less than 90 degrees that holds them
+        # A cone of less than 90 degrees around three normals also contains their interpolations
         normals = shading[smooth, None, :3] + np.insert(shading[smooth, 3:].reshape(-1, 2, 3), 0, 0.0, axis=1)
         normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), np.finfo(np.float64).tiny)
         self.axis[smooth], balanced = mean_axes(normals.sum(1), normals[:, 0])
@@ -96,25 +95,25 @@ class EmitterPieces:
         self.center[disk | sphere] = corner[disk | sphere]
         self.radius = np.linalg.norm(corners - self.center[:, None], axis=2).max(1)
         lengths = np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)
-        # An ellipse lies within the sum of its half-axes whatever their angle
+        # Valid for half-axes that are not orthogonal, too
         self.radius[disk] = np.hypot(*lengths)[disk]
         self.radius[sphere] = first[sphere, 0]
         for index in np.flatnonzero(kind == SHAPE):
             box = shapes[row[index]].bbox()
             low, high = np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel()
             self.center[index], self.radius[index] = (low + high) / 2, np.linalg.norm(high - low) / 2
-        # Convex bodies show a quarter of their surface on average
+        # The mean projected area of a convex body is a quarter of its surface
         projected = np.where(kind <= DISK, size, size / 4)
         self.intensity = projected * self._area.radiance.mean(1, dtype=np.float64)[row]
 
     def _fetch(self, piece, active):
-        """(kind, corner, first edge, second edge, normal, area, emitter's row) of pieces."""
+        """Fetch (kind, corner, first edge, second edge, normal, area, row of the emitter) of pieces."""
         a, b, c, d = (dr.gather(mi.Vector4f, self._records, piece * 4 + k, active) for k in range(4))
         kind, row = dr.reinterpret_array(mi.UInt32, a.w), dr.reinterpret_array(mi.UInt32, c.w)
         return kind, mi.Point3f(a.xyz), b.xyz, c.xyz, mi.Normal3f(d.xyz), b.w, row
 
     def sample(self, piece, interaction, sample, active):
-        """A point on each piece as seen from ``interaction``: flat ones by area, spheres by solid angle.
+        """Sample a point on each piece for a reference point: flat pieces by area, spheres by solid angle.
 
         Returns (:class:`PieceSample`, radiance towards the reference point over the density).
         """
@@ -134,7 +133,7 @@ class EmitterPieces:
             found = select_record(kind == SPHERE, of_sphere, found)
         if SHAPE in self._kinds:
             whole = active & (kind == SHAPE)
-            # By area, because texture coordinates come with positions only
+            # By area, because only position samples have texture coordinates
             ps = self._area.sample_position(row, interaction.time, sample, whole)
             other = PieceSample(ps.p, ps.n, ps.uv, _area_density(interaction.p, ps.p, ps.n, size))
             found = select_record(whole, other, found)
@@ -143,7 +142,7 @@ class EmitterPieces:
         return found, dr.select(active, finite_or_zero(radiance / found.pdf), 0)
 
     def found(self, preliminary, ray, active):
-        """Hit of a ray: (piece, whether it is one, radiance towards the ray's origin, density of :meth:`sample`)."""
+        """Piece that a ray hits: (piece, whether any, radiance towards the origin, density of :meth:`sample`)."""
         row = self._area.row(preliminary, active & preliminary.is_valid())
         active = active & (row > 0)
         row -= 1
@@ -171,7 +170,7 @@ class EmitterPieces:
         return piece, active, self._area.emitted_in_front(row, hit, shown), hit.pdf & shown
 
     def _sample_sphere(self, origin, center, first, second, axis, size, sample) -> PieceSample:
-        """A point on a sphere: on its visible part, uniform in solid angle, or by area where it emits inwards."""
+        """Sample a sphere: the visible part uniformly in solid angle, or by area if the sphere emits inwards."""
         n = _visible_normal(origin, center, first.x, sample)
         if self._hollow:
             n = dr.select(first.y > 0, n, mi.Normal3f(mi.warp.square_to_uniform_sphere(sample)))
@@ -182,7 +181,7 @@ class EmitterPieces:
         return PieceSample(p, n * first.y, self._on_sphere(n, second, axis, first.z), pdf)
 
     def _on_sphere(self, outward, across, axis, handed):
-        """Texture coordinates of a point of a sphere with the given x and z axes."""
+        """Texture coordinates of a point on a sphere with the given x and z axes."""
         if self._uv is None:
             return mi.Point2f(0)
         return sphere_coordinates(outward, across, axis, handed)
@@ -194,7 +193,7 @@ class EmitterPieces:
         return mi.Point2f(origin.x + a * origin.z + b * along.x, origin.y + a * origin.w + b * along.y)
 
     def _shading_normal(self, piece, a, b, normal, active):
-        """Normal whose side emits, up to its length."""
+        """Normal of the emitting side, not normalised."""
         if self._shading is None:
             return normal
         x, y, z = (dr.gather(mi.Vector4f, self._shading, piece * 3 + k, active) for k in range(3))
@@ -203,7 +202,7 @@ class EmitterPieces:
 
 
 def _place_in_plane(p, corner, first, second):
-    """Shares of both edges in the offset from the corner to a point in the plane of a piece."""
+    """Coordinates of a point in the plane of a piece, relative to its corner and both edges."""
     offset = p - corner
     ff, fs, ss = dr.squared_norm(first), dr.dot(first, second), dr.squared_norm(second)
     of, os = dr.dot(offset, first), dr.dot(offset, second)
@@ -214,7 +213,7 @@ def _place_in_plane(p, corner, first, second):
 def _area_density(origin, p, normal, size, shading=None):
     """Density per solid angle of a point drawn by area, 0 on the back.
 
-    ``shading``: the normal whose side emits, where it is not ``normal``.
+    ``shading``: normal of the emitting side if different from ``normal``.
     """
     offset = origin - p
     distance2 = dr.squared_norm(offset)
@@ -224,7 +223,7 @@ def _area_density(origin, p, normal, size, shading=None):
 
 
 def _cap(origin, center, radius):
-    """Of the cone that a sphere fills: (1 - cos of its half-angle, squared distance of the centre); 0 from inside."""
+    """(1 - cosine of the half-angle that a sphere subtends, 0 from inside; squared distance of the centre)."""
     distance2 = dr.squared_norm(center - origin)
     sine2 = dr.square(radius) / distance2
     return dr.select(sine2 < 1, sine2 / (1 + dr.safe_sqrt(1 - sine2)), 0), distance2
@@ -236,15 +235,15 @@ def _sphere_density(origin, center, radius):
 
 
 def _visible_normal(origin, center, radius, sample):
-    """Normal of a sphere at a point that is uniform in solid angle as seen from ``origin``."""
+    """Normal at a point on the visible part of a sphere, drawn uniformly in solid angle."""
     cap, distance2 = _cap(origin, center, radius)
-    below = sample.x * cap  # 1 - cosine, which single precision keeps for small spheres far away
-    sine2 = below * (2 - below)
+    versine = sample.x * cap  # 1 - cosine, accurate in single precision for small distant spheres
+    sine2 = versine * (2 - versine)
     azimuth = dr.two_pi * sample.y
     sine = dr.safe_sqrt(sine2)
-    local = mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), 1 - below)
+    local = mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), 1 - versine)
     direction = mi.Frame3f(dr.normalize(center - origin)).to_world(local)
-    distance = dr.sqrt(distance2) * (1 - below) - dr.safe_sqrt(dr.square(radius) - distance2 * sine2)
+    distance = dr.sqrt(distance2) * (1 - versine) - dr.safe_sqrt(dr.square(radius) - distance2 * sine2)
     return mi.Normal3f(dr.normalize(origin + distance * direction - center))
 
 
@@ -255,10 +254,10 @@ _COLUMNS = ("kind", "corner", "first", "second", "normal", "shading", "uv")
 
 @dataclass
 class _Pieces:
-    """Pieces of one shape: corner, edges (half-axes of disks), normal; ``shading`` (k, 9): the normal whose side emits,
-    at the corner, and its change along both edges; ``uv`` (k, 6): the same of texture coordinates.
+    """Pieces of one shape: corner, edges (half-axes of disks), normal; ``shading`` (k, 9): normal of the emitting side
+    at the corner, and changes along both edges; ``uv`` (k, 6): the same for texture coordinates.
 
-    Of spheres: centre, (radius, side that emits: 1 is outside, handedness of the frame), x axis, z axis.
+    Spheres: centre, (radius, emitting side: 1 is outside, handedness of the frame), x axis, z axis.
     """
 
     kind: np.ndarray
@@ -289,7 +288,7 @@ def _areas(kind, first, second) -> np.ndarray:
 
 
 def _is_mesh(shape) -> bool:
-    """Whether a shape is made of triangles; rectangles count as meshes in Mitsuba, but are not."""
+    """Whether a shape consists of triangles.  Mitsuba's ``is_mesh`` holds for rectangles, too."""
     return shape.is_mesh() and shape.class_name() != "Rectangle"
 
 
@@ -302,12 +301,12 @@ def _pieces_of(shape, textured: bool) -> _Pieces:
         matrix = matrix_of(parameters_of(shape, below=False)["to_world"])
     linear, origin = matrix[:3, :3], matrix[:3, 3]
     if np.linalg.det(linear) == 0:
-        # Flattened shapes have no area for Mitsuba: never drawn, this only has to be numbers
+        # A flattened shape has no area and is never drawn, but its row must be finite
         return _one(PARALLELOGRAM, origin, np.zeros(3), np.zeros(3), (0, 0, 1))
     if name == "Rectangle":
         normal = np.linalg.inv(linear).T[:, 2] * (-1 if shape.has_flipped_normals() else 1)
         return _one(PARALLELOGRAM, origin - linear[:, 0] - linear[:, 1], 2 * linear[:, 0], 2 * linear[:, 1], normal)
-    # Its texture coordinates are polar
+    # Texture coordinates of disks are polar, not linear
     if name == "Disk" and not textured:
         return _one(DISK, origin, linear[:, 0], linear[:, 1], np.linalg.inv(linear).T[:, 2])
     if name == "Sphere":
@@ -323,7 +322,7 @@ def _one(kind, corner, first, second, normal) -> _Pieces:
 
 
 def _constant(normal: np.ndarray) -> np.ndarray:
-    """``shading`` of pieces that are flat to light, too."""
+    """``shading`` of pieces with a constant normal."""
     return np.pad(normal, ((0, 0), (0, 6)))
 
 
@@ -335,7 +334,7 @@ def _triangles(mesh, textured: bool) -> _Pieces:
     first, second = second - corner, third - corner
     normal = np.cross(first, second)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    # A triangle without area is never drawn; its normal only has to be a number
+    # A triangle without area is never drawn, but its normal must be finite
     normal = np.where(length > 0, normal / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
     shading = _constant(normal)
     if mesh.has_vertex_normals() and not mesh.has_face_normals():

@@ -1,8 +1,8 @@
-"""Direct light of emitters with an extent (area, environment) and of those that only their own code can evaluate.
+"""Next-event estimation for area and environment emitters, and for emitters of unknown kind.
 
-One emitter sample and one BSDF sample, combined by the power heuristic as in Mitsuba's ``path``; a BSDF sample goes on
-through delta surfaces, so that emitters behind glass light the scene as they do there.  Emitters are chosen by power,
-with a uniform share.  Point, spot and directional emitters are not sampled here: they are virtual lights.
+One emitter sample and one BSDF sample, combined by the power heuristic as in Mitsuba's ``path``.  A BSDF sample
+continues through delta surfaces, so emitters behind glass light the scene as in ``path``.  Half of the emitter samples
+draw an emitter by power, half uniformly.  Point, spot and directional emitters are virtual lights instead.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ _UNIFORM_SHARE = 0.5
 
 
 def power_heuristic(pdf_a, pdf_b):
-    """Weight of a sample drawn with density a among densities a and b (power 2)."""
-    # As a ratio, because squares of densities leave the range of single precision
+    """MIS weight of a sample drawn with density a among densities a and b (power 2)."""
+    # A ratio, because squares of densities exceed the range of single precision
     return dr.select(pdf_a > 0, dr.rcp(1 + dr.square(pdf_b / pdf_a)), 0)
 
 
 class ExtendedEmitters:
-    """Area emitters (rows first), then the environment, then the others: what emitter sampling chooses from."""
+    """Emitters for next-event estimation, by row: area emitters, the environment, emitters of unknown kind."""
 
     def __init__(self, scene, emitters: Emitters):
         self.emitters = emitters
@@ -43,7 +43,7 @@ class ExtendedEmitters:
             self.choice = Choice((1 - _UNIFORM_SHARE) * power / power.sum() + _UNIFORM_SHARE * uniform)
 
     def sample(self, si, row_sample, direction_sample, active):
-        """Choose an emitter and a direction: (direction sample, radiance over density, density, is delta)."""
+        """Sample an emitter and a direction: (direction sample, radiance over density, density)."""
         row = self.choice.row(row_sample)
         probability = self.choice.probability(row)
         areas = self.emitters.area.count
@@ -62,7 +62,7 @@ class ExtendedEmitters:
         return ds, weight / probability, ds.pdf * probability
 
     def density(self, si, hit, direction, active):
-        """Density with which :meth:`sample` would have chosen the emitter that a ray from ``si`` found."""
+        """Density of :meth:`sample` for the direction of a ray from ``si`` and the emitter that the ray hit."""
         density = dr.zeros(mi.Float, dr.width(si.p))
         areas = self.emitters.area.count
         ds = dr.zeros(mi.DirectionSample3f, dr.width(si.p))
@@ -81,7 +81,7 @@ class ExtendedEmitters:
 
 
 def _scattered_emission(scene, extended: ExtendedEmitters, traits, si, sample, depth, max_depth, sampler, active):
-    """Radiance of emitters along a BSDF sample, weighted against emitter sampling; beyond delta surfaces, in full."""
+    """Emitted radiance along a BSDF sample, MIS-weighted; beyond delta surfaces the weight is 1."""
     direction = si.to_world(sample.wo)
     hit = scene.ray_intersect(si.spawn_ray(direction), active)
     weight = power_heuristic(sample.pdf, extended.density(si, hit, direction, active))
@@ -95,9 +95,9 @@ def _scattered_emission(scene, extended: ExtendedEmitters, traits, si, sample, d
 
 @dr.syntax
 def emission_beyond_delta(scene, emitters: Emitters, traits, hit, depth, max_depth, sampler, active):
-    """Radiance of emitters that a ray finds by way of mirrors, glass and masks.
+    """Emitted radiance that a ray finds through mirrors, glass and masks.
 
-    ``hit``: the first surface that it met, ``depth``: edges from the camera to it.
+    ``hit``: first surface of the ray; ``depth``: edges from the camera to ``hit``.
     """
     hit, depth = mi.SurfaceInteraction3f(hit), mi.UInt32(depth)
     radiance = dr.zeros(mi.UnpolarizedSpectrum, dr.width(hit.p))
@@ -120,10 +120,10 @@ def direct_light(
     scene, extended: ExtendedEmitters, traits, points: GatherPoints, max_depth, samples: int, rays_per_pixel: int,
     seed: int,
 ):  # fmt: skip
-    """Direct light at every gather point from emitters with an extent: (radiance, number of shadow rays).
+    """Direct light of ``extended`` at every gather point: (radiance, number of shadow rays).
 
-    ``samples``: pairs of an emitter sample and a BSDF sample per point.  Those of a pixel, which are the points of
-    ``rays_per_pixel`` successive camera rays, are spread evenly together.
+    ``samples``: pairs of an emitter sample and a BSDF sample per point.  The samples of a pixel, that is of
+    ``rays_per_pixel`` successive camera rays, are stratified jointly.
     """
     si, bsdf = points.si, points.si.bsdf()
     if dr.hint(extended.choice is None, mode="scalar"):

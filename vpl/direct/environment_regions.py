@@ -1,14 +1,12 @@
 """An environment cut into regions that are sampled like lights [IAS section 4.3; Agarwal et al. 2003].
 
-The environment is read once into a table of cells along latitude and longitude (z up, whatever frame the emitter has of
-its own).  Regions are sets of cells; inside its region a cell is drawn by the light that it holds, and a direction in
-it uniformly, so that of one region every direction has nearly the same weight: what [IAS] calls preintegrated and
-jittered.  The radiance of the direction itself is used, so nothing is lost between the cells.
+The environment is evaluated once into a table of cells along latitude and longitude (z up, in world space).  Regions
+are sets of cells.  A cell is drawn from its region in proportion to its light, and a direction uniformly in the cell.
+Directions of a region thus have nearly equal weights: [IAS] calls this preintegrated and jittered sampling.  A sample
+evaluates the radiance of its direction, not the mean of its cell: the table causes no bias.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -20,42 +18,43 @@ from ..core.sampling import RowChoice, independent_sampler
 from .environment_strata import cones, stratify
 
 _CONSTANT = "ConstantBackgroundEmitter"
-_EVALUATIONS = 2  # along each of both axes of a cell, at least
-# The same in cells next to others so many times as bright: the sun has an edge, and may be a single texel
+_EVALUATIONS = 2  # least number of evaluations along each axis of a cell
+# Evaluations along each axis of an edge cell; least contrast of its neighbourhood.  The sun may be a single texel
 _EDGE_EVALUATIONS, _EDGE_CONTRAST = 16, 2.0
-# In an image, only next to cells so many times as bright as the mean: edges of others are many, and hold little light
+# Least brightness of an edge in an image, relative to the mean radiance: darker edges are many, and hold little light
 _BRIGHT = 10.0
-_STRATA_WIDTH = 256  # columns of the grid that regions are made of
+_STRATA_WIDTH = 256  # columns of the grid of the strata
+# Columns of the table: for emitters without an image, and the most
 _DEFAULT_WIDTH, _LARGEST_WIDTH = 1024, 2048
-# Share of a region's light that is spread evenly over its cells: their table is made from few evaluations
+# Fraction of a region's samples drawn uniformly by solid angle, because the table rests on few evaluations
 _EVEN_SHARE = 0.02
 
 
-@dataclass
-class _Last:
-    """The regions that were made last, and what of."""
-
-    key: tuple | None = None
-    regions: EnvironmentRegions | None = None
-
-
-_last = _Last()
+# Key and regions of the previous call, in one tuple: threads never combine the key and the regions of different calls
+_previous: tuple[tuple, EnvironmentRegions] | None = None
 
 
 def regions_of(environment, count: int, most_columns: int = _LARGEST_WIDTH) -> EnvironmentRegions:
-    """Regions of an environment: those of the last call where nothing has changed since."""
-    key = mi.variant(), count, most_columns, fingerprint([environment])
-    if _last.key != key:
-        _last.key, _last.regions = key, EnvironmentRegions(environment, count, most_columns)
-    return _last.regions
+    """Regions of an environment; those of the previous call if the environment and the arguments are unchanged."""
+    global _previous
+    key = count, most_columns, fingerprint([environment])
+    found = _previous
+    # Regions evaluate their environment.  An equal environment of another scene does not match: it may be edited later
+    if found is None or found[0] != key or found[1].environment is not environment:
+        found = key, EnvironmentRegions(environment, count, most_columns)
+        _previous = found
+    return found[1]
 
 
 class EnvironmentRegions:
-    """``count`` regions: ``axis`` (count, 3), ``cone_cos`` (count,) contain their directions; ``irradiance`` (count,):
-    radiance (mean over channels) integrated over solid angle; all float64.  ``most_columns``: of the table."""
+    """``count`` regions of an environment, all arrays float64.
+
+    ``axis`` (count, 3), ``cone_cos`` (count,): cones around the directions of each region; ``irradiance`` (count,):
+    radiance (mean over channels) integrated over solid angle.  ``most_columns``: largest width of the table.
+    """
 
     def __init__(self, environment, count: int, most_columns: int = _LARGEST_WIDTH):
-        self._environment = environment
+        self.environment = environment
         width = min(_table_width(environment), most_columns)
         radiance = _read(environment, width)
         height = len(radiance)
@@ -72,7 +71,7 @@ class EnvironmentRegions:
         self._tabulate(labels, light.ravel(), solid_angle.ravel(), width, height)
 
     def _tabulate(self, labels, light, solid_angle, width, height):
-        """Cells region by region with their cumulative shares, and the density of every cell within its region."""
+        """Store the cells region by region, with their cumulative probabilities and densities within the region."""
         angle = np.bincount(labels, solid_angle, self.count)
         total = self.irradiance[labels]
         share = np.where(total > 0, light / np.where(total > 0, total, 1), 0)
@@ -85,14 +84,14 @@ class EnvironmentRegions:
         cells[self._choice.place] = order
         self._cells = upload(mi.UInt32, cells)
         density = (share / solid_angle).astype(np.float32).view(np.uint32)
-        # Side by side, so that one access to memory fetches both
+        # Interleaved: one memory access fetches both values
         self._found = upload(mi.UInt32, np.stack([labels.astype(np.uint32), density], 1).ravel())
         self._width, self._height = (dr.opaque(mi.UInt32, size) for size in (width, height))
 
     def sample(self, region, member, sample, active):
-        """A direction of each region: (direction, radiance over density, density per solid angle).
+        """Sample a direction of each region: (direction, radiance over density, density per solid angle).
 
-        ``member``: uniform number that picks the cell; ``sample``: two that pick the direction in it.
+        ``member``: uniform number that draws the cell; ``sample``: two uniform numbers for the direction in the cell.
         """
         cell = dr.gather(mi.UInt32, self._cells, self._choice.draw(region, member, active), active)
         row, column = cell // self._width, cell % self._width
@@ -107,10 +106,10 @@ class EnvironmentRegions:
         return direction, finite_or_zero(radiance / density) & active, density
 
     def radiance(self, direction, active):
-        """Radiance that arrives from a direction."""
+        """Incident radiance from a direction."""
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
         si.wi = -direction
-        return finite_or_zero(mi.unpolarized_spectrum(self._environment.eval(si, active)))
+        return finite_or_zero(mi.unpolarized_spectrum(self.environment.eval(si, active)))
 
     def find(self, direction, active):
         """(Region, density of :meth:`sample`) of a direction."""
@@ -129,7 +128,7 @@ class EnvironmentRegions:
 
 
 def _table_width(environment) -> int:
-    """Columns of the table: those of an image, as far as that pays, a power of two."""
+    """Columns of the table: the width of the image rounded up to a power of two, between 64 and _LARGEST_WIDTH."""
     if environment.class_name() == _CONSTANT:
         return 64
     columns = _image_width(environment) or _DEFAULT_WIDTH
@@ -137,14 +136,14 @@ def _table_width(environment) -> int:
 
 
 def _image_width(environment) -> int:
-    """Columns of the image of an environment, 0 where it has none."""
+    """Columns of the image of an environment, 0 without an image."""
     parameters = parameters_of(environment)
-    # The first column is there twice
+    # Mitsuba repeats the first column at the end
     return max(1, parameters["data"].shape[1] - 1) if "data" in parameters else 0
 
 
 def _read(environment, width: int) -> np.ndarray:
-    """Mean radiance of every cell, (width / 2, width) float64; values that are not finite count as black."""
+    """Mean radiance of every cell, (width / 2, width) float64; non-finite radiance counts as black."""
     height = width // 2
     image_width = _image_width(environment)
     across = max(_EVALUATIONS, -(-image_width // width))
@@ -155,8 +154,10 @@ def _read(environment, width: int) -> np.ndarray:
 
 
 def _at_edges(radiance: np.ndarray, least: float) -> np.ndarray:
-    """Cells with a far brighter or a far darker one among their eight neighbours, and one above ``least``: (height,
-    width) bool."""
+    """Mask of edge cells, (height, width) bool.
+
+    The brightest cell of the 3 × 3 neighbourhood is above ``least`` and _EDGE_CONTRAST times the darkest cell.
+    """
     padded = np.pad(np.pad(radiance, ((1, 1), (0, 0)), "edge"), ((0, 0), (1, 1)), "wrap")
     around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
     brightest = around.max((2, 3))
@@ -164,7 +165,7 @@ def _at_edges(radiance: np.ndarray, least: float) -> np.ndarray:
 
 
 def _read_cells(environment, cells: np.ndarray, width: int, across: int) -> np.ndarray:
-    """Mean radiance of some cells, from ``across`` times ``across`` evaluations in each."""
+    """Mean radiance of some cells, from ``across`` × ``across`` evaluations in each."""
     if len(cells) == 0:
         return np.zeros(0)
     row, column = upload(mi.Float, cells // width), upload(mi.Float, cells % width)
@@ -175,7 +176,7 @@ def _read_cells(environment, cells: np.ndarray, width: int, across: int) -> np.n
 
 @dr.syntax
 def _sum_of_evaluations(environment, row, column, step, across, sampler):
-    """Radiance summed over one direction in each of ``across`` times ``across`` equal parts of a cell."""
+    """Radiance of each cell, summed over one jittered direction in each of ``across`` × ``across`` equal parts."""
     total, k = dr.zeros(mi.Float, dr.width(row)), mi.UInt32(0)
     while dr.hint(k < across * across, exclude=[environment, row, column, step, across]):
         jitter = (mi.Point2f(mi.Float(k % across), mi.Float(k // across)) + sampler.next_2d()) / mi.Float(across)

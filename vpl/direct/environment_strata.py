@@ -1,31 +1,30 @@
-"""Regions of an environment map for few, well-placed samples: structured importance sampling (NumPy only) [SIS].
+"""Regions of an environment map by structured importance sampling (NumPy only) [SIS].
 
-An area of integrated illumination L and solid angle Ω has the importance Γ = L Ω^(1/4) [SIS section 3]: between
-sampling by light alone and by area alone, because what blocks a wide area varies more.  No Ω counts as less than
+An area of integrated illumination L and solid angle Ω has the importance Γ = L Ω^(1/4) [SIS section 3].  The exponent
+compromises between sampling by light and by area, because visibility varies more over a wide area.  Ω is at least
 0.01 sr.
 
-The map is cut at the levels t_i = iσ, i = 0 ... 5, σ being the standard deviation of its illumination [SIS section 4].
-From the brightest level down, every connected component is due its share of the samples by Γ, less the centres that
-brighter levels have already placed inside it.  The missing ones are placed farthest first (Hochbaum and Shmoys): each
-where the distance to all centres of the component is greatest.
+The map is thresholded at the levels t_i = iσ, i = 0 ... 5, with σ the standard deviation of the illumination [SIS
+section 4].  From the brightest level down, every connected component is allotted a number of samples proportional to Γ,
+less the centres that brighter levels have placed inside.  New centres are placed by farthest-first traversal (Hochbaum
+and Shmoys): each at the greatest distance from the existing centres of the component.
 
-A component's layer is what is left of it without the layers of brighter components.  At the end, every cell joins the
-nearest of the centres that lie in its layer, so that a bright spot which is due a sample shares no region with what is
-around it.
+A component's layer excludes the layers of brighter components.  Finally every cell joins the nearest centre of its
+layer, so that a bright spot with a sample of its own shares no region with its surroundings.
 
 Directions are (sin θ cos φ, sin θ sin φ, cos θ): z is up, θ = 0 is the upper edge of the first row, and φ grows from +x
 towards +y along the columns.
 
 Departures from the paper, and why:
 
-- The component of t_0 is every cell that is not black, connected or not, instead of the whole sphere: samples of black
-  areas are wasted.  Black cells join the nearest of all centres.
-- Shares are rounded to the nearest number, so that a bright spot worth half a sample gets one; where that makes too
-  many, the components that miss most come first.  t_0 gets all samples that are left.
-- A layer in which no centre lies is dissolved into the darker layer around it, as it was not worth a sample.
-- The first centre of a component that has none is its brightest cell (the first of several in the order of the rows).
-- Levels and shares are found from radiances relative to the greatest one in single precision: the rounding that a scale
-  of the map brings does not move them.
+- The component of t_0 is the set of cells that are not black, connected or not, instead of the whole sphere: samples
+  of black areas are wasted.  Black cells join the nearest centre.
+- Shares are rounded to the nearest integer: a bright spot with a share of half a sample gets one.  If the sum is too
+  large, components with the largest deficits take precedence.  t_0 gets the remaining samples.
+- A layer without a centre joins the darker layer around it.
+- The first centre of a component is its brightest cell (the first in row order in case of ties).
+- Levels and shares are computed from single-precision radiances relative to the greatest: scaling the map does not
+  change them.
 
 [SIS] Agarwal, Ramamoorthi, Belongie and Jensen 2003, Structured importance sampling of environment maps.
 """
@@ -40,29 +39,29 @@ from ..core.cones import mean_axes
 
 _LEVELS = 6
 _AREA_EXPONENT, _LEAST_SOLID_ANGLE = 0.25, 0.01
-# Cells whose distances to all centres are compared at a time: the table fits in a second-level cache
+# Cells compared with the centres at a time: the table of distances fits in a second-level cache
 _CHUNK = 512
-# A mean direction that is shorter than this is rounding
+# Length of a mean direction below which it is rounding error
 _BALANCED = 1e-6
-# Cosines of cones are lowered by this much, so that no cone loses a corner to rounding
+# Safety margin on the cosines of cones, against rounding
 _COSINE_ROUNDING = 1e-14
 
 
 def stratify(radiance, count: int = 300) -> np.ndarray:
-    """Label the region of every cell: (height, width) int32, from 0 for the first centre that was placed.
+    """Label the region of every cell: (height, width) int32, in the order of placement of the centres.
 
     radiance: (height, width) real numbers, finite and at least 0: the mean radiance of each cell of a grid of equal
-    steps in θ (rows, from the pole at +z to the one at -z) and φ (columns, all around); any unit, only ratios count.
-    Cells dimmer than 1e-45 of the brightest one count as black.
-    count: regions to make, at least 1.
+    steps in θ (rows, from +z to -z) and φ (columns, all around), in any unit.  Cells dimmer than 1e-45 of the brightest
+    count as black.
+    count: number of regions, at least 1.
 
-    There are as many regions as ``count`` or as cells that are not black, whichever is less, but at least one; unless
-    the map is black, every region holds light.  The same input gives the same labels.
+    The number of regions is the lesser of ``count`` and the number of cells that are not black, but at least one.
+    Unless the map is black, every region holds light.  The result is deterministic.
 
-    Raises ValueError, naming the argument, where an input is not as described.
+    Raises ValueError, naming the argument, for invalid input.
     """
     radiance = _checked(radiance, count)
-    # Single precision forgets how the division rounded
+    # Rounding to single precision removes the rounding of the division
     values = (radiance.reshape(-1) / (radiance.max() or 1)).astype(np.float32).astype(np.float64)
     lit = values > 0
     if not lit.any():
@@ -79,13 +78,12 @@ def stratify(radiance, count: int = 300) -> np.ndarray:
 def cones(labels) -> tuple[np.ndarray, np.ndarray]:
     """Cones around regions: axes (k, 3), unit vectors, and cosines of half-angles (k,), both float64.
 
-    labels: (height, width) integers; k is the greatest one plus 1.  Cells with negative labels are left out.
+    labels: (height, width) integers; k is the greatest label plus 1.  Cells with negative labels are left out.
 
-    The axis is the mean direction of a region's cells by solid angle; the cone holds these cells whole, edges and
-    inside as well as corners.  Where the mean vanishes (the region is the whole sphere, two opposite cells, or empty),
-    the cone is the whole sphere: +z and -1.
+    The axis is the mean direction of a region's cells by solid angle.  The cone contains every direction of the cells.
+    If the mean vanishes (the whole sphere, two opposite cells, or no cell), the cone is the whole sphere: +z and -1.
 
-    Raises ValueError if ``labels`` is not as described.
+    Raises ValueError for invalid ``labels``.
     """
     labels = np.asarray(labels)
     if labels.ndim != 2 or labels.size == 0 or labels.dtype.kind not in "iu":
@@ -106,7 +104,7 @@ def cones(labels) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _checked(radiance, count) -> np.ndarray:
-    """The radiance in double precision, once both arguments of ``stratify`` are as described there."""
+    """Validate the arguments of ``stratify``, and return the radiance in double precision."""
     radiance = np.asarray(radiance)
     if radiance.ndim != 2 or radiance.size == 0 or radiance.dtype.kind not in "fiu":
         raise ValueError(
@@ -124,25 +122,25 @@ def _checked(radiance, count) -> np.ndarray:
 
 
 def _cells(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of the middles of all cells, (height * width, 3), and their solid angles in sr, (height * width,)."""
+    """Directions of the centres of cells, (height * width, 3), and solid angles in sr, (height * width,)."""
     theta = ((np.arange(height) + 0.5) * (np.pi / height))[:, None]
     phi = (np.arange(width) + 0.5) * (2 * np.pi / width)
     unit = np.empty((height, width, 3))
     unit[..., 0], unit[..., 1], unit[..., 2] = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)
-    # The difference of the cosines at both edges of a row, without its cancellation at the poles
+    # Difference of the cosines at both edges of a row, without cancellation at the poles
     solid_angle = 2 * np.sin(theta[:, 0]) * np.sin(np.pi / (2 * height)) * (2 * np.pi / width)
     return unit.reshape(-1, 3), np.repeat(solid_angle, width)
 
 
 def _components(mask: np.ndarray) -> np.ndarray:
-    """Number the connected components of the cells in ``mask``, (height, width): (height * width,), -1 outside it.
+    """Number the connected components of ``mask``, (height, width): (height * width,), -1 outside the mask.
 
-    Cells that share an edge are connected, also across φ = 0, and so are all cells around a pole.
+    Cells that share an edge are connected, also across φ = 0.  The cells around a pole are connected, too.
     """
     cells = np.arange(mask.size).reshape(mask.shape)
     starts = mask.copy()
     starts[:, 1:] &= ~mask[:, :-1]
-    # Every run of cells along a row is a tree whose root is the first of them; roots are the least cells of their trees
+    # Union-find: every run of cells along a row is a tree; the root of a tree is its least cell
     root = np.where(mask.reshape(-1), np.maximum.accumulate(np.where(starts, cells, 0).reshape(-1)), cells.reshape(-1))
     below, across = mask[:-1] & mask[1:], mask[:, 0] & mask[:, -1]
     edges = [(cells[:-1][below], cells[1:][below]), (cells[across, 0], cells[across, -1])]
@@ -162,7 +160,7 @@ def _components(mask: np.ndarray) -> np.ndarray:
 
 
 def _place(levels, values: np.ndarray, unit: np.ndarray, solid_angle: np.ndarray, count: int) -> np.ndarray:
-    """Cells of ``count`` centres, in the order in which they are placed; ``levels``: from the brightest down."""
+    """Cells of ``count`` centres, in order of placement; ``levels``: from the brightest down."""
     whole = _importance(levels[-1], values, solid_angle)
     is_centre, centres = np.zeros(len(values), bool), []
     for component in levels:
@@ -187,7 +185,7 @@ def _importance(component: np.ndarray, values: np.ndarray, solid_angle: np.ndarr
 
 
 def _round_off(total: int, wanted: np.ndarray, spare: np.ndarray) -> np.ndarray:
-    """Round to the nearest whole numbers, none above ``spare``, the greatest first until their sum is ``total``."""
+    """Round to the nearest integers, at most ``spare``, in descending order until the sum is ``total``."""
     order = np.argsort(-wanted, kind="stable")
     given = np.minimum(np.floor(wanted + 0.5).astype(np.int64), spare)[order]
     result = np.empty_like(given)
@@ -196,7 +194,7 @@ def _round_off(total: int, wanted: np.ndarray, spare: np.ndarray) -> np.ndarray:
 
 
 def _farthest_first(unit: np.ndarray, values: np.ndarray, kept: np.ndarray, new: int) -> list[int]:
-    """Indices of ``new`` more centres among directions, each as far as can be from ``kept`` and those before it."""
+    """Indices of ``new`` centres among directions, each farthest from ``kept`` and from the centres before."""
     centres = kept.tolist()
     nearest = np.full(len(unit), -2.0)
     for number in range(len(kept) + new):
@@ -208,7 +206,7 @@ def _farthest_first(unit: np.ndarray, values: np.ndarray, kept: np.ndarray, new:
 
 
 def _assign(levels, unit: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """The centre that every cell joins, as an index into ``centres``: (n,) int32."""
+    """Index into ``centres`` of the centre that every cell joins, (n,) int32."""
     label = np.full(len(unit), -1, np.int32)
     for component in levels:
         free = np.flatnonzero((label[centres] < 0) & (component[centres] >= 0))
@@ -216,7 +214,7 @@ def _assign(levels, unit: np.ndarray, centres: np.ndarray) -> np.ndarray:
             layer = np.flatnonzero((component == which) & (label < 0))
             own = free[component[centres[free]] == which]
             label[layer] = own[_nearest(unit[layer], unit[centres[own]])]
-            # Whatever the rounding of distances between the smallest of cells
+            # Rounding of distances between tiny cells must not move a centre to another region
             label[centres[own]] = own
     rest = np.flatnonzero(label < 0)
     label[rest] = _nearest(unit[rest], unit[centres])
@@ -224,7 +222,7 @@ def _assign(levels, unit: np.ndarray, centres: np.ndarray) -> np.ndarray:
 
 
 def _nearest(unit: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Index of the nearest of ``centres``, (k, 3), for every direction of ``unit``, (n, 3)."""
+    """Index of the nearest centre, (k, 3), of every direction in ``unit``, (n, 3)."""
     result = np.empty(len(unit), np.int64)
     for i in range(0, len(unit), _CHUNK):
         np.argmax(unit[i : i + _CHUNK] @ centres.T, axis=1, out=result[i : i + _CHUNK])
@@ -232,13 +230,13 @@ def _nearest(unit: np.ndarray, centres: np.ndarray) -> np.ndarray:
 
 
 def _lowest_cosine(axis: np.ndarray, row: np.ndarray, column: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """The least cosine between an axis, (n, 3), and any direction in the cell at its row and column: (n,)."""
+    """Least cosine between an axis, (n, 3), and any direction in the cell at a row and a column: (n,)."""
     height, width = shape
-    # The azimuth at which the cell begins, seen from the one opposite to the axis; the least cosine is next to that
+    # Azimuth of the cell's first edge relative to the azimuth opposite to the axis, near which the cosine is least
     begin = (column * (2 * np.pi / width) - np.arctan2(axis[:, 1], axis[:, 0]) - np.pi) % (2 * np.pi)
     end = begin + 2 * np.pi / width
     across = -np.hypot(axis[:, 0], axis[:, 1]) * np.where(end >= 2 * np.pi, 1, np.maximum(np.cos(begin), np.cos(end)))
-    # Along a meridian the cosine is a wave, lowest at an end of the cell unless its trough lies in between
+    # Along a meridian the cosine is sinusoidal: least at an end of the cell unless its minimum lies in between
     top, bottom = row * (np.pi / height), (row + 1) * (np.pi / height)
     ends = [across * np.sin(theta) + axis[:, 2] * np.cos(theta) for theta in (top, bottom)]
     trough = np.arctan2(-across, -axis[:, 2])

@@ -1,7 +1,7 @@
-"""Sites and their clusters on the device: what the kernels of direct lighting read.
+"""Sites, clusters and statistics on the device, for the kernels of direct lighting.
 
-Everything is an array over *entries*: one entry per site and cluster of the site's group.  A site's samples come in two
-halves that never see each other's numbers; a lane works for one half of one site.
+Statistics are arrays over *entries*, the pairs of a site and a cluster of the site's group.  The samples of a site form
+two independent halves.  A lane samples one half of one site.
 """
 
 from __future__ import annotations
@@ -13,34 +13,40 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import upload
+from ..points.camera_paths import SceneTraits
 from ..points.surfaces import Batch
 from .cluster_cuts import GroupCuts
 from .sites import Sites
 from .sources import Sources
 
-SEEN = 1 << 16  # counters hold samples in their lower half and those that saw the source in their upper half
+# Counters hold samples in the lower 16 bits, samples that saw the source in the upper 16 bits.  A half of a site takes
+# at most 50,000 samples, half of the largest ``max_samples``
+SEEN = 1 << 16
 
 
 @dataclass
 class SiteTable:
-    """Sites on the device, s of them, with g groups and their cuts.
+    """A number s of sites with the cuts of their groups.
 
-    ``size``, ``cut``, ``entry`` (s,): clusters of each site, where its cut and its entries begin; ``member_first``,
-    ``members`` (s,): where the site's points begin in ``member_row``, and how many they are; ``node``: nodes of all
-    cuts; ``group_*`` (per node of a cut): where its entry of the group's first site is, how far it is from site to
-    site, and how many sites there are.
+    - ``size``, ``cut``, ``entry`` (s,): number of clusters of each site, its first index in ``node``, its first entry
+    - ``member_first``, ``members`` (s,): first index in ``member_row`` and number of points of each site
+    - ``member_row``: row in the batch of every point, site by site
+    - ``node``: nodes of the cuts, group by group
+    - ``group_entry``, ``group_stride``, ``group_sites``, for each element of ``node``: entry of the group's first site,
+      distance to the entry of the next site, number of sites
+    - ``entries``: number of entries
     """
 
-    size: object
-    cut: object
-    entry: object
-    member_first: object
-    members: object
-    member_row: object
-    node: object
-    group_entry: object
-    group_stride: object
-    group_sites: object
+    size: mi.UInt32
+    cut: mi.UInt32
+    entry: mi.UInt32
+    member_first: mi.UInt32
+    members: mi.UInt32
+    member_row: mi.UInt32
+    node: mi.UInt32
+    group_entry: mi.UInt32
+    group_stride: mi.UInt32
+    group_sites: mi.UInt32
     entries: int
 
     @property
@@ -49,7 +55,7 @@ class SiteTable:
 
     @classmethod
     def of(cls, sites: Sites, cuts: GroupCuts) -> SiteTable:
-        """Table of sites with the cuts of their groups."""
+        """Table of sites and of the cuts of their groups."""
         size = cuts.size[sites.group]
         entry = np.concatenate([[0], np.cumsum(size)])
         group = cuts.group
@@ -63,11 +69,13 @@ class SiteTable:
 
 @dataclass
 class Statistics:
-    """Observations of every entry, by each half (the second after all entries of the first): ``counts``: samples and
-    those that saw the source; ``gain``: sum of their contributions over the entry's importance."""
+    """Statistics of every entry, first of one half, then of the second.
 
-    counts: object
-    gain: object
+    ``counts``: numbers of samples, packed by SEEN; ``gain``: sum of contributions relative to the entry's importance.
+    """
+
+    counts: mi.UInt32
+    gain: mi.Float
 
     @classmethod
     def empty(cls, entries: int) -> Statistics:
@@ -75,30 +83,29 @@ class Statistics:
 
 
 @dataclass
-class Scenery:
-    """Context that all lanes of a pass have in common.
+class PassContext:
+    """Context shared by the lanes of a pass.
 
-    ``importance``, ``probability``: Float per entry; ``statistics``: of all entries; a ``probability`` of None means
-    that every cluster is sampled for certain.  ``max_depth``: UInt32, or None where no path goes beyond a gather point
-    by way of mirrors or glass.
+    ``importance``, ``probability``: one value per entry; without ``probability`` every cluster is sampled.
+    ``max_depth``: None if no path continues through delta surfaces beyond a gather point.
     """
 
-    scene: object
-    traits: object
+    scene: mi.Scene
+    traits: SceneTraits
     sources: Sources
     batch: Batch
     table: SiteTable
-    max_depth: object
-    importance: object = None
+    max_depth: mi.UInt32 | None
+    importance: mi.Float | None = None
     statistics: Statistics | None = None
-    probability: object = None
+    probability: mi.Float | None = None
 
 
 @dataclass
 class Lanes:
-    """Lanes of a pass: for each a site, its half (0, 1), and how many emitter and BSDF samples to take."""
+    """Lanes of a pass: site, half (0 or 1), and numbers of emitter and BSDF samples."""
 
-    site: object
-    half: object
-    samples: object
-    bsdf_samples: object
+    site: mi.UInt32
+    half: mi.UInt32
+    samples: mi.UInt32
+    bsdf_samples: mi.UInt32

@@ -1,12 +1,11 @@
 """Gather points sorted into sites and groups, the units of adaptive direct lighting (NumPy only).
 
-The image is divided into blocks of 8 x 8 pixels; the points of a block are divided into six classes by the main axis of
-their normals [IAS section 4.1].  What remains together is a *group*: its points share statistics about the clusters.
-The points of one pixel in one group are a *site*, which has statistics of its own, is sampled as a whole, and whose
-points all show its radiance.
+The image is divided into blocks of 8 × 8 pixels, and the points of a block into six classes by the main axis of their
+normals [IAS section 4.1].  Each class of a block is a *group*, with common statistics of its clusters.  The points of
+one pixel in one group are a *site*, with statistics and an estimate of its own.
 
-Departure from the paper: a class of a block falls apart further where its points do, along the largest gap between
-them, so that what is seen over the edge of something near shares no statistics with it.
+Departure from the paper: groups are further split at large gaps between their points, so that a distant background
+shares no statistics with a foreground object.
 """
 
 from __future__ import annotations
@@ -20,16 +19,18 @@ from ..core.cones import mean_axes
 from .cluster_cuts import PointGroups
 
 BLOCK = 8  # pixels along the side of a block [IAS section 4]
-# A group falls apart at a gap of more than this share of its extent, in as many rounds at most
+# Least gap that splits a group, relative to its extent; number of rounds of splitting
 _GAP, _ROUNDS = 0.3, 3
-_SLACK = 1e-5  # of cosines in single precision
+_SLACK = 1e-5  # tolerance of single-precision cosines
 
 
 @dataclass
 class Sites:
-    """``group``, ``pixel`` (s,): of every site, in rising order of both; ``point_site`` (n,): site of every point;
-    ``first`` (s + 1,): the points of site i are ``order[first[i] : first[i + 1]]``; ``group_first`` (g + 1,): the first
-    site of each group."""
+    """A number s of sites, sorted by group, then pixel, of n points and g groups.
+
+    ``group``, ``pixel`` (s,): of every site; ``point_site`` (n,): site of every point; ``first`` (s + 1,): site i has
+    the points ``order[first[i] : first[i + 1]]``; ``group_first`` (g + 1,): first site of each group.
+    """
 
     group: np.ndarray
     pixel: np.ndarray
@@ -57,7 +58,7 @@ class Sites:
         return ranges(self.group_first[groups], self.per_group[groups])
 
     def select(self, groups: np.ndarray) -> Sites:
-        """The sites of some groups, which are numbered anew; ``point_site`` stays that of the whole."""
+        """Select the sites of some groups, and renumber the groups; ``point_site`` stays unchanged."""
         chosen, size = self.of_groups(groups), self.per_group[groups]
         points = self.points[chosen]
         return Sites(
@@ -68,13 +69,13 @@ class Sites:
 
 
 def normal_class(normal: np.ndarray) -> np.ndarray:
-    """0 to 5: the face of a cube that each normal, (n, 3), points to: +x, -x, +y, -y, +z, -z."""
+    """Main axis of each normal, (n, 3): 0 to 5 for +x, -x, +y, -y, +z, -z."""
     axis = np.abs(normal).argmax(1)
     return 2 * axis + (np.take_along_axis(normal, axis[:, None], 1)[:, 0] < 0)
 
 
 def find_groups(pixel, width: int, position, normal) -> np.ndarray:
-    """Number the groups: (n,) int64 for points of the pixels ``pixel`` (n,) of an image ``width`` wide.
+    """Group of every point, (n,) int64, for points of the pixels ``pixel`` (n,) of an image ``width`` wide.
 
     ``position``, ``normal``: (n, 3), world units.
     """
@@ -90,7 +91,7 @@ def find_groups(pixel, width: int, position, normal) -> np.ndarray:
 
 
 def _split_at_gaps(group, position) -> np.ndarray:
-    """Divide each group at the largest gap along the longest side of its box, if that is wide."""
+    """Split each group at the largest gap along the longest side of its box, if wider than _GAP."""
     count = group.max() + 1
     order = np.argsort(group, kind="stable")
     first = np.searchsorted(group[order], np.arange(count))
@@ -105,7 +106,7 @@ def _split_at_gaps(group, position) -> np.ndarray:
     owner = group[order]
     wide = (largest > _GAP * extent.max(1)) & (largest > 0)
     at = (gap == largest[owner]) & wide[owner]
-    # Everything from the first of the largest gaps on becomes a group of its own
+    # The points beyond the first of the largest gaps form a new group
     passed = np.cumsum(at)
     before = np.concatenate([[0], passed])[first]
     beyond = passed > before[owner]
@@ -117,8 +118,8 @@ def _split_at_gaps(group, position) -> np.ndarray:
 def divide_points(pixel, width: int, position, normal, generator=None) -> Sites:
     """Divide points into sites and groups; arguments as in :func:`find_groups`.
 
-    The points of one pixel and class are a site, which goes to the group of the first of them.  ``generator``: of
-    NumPy; if there is one, it shuffles the points of each site.
+    The points of one pixel and class form a site, in the group of its first point.  ``generator``: a NumPy generator
+    that shuffles the points of each site, or None.
     """
     key = pixel * 6 + normal_class(normal)
     count = np.bincount(key)
@@ -151,10 +152,7 @@ def find_sites(group: np.ndarray, pixel: np.ndarray) -> Sites:
 
 
 def bound_groups(sites: Sites, position, normal, two_sided: np.ndarray) -> PointGroups:
-    """Boxes of the positions and cones of the normals of every group.
-
-    ``two_sided`` (n,): points that are lit from both sides.
-    """
+    """Boxes of positions and cones of normals of every group.  ``two_sided`` (n,): points lit from both sides."""
     first = sites.first[sites.group_first[:-1]]
     position, normal = position[sites.order], normal[sites.order]
     total = np.add.reduceat(normal, first, dtype=np.float64)

@@ -1,9 +1,9 @@
-"""Sources, which are everything that lights a scene directly, behind one interface: rows, grouped into clusters.
+"""Sources of direct light behind one interface: rows of arrays, grouped into clusters.
 
 A *source* is a point or spot emitter, a piece of an area emitter, a directional emitter, a region of the environment,
-or an emitter that only its own routines can sample.  Those at finite places form the cluster forest [IAS section
-4.3.1]; all others are clusters of their own.  *Nodes* number the clusters: those of the forest in preorder, then the
-others.  A source's *rank* is its place along the leaves of all nodes, so that every node holds a range of ranks.
+or an emitter of unknown kind, sampled by Mitsuba.  Sources at finite positions form the cluster forest [IAS section
+4.3.1].  Every source without a position is a cluster of its own.  *Nodes* are the clusters: the forest in preorder,
+then the single sources.  The *rank* of a source is its position along the leaves: every node holds a range of ranks.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .emitter_clusters import build_cluster_forest
 from .emitter_pieces import EmitterPieces
 from .environment_regions import regions_of
 
-# In place of the radius of a node that has no place
+# Radius of nodes without a finite position
 RADIUS_AT_INFINITY = -1.0
 
 
@@ -31,12 +31,15 @@ RADIUS_AT_INFINITY = -1.0
 class Nodes:
     """Clusters as NumPy arrays of m rows.
 
-    ``center`` (m, 3), ``radius`` (m,): bounding spheres, world units; for nodes at infinity the radius is
-    RADIUS_AT_INFINITY and the centre means nothing. ``axis`` (m, 3), ``cone_cos`` (m,): cone of the directions that
-    sources face (-1: all); for nodes at infinity, of the directions from which their light comes. ``intensity`` (m,):
-    radiant intensity, or irradiance of nodes at infinity. ``centroid`` (m, 3): mean position by intensity. ``escape``
-    (m,): the node after this node's subtree. ``first``, ``last`` (m,): ranks of its sources. All float64 or uint32.
-    ``extended`` (m,): how many of them have an extent.
+    - ``center`` (m, 3), ``radius`` (m,), float64: bounding spheres, world units; radius RADIUS_AT_INFINITY, and an
+      undefined centre, for nodes at infinity
+    - ``axis`` (m, 3), ``cone_cos`` (m,), float64: cone of the directions that sources face, -1 for omnidirectional
+      sources; for nodes at infinity, cone of the directions towards the source
+    - ``intensity`` (m,), float64: radiant intensity, or irradiance for nodes at infinity
+    - ``centroid`` (m, 3), float64: intensity-weighted mean position
+    - ``escape`` (m,), uint32: node after this node's subtree
+    - ``first``, ``last`` (m,), uint32: range of ranks of the node's sources
+    - ``extended`` (m,), int64: number of sources with an extent
     """
 
     center: np.ndarray
@@ -61,27 +64,30 @@ class Nodes:
 
 @dataclass
 class SourceSample:
-    """Points on sources in a kernel: unit ``direction`` to them, end ``p`` of the shadow ray, ``value``: incident
-    radiance over density (intensity over squared distance for those without extent), ``pdf``: density per solid angle
-    given the source, 0 for those without extent."""
+    """Points on sources in a kernel, one per lane.
 
-    direction: object
-    p: object
-    value: object
-    pdf: object
+    ``direction``: unit vector to the point; ``p``: end of the shadow ray; ``value``: incident radiance over density, or
+    intensity over squared distance for sources without extent; ``pdf``: density per solid angle given the source, 0 for
+    sources without extent.
+    """
+
+    direction: mi.Vector3f
+    p: mi.Point3f
+    value: mi.UnpolarizedSpectrum
+    pdf: mi.Float
 
 
 @dataclass
 class DeviceNode:
     """Clusters in a kernel, one per lane; see :class:`Nodes`."""
 
-    centroid: object
-    radius: object
-    axis: object
-    cone_cos: object
-    intensity: object
-    first: object
-    last: object
+    centroid: mi.Point3f
+    radius: mi.Float
+    axis: mi.Vector3f
+    cone_cos: mi.Float
+    intensity: mi.Float
+    first: mi.UInt32
+    last: mi.UInt32
 
     @property
     def infinite(self):
@@ -90,7 +96,7 @@ class DeviceNode:
 
 
 class Sources:
-    """All sources of a scene.  ``regions``: at most so many clusters for an environment [IAS section 4.3.1]."""
+    """The sources of a scene.  ``regions``: largest number of regions of the environment [IAS section 4.3.1]."""
 
     def __init__(self, scene, emitters: Emitters, regions: int = 300):
         self.emitters = emitters
@@ -113,7 +119,7 @@ class Sources:
         self._store(order, intensity)
 
     def _cluster(self, scene) -> tuple[Nodes, np.ndarray, np.ndarray]:
-        """All nodes, the source of every rank, and its intensity."""
+        """(Nodes, source of every rank, intensity of every rank)."""
         finite, rows = self._finite_sources()
         forest = build_cluster_forest(*finite)
         order = rows[forest.leaf_order]
@@ -127,11 +133,11 @@ class Sources:
         return joined, np.concatenate([order, more]), intensity
 
     def _finite_sources(self):
-        """(centre, radius, axis, cosine of the cone, intensity) of sources at finite places that emit; their rows."""
+        """(Centre, radius, axis, cosine of the cone, intensity) of emitting sources at finite positions; their rows."""
 
         def of(lights: VirtualLights):
             level = lights.intensity.mean(1, dtype=np.float64)
-            # A spot emitter that shines backwards too is as good as a point emitter for clustering
+            # A spot emitter that also emits backwards is clustered with the point emitters
             cosine = np.where(lights.cone[:, 0] <= np.pi / 2, 1.0, -1.0)
             return lights.position.astype(np.float64), np.zeros(lights.count), lights.direction, cosine, level
 
@@ -146,12 +152,12 @@ class Sources:
         return [column[keep] for column in columns], keep
 
     def _single_nodes(self, scene, rank: int) -> tuple[Nodes, np.ndarray]:
-        """Nodes of one source each, from ``rank`` on, and their sources' rows: directional ones, regions, others."""
+        """Nodes of single sources, from ``rank`` on, and the rows of these sources: directional, regions, unknown."""
         suns, regions, sphere = self.emitters.directional, self._regions, bounding_sphere(scene)
         rows = [(-d, 1.0, i) for d, i in zip(suns.direction, suns.intensity.mean(1, dtype=np.float64), strict=True)]
         if regions is not None:
             rows += zip(regions.axis, regions.cone_cos, regions.irradiance, strict=True)
-        # Where the others shine is not known: they count as though they shone on everything with all of their power
+        # Emitters of unknown kind are assumed to light the cross section of the scene with their whole power
         cross_section = np.pi * float(sphere.radius) ** 2
         rows += [((0.0, 0.0, 1.0), -1.0, other_power(emitter, sphere) / cross_section) for emitter in self._others]
         axis = np.array([row[0] for row in rows], np.float64).reshape(-1, 3)
@@ -177,7 +183,7 @@ class Sources:
         rank = np.full(self._begin[-1], self.count, np.uint32)
         rank[order] = np.arange(self.count)
         self._rank = upload(mi.UInt32, rank)
-        # Relative to the brightest, so that the sum stays far from the limits of its type
+        # Relative to the greatest intensity, against overflow and underflow
         scaled = intensity / intensity.max(initial=1e-300)
         self._cumulative = upload(dr.float64_array_t(mi.Float), np.concatenate([[0.0], np.cumsum(scaled)]))
 
@@ -188,23 +194,26 @@ class Sources:
         return DeviceNode(mi.Point3f(a.xyz), a.w, b.xyz, b.w, c.x, first, last)
 
     def member(self, node: DeviceNode, sample):
-        """Draw one of each node's sources by intensity [IAS section 4.3]: (rank, probability)."""
+        """Draw a source of each node by intensity [IAS section 4.3]: (rank, probability)."""
         rank = find_interval(self._cumulative, node.first, node.last, sample)
         return rank, self.member_probability(node, rank)
 
     def member_probability(self, node: DeviceNode, rank, active=True):
-        """Probability with which :meth:`member` draws a source of the node."""
+        """Probability that :meth:`member` draws the source of a rank from the node."""
         low, high, begin, end = (
             dr.gather(type(self._cumulative), self._cumulative, index, active)
             for index in (rank, rank + 1, node.first, node.last)
         )
-        # Where the sources of a node vanish beside those before it, :func:`find_interval` always finds the last
+        # If the node's intensity is lost to rounding in the running sum, :func:`find_interval` returns the last source
         rise = end - begin
         share = dr.select(rise > 0, (high - low) / rise, dr.select(rank + 1 == node.last, 1, 0))
         return dr.select(node.last == node.first + 1, 1, mi.Float(share))
 
     def sample(self, rank, interaction, member, sample, active) -> SourceSample:
-        """A point on the source of each rank as seen from ``interaction``; numbers as in the classes called."""
+        """Sample a point on the source of each rank for the reference point ``interaction``.
+
+        ``member``: uniform number that draws the cell of a region; ``sample``: two uniform numbers.
+        """
         row = dr.gather(mi.UInt32, self._order, rank, active)
         result = SourceSample(mi.Vector3f(0, 0, 1), interaction.p, mi.UnpolarizedSpectrum(0), mi.Float(0))
         for kind, begin, lights in zip(("point", "spot", "directional"), self._begin[[0, 1, 3]], self._device,
@@ -227,7 +236,7 @@ class Sources:
             here = active & (row == int(self._begin[5]) + number)
             ds, weight = emitter.sample_direction(interaction, sample, here)
             value = finite_or_zero(mi.unpolarized_spectrum(weight))
-            # Nothing else ever finds them, whether they have an extent or not
+            # Density 0 marks sources that BSDF samples never hit, here even with an extent
             result = select_record(here, SourceSample(ds.d, ds.p, value, mi.Float(0)), result)
         return result
 
@@ -242,10 +251,10 @@ class Sources:
         return (row >= int(begin)) & (row < int(begin) + count)
 
     def find(self, hit, ray, active):
-        """Source that a ray from a gather point met, for multiple importance sampling.
+        """Source that a ray from a gather point hits, for multiple importance sampling.
 
-        ``hit``: preliminary intersection. Returns (radiance towards the ray's origin, rank of the source or ``count``
-        where there is none, density with which :meth:`sample` would have drawn the direction given the source).
+        ``hit``: preliminary intersection.  Returns (radiance towards the ray's origin, rank of the source or ``count``
+        without a source, density of :meth:`sample` for the direction given the source).
         """
         radiance, pdf = dr.zeros(mi.UnpolarizedSpectrum, dr.width(ray.d)), mi.Float(0)
         row, found = mi.UInt32(0), mi.Bool(False)

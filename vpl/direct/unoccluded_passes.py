@@ -1,7 +1,7 @@
 """The standard that iterative adaptive sampling is compared with [IAS section 5.1].
 
-For each point a fixed density over all sources, proportional to their unoccluded contribution; point after point of a
-pixel, until its estimate converges by the same rule.
+Each point samples the sources with a fixed density, proportional to unoccluded contributions.  Points of a pixel are
+sampled one after another, until the estimate converges by the same rule.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from .cluster_probabilities import Mixture, update_importance, update_probabilit
 from .passes import SiteEstimates
 from .site_table import Statistics
 
-_LEAST_PASSES = 4  # of each half: fewer say nothing about the variance between points
+_LEAST_PASSES = 4  # least passes of each half for an estimate of the variance between points
 
 
 class UnoccludedPasses:
-    """Passes over one point of every site after another, with ``options.samples_per_ray`` emitter samples at each.
+    """Passes over the points of every site, one point a pass, with ``options.samples_per_ray`` emitter samples each.
 
     Arguments as in :class:`vpl.direct.passes.SiteEstimates`.
     """
 
-    def __init__(self, scenery, share, bsdf_share, level, options):
-        self.estimates = SiteEstimates(scenery, share, bsdf_share, level, options)
+    def __init__(self, context, share, bsdf_share, level, options):
+        self.estimates = SiteEstimates(context, share, bsdf_share, level, options)
         self.estimates.least_samples = self.estimates.most_samples = options.samples_per_ray
-        self.scenery, self.options = scenery, options
-        self.several = download(scenery.table.members) > 1
-        # Sums over the passes of each half and site: their means, squares of these, and how many there were
+        self.context, self.options = context, options
+        self.several = download(context.table.members) > 1
+        # Sums over the passes of each half and site: of channel means, of their squares, and of passes
         self.levels, self.squares, self.done = (np.zeros((2, len(share))) for _ in range(3))
 
     def run(self, two_sided, seed: int, halted) -> None:
-        """Sample until all sites are done.  Arguments as in :meth:`vpl.direct.passes.SitePasses.run`."""
-        whole = self.scenery.table
+        """Sample until the sites converge.  Arguments as in :meth:`vpl.direct.passes.SitePasses.run`."""
+        whole = self.context.table
         if whole.entries == 0:
             return
         first, members = (download(column).astype(np.int64) for column in (whole.member_first, whole.members))
-        self.scenery.importance = dr.zeros(mi.Float, whole.entries)
-        self.scenery.probability = dr.empty(mi.Float, whole.entries)
-        self.scenery.statistics = Statistics.empty(whole.entries)
+        self.context.importance = dr.zeros(mi.Float, whole.entries)
+        self.context.probability = dr.empty(mi.Float, whole.entries)
+        self.context.statistics = Statistics.empty(whole.entries)
         nothing = tuple(dr.zeros(mi.Float, dr.width(whole.node)) for _ in range(3))
         mixture = Mixture(*(dr.opaque(mi.Float, share) for share in (1.0, 0.0, 0.0, 1.0)))
         wanted = self.estimates.full_pass()
@@ -52,26 +52,26 @@ class UnoccludedPasses:
             if len(active) == 0 or halted(number):
                 break
             for half in (0, 1):
-                # The halves stand on different points, as long as there are two
+                # The halves use different points if the site has several
                 member = (2 * number + half) % members
                 changed = np.flatnonzero(wanted[half])
                 if number + half > 0:
                     changed = changed[members[changed] > 1]
-                self._stand_on(whole, first + member, changed, two_sided, nothing, mixture)
+                self._select_points(whole, first + member, changed, two_sided, nothing, mixture)
                 self._draw_half(wanted, half, number, derived_seed(seed, number, half))
             wanted = self.estimates.wanted(number, *self._halves())
 
-    def _stand_on(self, whole, place, changed, two_sided, nothing, mixture) -> None:
-        """Take one point of every site, and make the densities of the sites ``changed``; others keep theirs."""
+    def _select_points(self, whole, place, changed, two_sided, nothing, mixture) -> None:
+        """Select one point of every site, and update the densities of the sites ``changed``."""
         one = dr.full(mi.UInt32, 1, whole.count)
-        self.scenery.table = replace(whole, member_first=upload(mi.UInt32, place), members=one)
+        self.context.table = replace(whole, member_first=upload(mi.UInt32, place), members=one)
         if len(changed):
             sites = upload(mi.UInt32, changed)
-            update_importance(self.scenery, two_sided, sites)
-            update_probabilities(self.scenery, nothing, mixture, sites)
+            update_importance(self.context, two_sided, sites)
+            update_probabilities(self.context, nothing, mixture, sites)
 
     def _draw_half(self, wanted: np.ndarray, half: int, number: int, seed: int) -> None:
-        """A pass of one half, whose mean is kept for the variance between points."""
+        """Draw a pass of one half, and record its mean for the variance between points."""
         taken = wanted[half]
         if not taken.any():
             return
@@ -83,7 +83,7 @@ class UnoccludedPasses:
         self.done[half] += taken > 0
 
     def _halves(self):
-        """Radiance and variance of both halves; between the passes where these stand on different points."""
+        """Radiance and variance of both halves; for sites of several points the variance between passes."""
         radiance, variance = self.estimates.halves()
         passes = np.maximum(self.done, 2)
         between = np.maximum(self.squares / passes - np.square(self.levels / passes), 0) / (passes - 1)

@@ -1,7 +1,7 @@
-"""Columns of the light matrix: clusters of lights, and the light trees above them as one forest (NumPy only) [LS].
+"""Columns of the light matrix: clusters of lights below a forest of light trees (NumPy only) [LS].
 
-The light matrix has a row for every gather point and a column for every light.  Nodes of the light trees stand for
-ranges of its columns; cutting the trees off at some of them makes a matrix of fewer columns.
+The light matrix has a row per gather point and a column per light.  A node of a light tree represents a range of
+columns.  Pruning the trees reduces the number of columns.
 """
 
 from __future__ import annotations
@@ -14,11 +14,10 @@ import numpy as np
 
 @dataclass(frozen=True)
 class ColumnForest:
-    """The upper parts of some trees, one after another in preorder: m nodes, of which those without children are c
-    columns, in the same order.
+    """Pruned trees, concatenated in preorder: m nodes, of which the c leaves are the columns, in the same order.
 
-    ``group``: (m,) int64, which tree a node is of; ``node``: (m,) int64, its index there; ``escape``: (m,) int64, the
-    node that follows its subtree; a node without children escapes to the next one.
+    ``group``: (m,) int64, tree of a node; ``node``: (m,) int64, index in the tree; ``escape``: (m,) int64, node after
+    the subtree, i + 1 for a leaf i.
     """
 
     group: np.ndarray
@@ -27,12 +26,12 @@ class ColumnForest:
 
     @classmethod
     def of_tree(cls, escape: np.ndarray, group: int = 0) -> ColumnForest:
-        """All nodes of one tree, given where each escapes to: see :class:`vpl.lights.light_tree.LightTree`."""
+        """The whole of a tree with the given ``escape``: see :class:`vpl.lights.light_tree.LightTree`."""
         return cls(np.full(len(escape), group), np.arange(len(escape)), escape.astype(np.int64))
 
     @classmethod
     def joined(cls, forests: list[ColumnForest]) -> ColumnForest:
-        """Several forests as one."""
+        """Concatenate forests."""
         sizes = np.array([forest.size for forest in forests])
         start = np.cumsum(sizes) - sizes
         escape = np.concatenate([forest.escape for forest in forests]) + np.repeat(start, sizes)
@@ -46,13 +45,15 @@ class ColumnForest:
 
     @cached_property
     def inner(self) -> np.ndarray:
-        """Mask of the nodes that have children, (m,) bool."""
+        """Mask of the inner nodes, (m,) bool."""
         return self.escape > np.arange(self.size) + 1
 
     @cached_property
     def first(self) -> np.ndarray:
-        """Columns before each node, and the number of all, (m + 1,) int64: node i has those from ``first[i]`` up to
-        ``first[escape[i]]``."""
+        """First column of each node, then the number of columns, (m + 1,) int64.
+
+        Node i has the columns ``first[i]`` to ``first[escape[i]]`` - 1.
+        """
         return np.concatenate([[0], np.cumsum(~self.inner)])
 
     @property
@@ -71,13 +72,12 @@ class ColumnForest:
         return np.flatnonzero(self.node == 0)
 
     def pruned(self, cost: np.ndarray, most: int) -> ColumnForest:
-        """The forest of at most ``most`` columns, but of each tree's root at least, that comes of splitting the nodes
-        that cost most.
+        """Split the costliest nodes, up to ``most`` columns; at least the root of each tree remains.
 
-        ``cost`` (m,): not negative, and at no node above that of its parent but for rounding.
+        ``cost`` (m,): at least 0, and apart from rounding at most the cost of the parent.
         """
         split = self.inner & (cost > split_threshold(cost[None, self.inner], most - len(self.roots))[0])
-        # A node that is not split hides all that are below it
+        # A node that is not split hides its descendants
         whole, size = np.flatnonzero(~split), self.size + 1
         hidden = np.bincount(whole + 1, minlength=size) - np.bincount(self.escape[whole], minlength=size)
         kept = np.cumsum(hidden)[:-1] == 0
@@ -87,9 +87,9 @@ class ColumnForest:
 
 
 def split_threshold(cost: np.ndarray, splits: int) -> np.ndarray:
-    """Cost above which nodes are split, so that in each row at most ``splits`` are, (s,).
+    """Threshold on the cost of nodes above which at most ``splits`` nodes of a row are split, (s,).
 
-    ``cost`` (s, m): of nodes that can be split, in no order.  Nodes that cost nothing are never split.
+    ``cost`` (s, m): costs of inner nodes.  Nodes of cost 0 are never split.
     """
     nodes, splits = cost.shape[1], max(splits, 0)
     if splits >= nodes:

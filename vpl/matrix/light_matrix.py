@@ -1,9 +1,8 @@
-"""The light matrix, sampled at some rows: what clusters of lights send to some gather points, with visibility [LS].
+"""Sampled rows of the light matrix: contributions of light clusters to some gather points, with visibility [LS].
 
-Columns are clusters of lights (:mod:`vpl.matrix.column_forest`), of which the representative is traced.  From sampled
-rows follows how much is lost where one light stands for a cluster, for all clusters of the forest at once: drawn with a
-probability proportional to the norms n of their columns x, it has the variance (Σ n)² − ‖Σ x‖², which is the cost of
-clusters that [LS] and the work before it minimise.
+Columns are clusters of lights (:mod:`vpl.matrix.column_forest`), evaluated at their representative lights.  If a column
+x, drawn in proportion to its norm n, represents a cluster of columns, the variance is (Σ n)² − ‖Σ x‖².  [LS] and
+earlier work minimise this cost of clusters, here estimated from the sampled rows.
 """
 
 from __future__ import annotations
@@ -23,16 +22,19 @@ from ..transport.bounds import contribution_bound
 from ..transport.evaluation import Transport, evaluate_pairs
 from .column_forest import ColumnForest
 
-# What a bound counts for at most, relative to the light that was seen; and what float32 still squares or adds up
-_BOUND_LIMIT, _LARGEST = 10.0, 1e30
-# Rows that are darker than this fraction of the mean count for less
-_DARK_FLOOR = 0.5
+# Largest weight of an upper bound, relative to the light seen by the sampled rows
+_BOUND_LIMIT = 10.0
+# Largest finite bound: sums of bounds stay within float32
+_LARGEST = 1e30
+# Rows below this fraction of the mean sum keep a smaller weight
+_DARK_ROW = 0.5
 
 
 class DeviceForest:
-    """A forest on the device: for every node ``first``, ``last`` column and ``escape``; ``node`` of every column.
+    """A forest on the device: ``first``, ``last`` column and ``escape`` of every node; tree ``node`` of every column.
 
-    ``size``, ``columns``: how many of both; ``parts``: of every group of lights, its first column and how many it has.
+    ``size``, ``columns``: numbers of nodes and columns; ``parts``: (first column, number of columns) per group of
+    lights.
     """
 
     def __init__(self, forest: ColumnForest, lights: LightSet):
@@ -46,8 +48,11 @@ class DeviceForest:
         self.parts = list(zip((np.cumsum(count) - count).tolist(), count.tolist(), strict=True))
 
     def fill(self, rows: int, entry):
-        """A matrix, Float, row by row, evaluated: ``entry`` is called with (group of lights, nodes of its tree, row),
-        arrays of one entry per lane, and returns what to store."""
+        """Evaluate a matrix, Float, row by row.
+
+        ``entry``: called with (group of lights, nodes of the group's tree, rows), one entry of the matrix per lane;
+        returns the values, Float.
+        """
         matrix = dr.empty(mi.Float, rows * self.columns)
         for group, (first, count) in zip(self.lights.groups, self.parts, strict=True):
             width, columns = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, self.columns)
@@ -61,22 +66,22 @@ class DeviceForest:
         return matrix
 
     def node_sum(self, cumulative, row, node):
-        """The sum of the columns of a node in a row, from running sums over whole rows, in double precision."""
+        """Sum of the columns of a node in a row, from double-precision running sums over rows."""
         start = row * dr.opaque(mi.UInt32, self.columns)
         first, last = (start + dr.gather(mi.UInt32, ends, node) for ends in (self.first, self.last))
         return dr.gather(type(cumulative), cumulative, last) - dr.gather(type(cumulative), cumulative, first)
 
     def node_sums(self, cumulative, rows: int):
-        """These sums for every node, row by row, Float."""
+        """:meth:`node_sum` for every node, row by row, Float."""
         lane, size = dr.arange(mi.UInt32, rows * self.size), dr.opaque(mi.UInt32, self.size)
         return mi.Float(self.node_sum(cumulative, lane // size, lane % size))
 
 
 class SampledRows:
-    """Some rows of the matrix, evaluated, in units of their mean sum, so that squares neither overflow nor vanish.
+    """Rows of the matrix at ``points``, in units of the mean row sum, so that squares neither overflow nor underflow.
 
-    ``scale``: one over that mean, or 1 where they are ``dark``, without any light; ``values``: Float, row by row;
-    ``sums``: Float, of the columns of every node, row by row; ``rays``: shadow rays that were traced for them.
+    ``scale``: inverse of the mean, or 1 for ``dark`` rows, without light; ``values``: entries, Float, row by row;
+    ``sums``: sums over the columns of every node, Float, row by row; ``rays``: number of shadow rays.
     """
 
     def __init__(self, transport: Transport, batch: Batch, forest: DeviceForest, points: np.ndarray):
@@ -88,7 +93,7 @@ class SampledRows:
             surface = batch.surfaces_at(dr.gather(mi.UInt32, index, row))
             light, scale = group.representatives(node)
             value, traced = evaluate_pairs(transport, group, surface, light, scale)
-            # One value that is not finite would spoil the sums of all that follow
+            # A non-finite value would spoil the running sums after it
             value, traced = channel_mean(finite_or_zero(value)), dr.select(traced, mi.UInt32(1), 0)
             dr.eval(value, traced)
             self.rays += int(dr.sum(mi.UInt64(traced))[0])
@@ -96,7 +101,7 @@ class SampledRows:
 
         self.values = forest.fill(self.count, entry)
         mean = float(dr.sum(dr.float64_array_t(mi.Float)(self.values))[0]) / self.count
-        # The inverse of the least of numbers is not finite
+        # The inverse of a denormal mean would overflow
         self.dark = mean <= np.finfo(np.float32).tiny
         self.scale = 1.0 if self.dark else 1 / mean
         self.values *= dr.opaque(mi.Float, self.scale)
@@ -111,11 +116,11 @@ class SampledRows:
             dr.eval(self.sums)
 
     def balance(self) -> None:
-        """Scale rows to the same sum of 1, those darker than _DARK_FLOOR times the mean to less, so that clusters are
-        judged by what they are to all points; ``scale`` remains what it was."""
+        """Scale rows to a sum of 1, and rows below _DARK_ROW times the mean to less: every point counts the same in the
+        cost of clusters.  ``scale`` is unchanged."""
         total = dr.block_sum(self.values, self.forest.columns)
         # The mean over rows is 1
-        scale = dr.rcp(dr.maximum(total, _DARK_FLOOR))
+        scale = dr.rcp(dr.maximum(total, _DARK_ROW))
 
         def scaled(matrix, width: int):
             row = dr.arange(mi.UInt32, dr.width(matrix)) // dr.opaque(mi.UInt32, width)
@@ -127,7 +132,7 @@ class SampledRows:
 
 @dataclass(frozen=True)
 class NearRows:
-    """Of some groups of gather points, the sampled rows that tell about each, and how much they count: (groups, k)."""
+    """Sampled rows near each group of gather points, (groups, k) int64, and their weights, (groups, k) float64."""
 
     rows: np.ndarray
     relevance: np.ndarray
@@ -139,14 +144,14 @@ class NearRows:
 
     @classmethod
     def all_of(cls, rows: int) -> NearRows:
-        """A single group, of which all rows tell the same."""
+        """A single group, with equal weights of the rows."""
         return cls(np.arange(rows)[None], np.ones((1, rows)))
 
     @classmethod
     def nearest(cls, places: np.ndarray, most: int) -> NearRows:
-        """For each of some places, (n, k), the ``most`` nearest ones, its own among them.
+        """The ``most`` nearest places of each of n places, (n, k), including itself.
 
-        They count 1 / (1 + d² / d₁²), d₁ being the distance to the nearest one of the others.
+        The weights are 1 / (1 + d² / d₁²), with d₁ the distance to the nearest different place.
         """
         most = min(most, len(places))
         squares, rows, found = (places**2).sum(1), [], []
@@ -158,26 +163,26 @@ class NearRows:
             found.append(np.take_along_axis(distance2, rows[-1], axis=1))
         distance2 = np.maximum(np.concatenate(found), 0)
         unit = np.sort(distance2, axis=1)[:, min(1, most - 1), None]
-        # Places that coincide tell the same
+        # Coincident places have equal weights
         relevance = np.divide(unit, unit + distance2, out=np.ones_like(distance2), where=unit + distance2 > 0)
         return cls(np.concatenate(rows), relevance)
 
     def part(self, first: int, last: int) -> NearRows:
-        """Rows near some consecutive groups."""
+        """Rows near the groups ``first`` to ``last`` - 1."""
         return NearRows(self.rows[first:last], self.relevance[first:last])
 
 
 class ColumnWeights:
-    """Weights of every column, and costs of every cluster of them, for some groups of gather points.
+    """Weights of columns and costs of nodes, for some groups of gather points.
 
-    ``cumulative``: float64, the running sums of the weights of the columns, group by group, each of which adds 1, or 0
-    if nothing can arrive: lights are drawn with probabilities proportional to weights.  ``cost``: Float, of every node,
-    group by group.
+    ``cumulative``: float64, running sums of the weights of columns, group by group.  The weights of a group sum to 1,
+    or to 0 if no light can arrive.  Lights are drawn in proportion to the weights.  ``cost``: Float, cost of every
+    node, group by group.
 
-    ``near``: the sampled rows that tell about each group; ``clusters``, ``nodes`` (UInt32): the groups as nodes of a
-    point tree.  ``unseen``: how much goes by upper bounds, relative to what goes by sampled rows: a light that no row
-    saw may yet be seen.  A bound counts for no more than _BOUND_LIMIT times all light that was seen, or all that rows
-    see on average: those of boxes with a light inside would leave nothing to the others.
+    ``near``: sampled rows near each group; ``clusters``, ``nodes`` (UInt32): nodes of the point tree, one per group.
+    ``unseen``: total weight of upper bounds relative to sampled rows, for lights that are hidden from the sampled rows
+    only.  A bound counts at most _BOUND_LIMIT times the light seen by the rows of the group, or the mean row sum if
+    larger: an unlimited bound of a box around a light would take the whole weight.
     """
 
     def __init__(self, sampled: SampledRows, near: NearRows, clusters: PointClusters, nodes, unseen: float):
@@ -190,26 +195,26 @@ class ColumnWeights:
         total = self._forest.node_sums(self.cumulative, self.groups)
         group = dr.arange(mi.UInt32, dr.width(total)) // dr.opaque(mi.UInt32, self._forest.size)
         scale = dr.gather(mi.Float, mi.Float(scale), group)
-        # Scaled before they are squared, which float32 holds for any light
+        # Scaled before squaring, against overflow of float32
         squares = dr.square(dr.sqrt(self._squares(sampled.sums, self._forest.size)) * scale)
         self.cost = dr.maximum(dr.square(total) - squares, 0)
         dr.eval(self.cost)
 
     def _bounds(self, clusters: PointClusters, nodes, scale):
-        """The most that each column can send to a point of each group, in the units of the rows."""
+        """Upper bound of each column's contribution to any point of each group, in the units of the rows."""
         clamp = self._forest.lights.clamp
 
         def entry(group, node, row):
             receiver = clusters.gather(dr.gather(mi.UInt32, nodes, row)).receiver
             bound = scale * contribution_bound(group.kind, receiver, group.tree.gather(node), clamp)
-            # Without clamping some are infinite
+            # Bounds may be infinite without clamping
             return dr.select(bound > 0, dr.minimum(bound, _LARGEST), 0)
 
         return self._forest.fill(self.groups, entry)
 
     @dr.syntax
     def _squares(self, matrix, width: int):
-        """For every group and every place in a row, the sum of squares over the rows that tell about the group."""
+        """Weighted sum of squares over the rows near each group, for every position in a row."""
         lane, columns = dr.arange(mi.UInt32, self.groups * width), dr.opaque(mi.UInt32, width)
         start, column = lane // columns * self._nearby, lane % columns
         total, k = dr.zeros(mi.Float, self.groups * width), mi.UInt32(0)
@@ -221,7 +226,7 @@ class ColumnWeights:
         return total
 
     def _weigh(self, norms, bounds, unseen: float, dark: bool):
-        """(Running sums of the weights, scaled to 1 for each group; what they were scaled by, float64 per group)."""
+        """(Running sums of the weights, normalised to 1 in each group; factor of the normalisation, per group)."""
         precise = dr.float64_array_t(mi.Float)
         columns = dr.opaque(mi.UInt32, self._forest.columns)
         group = dr.arange(mi.UInt32, dr.width(norms)) // columns
@@ -231,7 +236,7 @@ class ColumnWeights:
 
         seen = total(norms)
         if dark:
-            # Nothing tells which bounds are much
+            # Without light there is no unit for bounds
             bounds = dr.select(bounds > 0, mi.Float(1), 0)
         else:
             most = mi.Float(dr.maximum(_BOUND_LIMIT * seen, 1))

@@ -1,6 +1,6 @@
-"""The reduced matrices of some slices as dense arrays, all of one padded size, entry next to entry along the rows.
+"""Reduced matrices of some slices in one dense array, padded to one size.
 
-Entry (slice s, column j, row i) stands at (s · width + j) · height + i; what pads a matrix is 0 everywhere.
+Entry (slice s, column j, row i) has the index (s · width + j) · height + i.  Padding is 0.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from .reduced_matrix import Columns, MatrixEntries
 
 
 class MatrixBlock:
-    """Slices ``begin`` up to ``end``, and all their columns, sorted.
+    """Matrices of the slices ``begin`` to ``end`` - 1, with their c columns, sorted.
 
     ``shape``: (slices, width, height); ``slot``: (c,) int64, s · width + j of every column; ``counts``: (slices, 2)
-    int64, columns and rows of each slice.
+    int64, numbers of columns and rows of each slice.
     """
 
     def __init__(self, entries: MatrixEntries, columns: Columns, begin: int, end: int):
@@ -38,12 +38,12 @@ class MatrixBlock:
 
     @property
     def size(self) -> int:
-        """Entries, padding included."""
+        """Number of entries, including padding."""
         return int(np.prod(self.shape))
 
     def lanes(self, index: np.ndarray):
-        """One lane for every row of some columns: (column, row of the slice, its number among all rows, whether there
-        is one, place of the entry)."""
+        """One lane per row of some columns: (column, row within the slice, row of :class:`MatrixRows`, whether the row
+        exists, index of the entry)."""
         height = dr.opaque(mi.UInt32, self.shape[2])
         lane = dr.arange(mi.UInt32, len(index) * self.shape[2])
         column = dr.gather(mi.UInt32, upload(mi.UInt32, index), lane // height)
@@ -54,7 +54,7 @@ class MatrixBlock:
         return column, inside, first + inside, inside < count, place
 
     def unoccluded(self):
-        """E of all entries, mean over channels [MSR equation 3]: Float, evaluated."""
+        """E of every entry, mean over channels [MSR equation 3]: Float, evaluated."""
         matrix = dr.zeros(mi.Float, self.size)
         dr.eval(matrix)
         for group, index in self.entries.by_group(self.columns):
@@ -68,9 +68,9 @@ class MatrixBlock:
         return matrix
 
     def trace(self, visibility, wanted, number) -> None:
-        """Replace V of the entries in ``wanted`` (UInt32, places) by what a ray finds, where any light arrives.
+        """Trace the entries with the indices ``wanted``, UInt32, and store their V if E is positive.
 
-        ``visibility``: Float, of all entries; ``number``: draws the points of rows.
+        ``visibility``: V of every entry, Float; ``number``: seed for the points of rows.
         """
         slot = wanted // dr.opaque(mi.UInt32, self.shape[2])
         column_at = np.zeros(self.slices * self.shape[1], np.int64)
@@ -85,12 +85,12 @@ class MatrixBlock:
             if len(inside) == 0:
                 continue
             one_light, one_row, place = (dr.gather(mi.UInt32, values, inside) for values in (light, row, wanted))
-            passed, asked = self.entries.trace(group, one_light, one_row, number)
-            dr.scatter(visibility, passed, place, asked)
+            passed, traced = self.entries.trace(group, one_light, one_row, number)
+            dr.scatter(visibility, passed, place, traced)
             dr.eval(visibility)
 
     def light_points(self, visibility, first: int, last: int):
-        """(Radiance, columns) of the points first .. last - 1 along the tree, from V of their rows."""
+        """(Radiance, number of columns) of the points ``first`` to ``last`` - 1 along the tree, by V of their rows."""
         rows = self.entries.rows
         point = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
         row = rows.row_of(point)
@@ -117,7 +117,7 @@ class MatrixBlock:
 
     @dr.syntax
     def _sum_columns(self, group: LightGroup, surface, visibility, first, last, place):
-        """Light of columns first .. last - 1 of every surface; ``place``: the entry of the first of them."""
+        """Radiance from the columns ``first`` to ``last`` - 1; ``place``: index of the entry of column ``first``."""
         j, at, height = mi.UInt32(first), mi.UInt32(place), dr.opaque(mi.UInt32, self.shape[2])
         total = dr.zeros(mi.UnpolarizedSpectrum, dr.width(first))
         while dr.hint(j < last, exclude=[self, group, surface, visibility]):

@@ -1,14 +1,17 @@
-"""Recovering the visibility of reduced matrices from the few entries that were traced [MSR 5, 6].
+"""Recovery of the visibility of reduced matrices from few traced entries [MSR sections 5, 6].
 
-First every entry that was not traced is predicted, column by column; then the matrix is separated into a part of low
-rank and sparse errors; and where errors lie dense, entries are traced after all.  So are, at last, those that may be
-much of the light of their row.
+1. Prediction: the remaining entries are predicted, column by column.
+2. Separation of the matrix into a low-rank part and sparse errors.
+3. Correction: entries in regions of dense errors are traced.
+4. Largest entries: predicted entries that may be a large fraction of the light of a row are traced.
 
-Departure from the paper: what is separated is visibility, V, rather than light, E V.  E needs no recovering, and makes
-the rank higher: separated light errs more than predictions (benchmarks/matrixrecovery.py).  And what is recovered is
-D − Z, not XY, so that entries in which no error was found stay what they are.  And the paper knows no last step: a
-small lamp lights what is next to it, where few of the rows of its column are, so that prediction, which goes by the
-number of rows, loses most of its light.
+Departures from the paper:
+
+- Visibility V is separated, not light E V.  E is known and raises the rank: separated light has larger errors than
+  predictions (benchmarks/matrixrecovery.py).
+- The result is D − Z, not XY: entries without an error stay unchanged.
+- Step 4 is new.  A small lamp lights few rows of its column, nearby.  Prediction minimises the number of wrong rows,
+  and so loses most of the lamp's light.
 """
 
 from __future__ import annotations
@@ -27,41 +30,42 @@ from .matrix_block import MatrixBlock
 from .separation import Separation, SeparationLimits, separate
 from .visibility_prediction import PREDICTORS, Predictors
 
-# What may be done [MSR 7.1]: the predictors to choose from, and what follows prediction
+# Optional steps [MSR section 7.1]: available predictors, then the steps after prediction
 STEPS = (*PREDICTORS, "separation", "correction", "largest")
-# Share of errors around an entry from which on it is traced; 0.2 in the paper, but errors lie denser here
+# Density of errors above which an entry is traced; 0.2 in the paper, but errors of visibility are denser
 DENSITY = 0.65
 LIMITS = SeparationLimits()
-# Share of the light of a row from which on an entry is traced; the least share of its unoccluded light that a row is
-# taken to have
-LARGE_SHARE, _LEAST_LIGHT = 0.03, 0.1
-# The Gaussian of the density of errors: 7 × 7 entries [MSR 6.2]
+# Fraction of the light of a row above which a predicted entry is traced
+LARGE_SHARE = 0.03
+# Least light assumed for a row, relative to its unoccluded light
+_LEAST_LIGHT = 0.1
+# Gaussian kernel of the density of errors: 7 × 7 entries, standard deviation in entries [MSR section 6.2]
 _TAPS, _SIGMA = 7, 1.5
-# An error counts from this fraction of the whole entry on
+# Least error that counts, relative to the unoccluded entry
 _LEAST_ERROR = 0.01
 
 
 @dataclass
 class Recovered:
-    """One block: arrays as :class:`vpl.matrix.matrix_block.MatrixBlock` lays them out, Float but for ``traced`` (Bool).
+    """Entries of a block, in the layout of :class:`vpl.matrix.matrix_block.MatrixBlock`.
 
-    ``unoccluded``: E; ``predicted``: V̄; ``traced``: entries whose V a ray found before; ``visibility``: V, recovered.
-    Where columns were separated: ``part``, the block that these make, and in its layout ``error``, Z in units
-    of whole entries, and ``density`` of errors (None without correction); ``separation``.
+    ``unoccluded``: E; ``predicted``: V̄; ``traced``: whether V was traced before prediction; ``visibility``: recovered
+    V.  With separation: ``part``, the block of the separated columns; in its layout ``error``, Z relative to the
+    unoccluded entry, and, with correction, ``density`` of errors.
     """
 
-    unoccluded: object
-    predicted: object
-    traced: object
-    visibility: object
+    unoccluded: mi.Float
+    predicted: mi.Float
+    traced: mi.Bool
+    visibility: mi.Float
     part: MatrixBlock | None = None
     separation: Separation | None = None
-    error: object = None
-    density: object = None
+    error: mi.Float | None = None
+    density: mi.Float | None = None
 
     @property
     def failed(self) -> int:
-        """Number of slices that could not be separated, so that what was in question there is traced."""
+        """Number of slices without a valid separation, in which the entries in question are traced."""
         return int(self.separation.failed.sum()) if self.separation else 0
 
 
@@ -69,11 +73,11 @@ def recover(
     block: MatrixBlock, predictors: Predictors, best: np.ndarray, first: int, steps: tuple[str, ...], seed: int,
     begin: Callable[[Stage], None] = tell,
 ) -> Recovered:  # fmt: skip
-    """Recover a block: see :class:`Recovered`.
+    """Recover the visibility of a block.
 
-    ``best``: the predictor of every column that has samples; those of the block are these from number ``first`` on.
-    ``steps``: those of STEPS that are taken; without a predictor what was not traced is taken to arrive, and correction
-    needs separation.  ``begin``: called with every stage as it begins.
+    ``best``: predictor of every sampled column; the columns of the block start at number ``first``.
+    ``steps``: subset of STEPS; without a predictor every entry that was not traced is assumed visible; correction
+    requires separation.  ``begin``: called with every stage before it.
     """
     begin(Stage.PREDICTION)
     prediction = any(step in PREDICTORS for step in steps)
@@ -93,13 +97,13 @@ def recover(
 
 
 def _trace(found: Recovered, block: MatrixBlock, wanted, seed: int) -> None:
-    """Trace the entries at some places, UInt32."""
+    """Trace the entries with the indices ``wanted``, UInt32."""
     if len(wanted):
         block.trace(found.visibility, wanted, dr.opaque(mi.UInt32, seed))
 
 
 def _largest(found: Recovered, block: MatrixBlock):
-    """Places of entries that were predicted, and may be a large share of the light of their row: UInt32."""
+    """Indices, UInt32, of predicted entries that may be a large fraction of the light of their row."""
     _, width, height = block.shape
     light, whole = _light_of_rows(found.unoccluded, found.visibility, block.shape)
     enough = LARGE_SHARE * dr.maximum(light, _LEAST_LIGHT * whole)
@@ -110,7 +114,7 @@ def _largest(found: Recovered, block: MatrixBlock):
 
 @dr.syntax
 def _light_of_rows(unoccluded, visibility, shape: tuple[int, int, int]):
-    """Sums of E V and of E over the columns, Float, evaluated: the rows of one slice after another."""
+    """Sums of E V and of E over the columns, for the rows of slice after slice: Float, evaluated."""
     slices, width, height = shape
     lane, rows = dr.arange(mi.UInt32, slices * height), dr.opaque(mi.UInt32, height)
     place = lane // rows * dr.opaque(mi.UInt32, width * height) + lane % rows
@@ -127,14 +131,16 @@ def _light_of_rows(unoccluded, visibility, shape: tuple[int, int, int]):
 
 
 def _mixed_columns(predictors: Predictors, first: int, count: int) -> np.ndarray:
-    """Columns, of ``count``, that have samples that differ: the others have nothing that could be told apart."""
+    """Columns, out of ``count``, with samples both in light and in shadow; no other column needs separation."""
     sums = (download(values)[first : first + count] for values in (predictors.in_light, predictors.in_shadow))
     return np.flatnonzero(np.minimum(*sums) > _LEAST_ERROR)
 
 
 def _separate(found: Recovered, block: MatrixBlock, mixed: np.ndarray, correction: bool, seed: int):
-    """Find and take off errors in some columns: the places to trace, UInt32, which are all of slices that failed and,
-    with ``correction``, those where errors lie dense."""
+    """Separate the columns ``mixed``, subtract errors, and return the indices of entries to trace, UInt32.
+
+    These are the entries of slices without a valid separation and, with ``correction``, of regions of dense errors.
+    """
     part = MatrixBlock(block.entries, block.columns.select(mixed), block.begin, block.begin + block.slices)
     source, present = _places(block, part, mixed)
     predicted = dr.gather(mi.Float, found.predicted, source, present)
@@ -159,7 +165,7 @@ def _separate(found: Recovered, block: MatrixBlock, mixed: np.ndarray, correctio
 
 
 def _places(block: MatrixBlock, part: MatrixBlock, columns: np.ndarray):
-    """For every entry of a block of some of the columns, its place in the whole block, and whether there is one."""
+    """For every entry of ``part``, with some columns of a block: (index in the block, whether the entry exists)."""
     source, present = dr.zeros(mi.UInt32, part.size), dr.zeros(mi.Bool, part.size)
     dr.eval(source, present)
     column, inside, _, active, place = part.lanes(np.arange(part.columns.count))
@@ -171,7 +177,7 @@ def _places(block: MatrixBlock, part: MatrixBlock, columns: np.ndarray):
 
 
 def _predicted(block: MatrixBlock, predictors: Predictors, best: np.ndarray, first: int, prediction: bool, seed: int):
-    """(V̄ of all entries, which of them were traced)."""
+    """(V̄ of every entry, whether the entry was traced)."""
     samples, height = predictors.samples, dr.opaque(mi.UInt32, block.shape[2])
     values, traced = dr.zeros(mi.Float, block.size), dr.zeros(mi.Bool, block.size)
     dr.eval(values, traced)
@@ -201,7 +207,7 @@ def _predicted(block: MatrixBlock, predictors: Predictors, best: np.ndarray, fir
 
 
 def whole_entries(unoccluded, present):
-    """Entries of the separated matrix where all arrives: of V, 1; 0 where there is no entry."""
+    """Value of fully visible entries in the separated matrix: 1 for V; 0 for padding."""
     return dr.select(present, mi.Float(1), 0)
 
 
@@ -212,7 +218,7 @@ def _of_slices(block: MatrixBlock, chosen: np.ndarray):
 
 
 def _blurred(block: MatrixBlock, values):
-    """A Gaussian over rows and columns of every matrix; nothing lies beyond their borders."""
+    """Blur every matrix by a Gaussian over rows and columns, with zeros beyond the borders."""
     offsets = np.arange(_TAPS) - _TAPS // 2
     taps = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
     taps /= taps.sum()

@@ -1,13 +1,16 @@
-"""Columns of the reduced matrices: clusters of lights for every slice, split where they may send too much [MSR 4.2].
+"""Columns of the reduced matrices: clusters of lights for every slice, split by contribution [MSR section 4.2].
 
-A slice starts with the cut of its whole box through the light trees, by upper bounds [MSR 4.2.1].  Then every cluster
-whose estimated largest contribution (equation 7) is above a share of the sum of all (equation 8) is split, until none
-is (algorithm 1): no column is to dominate its matrix.  Few rows of each column are traced for it.
+A slice starts with the light cut of its bounding box, by upper bounds [MSR section 4.2.1].  A cluster is split if its
+estimated largest contribution (equation 7) exceeds a fraction of the sum over clusters (equation 8), until no cluster
+does (algorithm 1).  No column then dominates its matrix.  The estimate traces few rows of each column.
 
-Departures from the paper: all clusters that are too large are split at once, in rounds, instead of one by one; and the
-clusters that lend their samples to one another are those next to each other along the light tree.  (Its search by
-intensity is in a supplement that is not at hand.)  And a cluster none of whose few samples is lit may be split all the
-same: had it to be lit, those whose light that stands for all happens to be in shadow would stay whole, and dark.
+Departures from the paper:
+
+- Clusters are split in rounds, several at once, instead of one by one.
+- Clusters share samples with their neighbours along the light tree.  The paper searches by intensity, by a method in a
+  supplement that was not available.
+- A cluster without a lit sample may be split, too.  Otherwise a cluster would stay whole, and dark, if its
+  representative light happens to be in shadow.
 """
 
 from __future__ import annotations
@@ -26,18 +29,18 @@ from ..points.point_clusters import PointClusters
 from .reduced_matrix import Columns, MatrixEntries
 from .visibility_samples import FirstSamples, VisibilitySamples
 
-# How far along the light tree, to either side, clusters lend their samples to each other
+# Neighbours to either side along the light tree that share samples
 _NEARBY = 2
-# Bounds that cuts of slices accept are searched for from this fraction of the mean radiance on
+# Initial error bound of the cuts of slices, relative to the mean radiance
 _START = 1e-4
 
 
 @dataclass
 class _SliceBatch:
-    """Slices as :mod:`vpl.cuts.light_cuts` sees gather points: boxes of them."""
+    """Bounding boxes of slices, with the interface of gather points in :mod:`vpl.cuts.light_cuts`."""
 
     clusters: PointClusters
-    nodes: object
+    nodes: mi.UInt32
 
     def __post_init__(self):
         self.receiver = self.clusters.gather(self.nodes).receiver
@@ -52,9 +55,9 @@ class _SliceBatch:
 
 
 def initial_columns(entries: MatrixEntries, mean: float, most: int) -> tuple[Columns, int]:
-    """At most ``most`` clusters for every slice, chosen by upper bounds [MDLC], and how many of these it took.
+    """At most ``most`` clusters for every slice by upper bounds [MDLC], and the number of evaluated bounds.
 
-    ``mean``: radiance of the image.
+    ``mean``: mean radiance of the image.
     """
     clusters = entries.rows.clusters
     slices = _SliceBatch(clusters, upload(mi.UInt32, clusters.tree.leaves))
@@ -74,10 +77,10 @@ def initial_columns(entries: MatrixEntries, mean: float, most: int) -> tuple[Col
 def split_columns(
     entries: MatrixEntries, columns: Columns, alpha: float, most: int, count: int, seed: int
 ) -> tuple[Columns, FirstSamples]:
-    """Split clusters until none may send more than ``alpha`` times the sum of what all may, and at most ``most`` are in
-    a slice [MSR algorithm 1].
+    """Split clusters until each contributes at most ``alpha`` times the sum over the slice [MSR algorithm 1].
 
-    ``count``: samples of every column.  Returns the columns whose representatives may send anything, and their samples.
+    ``most``: largest number of clusters of a slice; ``count``: samples of every column.  Returns the columns with a
+    positive unoccluded contribution, and their samples.
     """
     largest, samples = entries.largest(columns), VisibilitySamples.first(entries, columns, count, seed)
     while True:
@@ -90,7 +93,7 @@ def split_columns(
             return columns.select(lit), samples.select(lit)
         kept = np.delete(np.arange(columns.count), split)
         children, parents = _children(entries, columns, split)
-        # What was found out about a light holds for the child that keeps it
+        # The child with the representative of its parent keeps the parent's samples
         other = np.flatnonzero(children.light != columns.light[parents])
         source = np.concatenate([kept, parents])
         source[len(kept) + other] = columns.count + np.arange(len(other))
@@ -102,7 +105,7 @@ def split_columns(
 
 
 def _records(entries: MatrixEntries, columns: Columns) -> np.ndarray:
-    """The records of the nodes of all columns: see :class:`vpl.lights.light_tree.LightTree`."""
+    """Records of the nodes of columns: see :class:`vpl.lights.light_tree.LightTree`."""
     found = np.zeros((columns.count, entries.records[0].shape[1]), np.float32)
     for number, records in enumerate(entries.records):
         inside = columns.group == number
@@ -111,7 +114,7 @@ def _records(entries: MatrixEntries, columns: Columns) -> np.ndarray:
 
 
 def _children(entries: MatrixEntries, columns: Columns, split: np.ndarray):
-    """The two children of every cluster to be split, and its number among the columns."""
+    """(Children of the clusters to be split, column number of each child's parent)."""
     parts, parents = [], []
     for number, records in enumerate(entries.records):
         inside = split[columns.group[split] == number]
@@ -127,13 +130,13 @@ def _largest_contributions(columns: Columns, intensity: np.ndarray, largest: np.
     """Γ of every column [MSR equation 7], (c,) float64."""
     known, segment = values >= 0, columns.segment
     seen = _nearby(np.maximum, np.where(known, values, 0).max(1).astype(np.float64), segment)
-    # After n samples in shadow, the next one is lit with a probability of at most 1 / (n + 1)
-    doubt = 1 / (1 + _nearby(np.add, known.sum(1).astype(np.float64), segment))
-    return _nearby(np.maximum, largest, segment) * np.maximum(seen, doubt) * intensity
+    # After n samples in shadow, the next sample is lit with a probability of at most 1 / (n + 1)
+    possible = 1 / (1 + _nearby(np.add, known.sum(1).astype(np.float64), segment))
+    return _nearby(np.maximum, largest, segment) * np.maximum(seen, possible) * intensity
 
 
 def _nearby(combine: np.ufunc, values: np.ndarray, segment: np.ndarray) -> np.ndarray:
-    """The values of the neighbours of each within its segment, its own among them, combined."""
+    """Combine the value of each column with the values of its neighbours in the segment."""
     result = values.copy()
     for shift in range(1, min(_NEARBY, len(values) - 1) + 1):
         same = segment[shift:] == segment[:-shift]
@@ -143,14 +146,13 @@ def _nearby(combine: np.ufunc, values: np.ndarray, segment: np.ndarray) -> np.nd
 
 
 def _to_split(columns: Columns, inner: np.ndarray, gamma: np.ndarray, alpha: float, most: int) -> np.ndarray:
-    """Columns that are too large [MSR equation 8], and can be split without having more than ``most`` in a slice.
+    """Columns to split [MSR equation 8], the largest first, up to ``most`` columns in a slice.
 
-    ``inner``: which of them are of several lights.
+    ``inner``: mask of columns of several lights.
     """
     threshold = alpha * np.bincount(columns.piece, gamma)
     over = np.flatnonzero(inner & (gamma > threshold[columns.piece]))
     room = most - np.bincount(columns.piece)
-    # The largest of each slice first
     over = over[np.lexsort((-gamma[over], columns.piece[over]))]
     piece = columns.piece[over]
     rank = np.arange(len(over)) - np.searchsorted(piece, piece)

@@ -1,7 +1,7 @@
-"""Reduced light matrices, whose rows are pixels of a slice and whose columns are clusters of lights [MSR 3].
+"""Reduced light matrices, with a row per pixel of a slice and a column per cluster of lights [MSR section 3].
 
-An entry is E V: the unoccluded contribution of a cluster's representative to a row, times how much of it arrives.
-E is evaluated at one point of the row, V traced at a random one [MSR 7.2].
+An entry is E V: the unoccluded contribution E of a cluster's representative light to a row, times its visibility V.  E
+is evaluated at a fixed point of the row, V is traced at a random point [MSR section 7.2].
 """
 
 from __future__ import annotations
@@ -21,11 +21,13 @@ from ..transport.evaluation import Transport, probe_visibility, unoccluded
 
 
 class MatrixRows:
-    """The rows of all slices, one slice after another: ``slices`` of them, ``count`` rows.
+    """Rows of the slices, slice after slice.
 
-    ``first``: (slices + 1,) int64, where the rows of each begin; ``points``: UInt32, where the points of each row
-    begin along the tree, and the number of all points; ``shown``: UInt32, the point at which a row is shaded;
-    ``places``: two arrays, Float, where rows are in the plane of their slice, from 0 to 1.
+    - ``slices``, ``count``: numbers of slices and rows
+    - ``first``: (slices + 1,) int64, first row of each slice
+    - ``points``: UInt32, first point of each row along the tree, then the number of points
+    - ``shown``: UInt32, point at which a row is shaded
+    - ``places``: two arrays, Float, position of rows in the tangent plane of the slice, from 0 to 1
     """
 
     def __init__(self, clusters: PointClusters, pixel: np.ndarray, seed: int):
@@ -58,11 +60,11 @@ class MatrixRows:
         return first, dr.gather(mi.UInt32, self._begin, piece + 1) - first
 
     def step(self, piece):
-        """By how many rows, around the end, the samples of a column of slices follow each other."""
+        """Distance in rows, modulo the size of the slice, between successive samples of a column."""
         return dr.gather(mi.UInt32, self._step, piece)
 
     def row_of(self, point):
-        """The row of points along the tree."""
+        """Row of points along the tree."""
         return dr.gather(mi.UInt32, self._row, point)
 
     def slice_of(self, row):
@@ -70,15 +72,15 @@ class MatrixRows:
         return dr.gather(mi.UInt32, self._slice, row)
 
     def place(self, row):
-        """Places of rows in the plane of their slice, from 0 to 1: two arrays."""
+        """Position of rows in the tangent plane of the slice, from 0 to 1: two arrays."""
         return tuple(dr.gather(mi.Float, column, row) for column in self.places)
 
     def shown_surface(self, row, active=True):
-        """The surfaces at which rows are shaded."""
+        """Surfaces at which rows are shaded."""
         return self.clusters.batch.surfaces_at(dr.gather(mi.UInt32, self.shown, row, active), active)
 
     def random_surface(self, row, number, active=True):
-        """A surface of every row, drawn by two numbers."""
+        """A random surface of every row, drawn by a hash of ``row`` and ``number``."""
         first = dr.gather(mi.UInt32, self.points, row, active)
         size = dr.gather(mi.UInt32, self.points, row + 1, active) - first
         draw, _ = mi.sample_tea_32(row, number, HASH_ROUNDS)
@@ -87,9 +89,9 @@ class MatrixRows:
 
 @dataclass
 class Columns:
-    """Columns of the matrices of some slices, sorted by slice, then group of lights, then node of its tree.
+    """Columns of the matrices of some slices, sorted by slice, group of lights and tree node.
 
-    ``piece``, ``group``, ``node``, ``light``: (c,) int64: the slice, the group, the node, the light that stands for it.
+    ``piece``, ``group``, ``node``, ``light``: (c,) int64: slice, group of lights, tree node, representative light.
     """
 
     piece: np.ndarray
@@ -104,7 +106,7 @@ class Columns:
 
     @property
     def segment(self) -> np.ndarray:
-        """A number for every slice and group, (c,): columns that have the same follow each other along one tree."""
+        """A number for every slice and group, (c,): equal for the columns of a slice in one tree."""
         return self.piece * (self.group.max(initial=0) + 1) + self.group
 
     def select(self, index: np.ndarray) -> Columns:
@@ -117,26 +119,26 @@ class Columns:
         return cls(*(np.zeros(0, np.int64) for _ in range(4)))
 
     def joined(self, other: Columns) -> Columns:
-        """These columns, then others."""
+        """Concatenate columns."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return Columns(*(np.concatenate(pair) for pair in pairs))
 
     def sorted(self) -> tuple[Columns, np.ndarray]:
-        """In the order that columns have, and from where each came."""
+        """(Sorted columns, their previous indices)."""
         order = np.lexsort((self.node, self.group, self.piece))
         return self.select(order), order
 
 
 class MatrixEntries:
-    """Evaluates entries: E without rays, V with them; ``rays``: how many were traced."""
+    """Evaluates entries: E without rays, V by shadow rays; ``rays``: number of shadow rays so far."""
 
     def __init__(self, transport: Transport, rows: MatrixRows):
         self._transport, self.lights, self.rows, self.rays = transport, transport.lights, rows, 0
-        # Of the light trees, of NumPy
+        # NumPy records of the light trees
         self.records = [group.tree.records() for group in self.lights.groups]
 
     def columns_of(self, piece, group: int, node) -> Columns:
-        """Columns with the representatives of some nodes."""
+        """Columns for tree nodes, with their representative lights."""
         if not len(node):
             return Columns.none()
         tree = self.lights.groups[group].tree
@@ -144,14 +146,17 @@ class MatrixEntries:
         return Columns(piece, np.full(len(node), group), node, light)
 
     def by_group(self, columns: Columns):
-        """(Group of lights, which of the columns are in it) for every group that has any."""
+        """Yield (group of lights, indices of its columns) for every group with columns."""
         for number, group in enumerate(self.lights.groups):
             index = np.flatnonzero(columns.group == number)
             if len(index):
                 yield group, index
 
     def largest(self, columns: Columns, part: int = 32) -> np.ndarray:
-        """Of every column, the most that light of unit intensity would send to a row of its slice: (c,) float64."""
+        """Largest E over the rows of the slice, for unit intensity, of every column: (c,) float64.
+
+        ``part``: number of rows per lane.
+        """
         found = np.zeros(columns.count)
         parts = -(-self.rows.most // part)
         for group, index in self.by_group(columns):
@@ -178,15 +183,14 @@ class MatrixEntries:
         return most
 
     def trace(self, group: LightGroup, light, row, number, active=True):
-        """V at some rows: (fraction of light that arrives, where it was asked for), one per lane, evaluated.
+        """Trace V at some rows: (V, whether a ray was traced), one per lane, evaluated.
 
-        ``light``: index in the group; ``number``: draws the point of a row.  Where nothing would arrive anyway, nothing
-        is asked.
+        ``light``: index in the group; ``number``: seed for the point of a row.  Rays are traced only if E is positive.
         """
         surface = self.rows.random_surface(row, number, active)
         light = group.lights.gather(light, active)
-        passed, asked = probe_visibility(self._transport, group, surface, light, active)
+        passed, traced = probe_visibility(self._transport, group, surface, light, active)
         passed = channel_mean(passed)
-        dr.eval(passed, asked)
-        self.rays += int(dr.count(asked)[0])
-        return passed, asked
+        dr.eval(passed, traced)
+        self.rays += int(dr.count(traced)[0])
+        return passed, traced

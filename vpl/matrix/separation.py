@@ -1,10 +1,10 @@
-"""Separating matrices into a part of low rank and sparse errors, many of them at once [MSR 6].
+"""Separation of a batch of matrices into a low-rank part and sparse errors [MSR section 6].
 
-D = XY + Z with as small a sum of |Z| as can be [MSR equation 11], by alternating directions of an augmented Lagrangian
-[SWZ]: X and Y by least squares, Z by shrinking, multipliers by what is left over.  Z is known to be 0 where entries
-were traced.  Elsewhere an entry is either right or wrong altogether, which is relaxed to the sphere of equation 12.
+Minimises the sum of |Z| in D = XY + Z [MSR equation 11] by alternating directions of an augmented Lagrangian [SWZ]: X
+and Y by least squares, Z by shrinkage, multipliers by the residual.  Z is 0 for traced entries.  Any other entry is
+either right or wrong, a constraint that is relaxed to the sphere of equation 12.
 
-Products of matrices are NumPy's (BLAS), all that goes entry by entry is one kernel for all matrices.
+NumPy (BLAS) multiplies matrices.  One kernel per step updates the entries of every matrix.
 
 [SWZ] Shen, Wen and Zhang 2014, Augmented Lagrangian alternating direction method for matrix separation based on
 low-rank factorization.  [HMT] Halko, Martinsson and Tropp 2011, Finding structure with randomness.
@@ -16,6 +16,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from threading import Lock
 
 import drjit as dr
 import mitsuba as mi
@@ -24,20 +25,22 @@ from threadpoolctl import threadpool_limits
 
 from ..core.arrays import download, upload
 
-# Step of the multipliers, in units of the penalty; [SWZ] allows up to 1.6, which errs more here
+# Step of the multipliers, in units of the penalty; [SWZ] allows up to 1.6, with larger errors here
 _STEP = 1.0
-# So many times further from D than after the first iteration, a separation has failed
+# Growth of the residual since the first iteration above which a separation has failed
 _DIVERGED = 2.0
-# Columns that a sketch has beyond the largest rank [HMT]
+# Columns of a sketch in excess of the largest rank [HMT]
 _OVERSAMPLING = 8
+# Held while BLAS is limited to one thread: the limit belongs to the process, and its end restores the previous one
+_BLAS_LIMIT = Lock()
 
 
 @dataclass(frozen=True)
 class SeparationLimits:
-    """When to stop: after ``iterations``, once a matrix is explained but for ``residual`` of its norm, or once that
-    falls by less than the fraction ``progress`` in an iteration.
+    """Stops after ``iterations``, at a relative residual of at most ``residual``, or if the residual decreases by less
+    than the fraction ``progress`` in an iteration.
 
-    ``rank``: the largest; ``relative``: singular values below this fraction of the largest one are not counted.
+    ``rank``: largest rank; ``relative``: least singular value that counts, relative to the largest.
     """
 
     iterations: int = 20
@@ -49,42 +52,46 @@ class SeparationLimits:
 
 @dataclass
 class Separation:
-    """``error``: Z, Float, in the layout of D.  Of every matrix, of NumPy: ``rank``, ``iterations``, ``failed`` (bool:
-    not finite, or much further from D than it was at first), ``residual``: ‖XY + Z − D‖ / ‖D‖ after each iteration, a
-    list.
+    """``error``: Z, in the layout of D.  Per matrix: ``rank``, ``iterations``, ``failed`` (not finite, or diverged).
+    ``residual``: list of ‖XY + Z − D‖ / ‖D‖ of the matrices after each iteration.
     """
 
-    error: object
+    error: mi.Float
     rank: np.ndarray
     iterations: np.ndarray
     failed: np.ndarray
-    residual: list
+    residual: list[np.ndarray]
 
 
 @contextmanager
 def _one_core_each():
-    """A function that does some work for each of some numbers: one matrix to a core, rather than all cores to a matrix,
-    which is too small for that.  Threads of BLAS that wait for each other cost tenfold on a busy machine."""
+    """Function that calls ``work`` for each of some numbers, in parallel, with BLAS limited to one thread.
+
+    Matrices are too small for several threads each: BLAS threads that wait for each other cost ten times as much on a
+    busy machine.  A second thread waits until the first leaves the block.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(cores) as pool:
+    with _BLAS_LIMIT, threadpool_limits(1, "blas"), ThreadPoolExecutor(cores) as pool:
         yield lambda work, numbers: list(pool.map(work, numbers))
 
 
 def sketch(matrix: np.ndarray, test: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Leading singular values of a matrix (n, m), (r,), and right singular vectors times these, (r, m), by its product
-    with a random matrix, (m, r) [HMT]."""
+    """Leading singular values of a matrix (n, m), (r,), and right singular vectors times singular values, (r, m).
+
+    ``test``: random matrix, (m, r) [HMT].
+    """
     basis, _ = np.linalg.qr(matrix @ test)
     part = basis.T @ matrix
-    # The squares of r × r are as good where values far below the largest do not count
+    # The r × r Gram matrix is accurate enough, since singular values far below the largest do not count
     squares, vectors = np.linalg.eigh(part @ part.T)
     return np.sqrt(np.maximum(squares[::-1], 0)), vectors[:, ::-1].T @ part
 
 
 def separate(whole, free, weight, shape: tuple[int, int, int], limits: SeparationLimits, seed: int = 0) -> Separation:
-    """Separate matrices of one size.
+    """Separate s matrices of size n × m, stored one after another; ``shape``: (s, n, m).
 
-    whole: D, Float, of s matrices of n × m, one after another, evaluated; what pads them is 0.  free: Bool, where
-    entries may be wrong.  weight: Float, what an entry would be if all arrived, E; an error is 0 or the whole of it.
+    whole: D, Float, evaluated; padding is 0.  free: Bool, entries that may be wrong.  weight: Float, value of fully
+    visible entries; an error is 0 or ± the weight.
     """
     count, n, m = shape
     state = _State(whole, free, weight, shape)
@@ -92,18 +99,18 @@ def separate(whole, free, weight, shape: tuple[int, int, int], limits: Separatio
     width = min(limits.rank + _OVERSAMPLING, n, m)
     test = np.random.default_rng(seed).standard_normal((m, width)).astype(np.float32)
     norm = np.sqrt(np.square(matrices).sum((1, 2), dtype=np.float64))
-    # What is zero altogether has no errors
+    # Matrices of zeros have no errors
     active = np.flatnonzero(np.isfinite(norm) & (norm > 0))
     rank, right, product = np.zeros(count, np.int64), [np.zeros((0, m))] * count, np.zeros(shape, np.float32)
 
     def begin(number):
-        """The rank of a matrix, and Y."""
+        """Initialise the rank of a matrix, and Y."""
         values, vectors = sketch(matrices[number], test)
         rank[number] = np.clip((values > limits.relative * values[0]).sum(), 1, limits.rank)
         right[number] = vectors[: rank[number]]
 
     def fit(number):
-        """X, then Y, for what XY is to be now."""
+        """Update X, then Y, by least squares."""
         left, _ = np.linalg.qr(target[number] @ right[number].T)
         right[number] = left.T @ target[number]
         np.matmul(left, right[number], out=product[number])
@@ -129,7 +136,7 @@ def separate(whole, free, weight, shape: tuple[int, int, int], limits: Separatio
 
 
 class _State:
-    """Z and the multipliers of all matrices, which each step changes for those that are still active."""
+    """Z and the multipliers of the matrices.  A step changes only active matrices."""
 
     def __init__(self, whole, free, weight, shape):
         self._whole, self._free, self._weight, self._shape = whole, free, weight, shape
@@ -139,23 +146,23 @@ class _State:
         rows = [dr.block_sum(values, shape[2]) for values in (dr.abs(whole), *ones)]
         dr.eval(rows)
         total, entries, self._number = (self._per_matrix(sums) for sums in rows)
-        # The penalty makes entries shrink by the mean entry [SWZ]
+        # By the choice of the penalty, entries shrink by the mean entry [SWZ]
         self._threshold = np.divide(total, entries, out=np.zeros(len(total)), where=entries > 0)
         self._target = mi.Float(whole)
 
     def _per_matrix(self, sums) -> np.ndarray:
-        """Sums over each matrix, (s,) float64, from those over its rows."""
+        """Sum over each matrix, (s,) float64, from sums over rows."""
         return download(sums).reshape(self._shape[:2]).sum(1, dtype=np.float64)
 
     def _loose(self):
         return self._free & (self._weight > 0)
 
     def target(self) -> np.ndarray:
-        """Matrices that XY is fitted to: D − Z less the multipliers, (s, n, m)."""
+        """Target of XY: D − Z minus the multipliers, (s, n, m)."""
         return download(self._target).reshape(self._shape)
 
     def step(self, product, active: np.ndarray) -> np.ndarray:
-        """Z and multipliers for a new XY; norms of what is left over, per matrix."""
+        """Update Z and the multipliers for a new XY; return the norm of the residual per matrix."""
         count, n, m = self._shape
         live = np.zeros(count, np.float32)
         live[active] = 1
@@ -180,11 +187,11 @@ class _State:
         return np.sqrt(self._per_matrix(left))
 
     def _sign(self):
-        """An entry that was taken to arrive is too large if it is wrong, the others too small."""
+        """Sign of a possible error: a wrong entry is too large if predicted visible, otherwise too small."""
         return dr.select(self._whole > 0.5 * self._weight, mi.Float(1), -1)
 
     def _normalized(self, product, threshold):
-        """H [MSR equation 12] of the shrunk errors: −1 where an entry is right, 1 where it is wrong."""
+        """H [MSR equation 12] of the shrunk errors: −1 for right entries, 1 for wrong entries."""
         rest = self._whole - product - self._multiplier
         shrunk = dr.maximum(self._sign() * rest - threshold, 0)
         weight = dr.select(self._weight > 0, self._weight, 1)

@@ -1,13 +1,16 @@
-"""Lights that light a slice: columns of the light matrix, clustered for all slices together, then for each [LS].
+"""Lights of each slice: columns of the light matrix, clustered for the image, then refined for the slice [LS].
 
-First some rows of the matrix are sampled at clusters of lights that are as small as can be afforded, and of those only
-the clusters that matter for the image are kept apart: the columns that all slices share.  Then each slice gets a row of
-these, sampled at one of its points.  The rows of a slice and of its nearest neighbours tell which columns it can join.
+Global clustering samples a few rows of the matrix at many small clusters of lights, and joins clusters with little
+effect on the image.  The remaining clusters are the shared columns.  Refinement samples one row of the shared columns
+per slice.  The rows of a slice and of its nearest neighbours decide the columns that are joined for the slice.
 
-Departures from the paper: clusters are nodes of the light trees, the costliest (:mod:`vpl.matrix.light_matrix`) split
-first; the paper divides columns by where they project on a line.  A light is drawn for each cluster by norm, and counts
-with its own colour: the paper's ratios of norms, channel by channel, are biased where the colours of a cluster differ.
-And no light is lost for not having been seen: weights have a share of upper bounds.
+Departures from the paper:
+
+- Clusters are nodes of the light trees, split in order of cost (:mod:`vpl.matrix.light_matrix`).  The paper splits
+  columns by their projections on a line.
+- The representative light of a cluster is drawn by norm and keeps its colour.  The paper scales colours by ratios of
+  norms per channel, which is biased for clusters of different colours.
+- Weights include a fraction of upper bounds, so that lights hidden from the sampled rows are not lost.
 """
 
 from __future__ import annotations
@@ -28,41 +31,41 @@ from ..transport.evaluation import Transport
 from .column_forest import ColumnForest, split_threshold
 from .light_matrix import ColumnWeights, DeviceForest, NearRows, SampledRows
 
-# For each column that all slices share: clusters that were compared; and of all slices, those whose rows decided
-_FINE, _DECIDING = 8, 1 / 8
-# How much bounds decide there: with 0.1 errors were a tenth larger (cornell)
+# Global clustering: number of small clusters per shared column; fraction of the slices with a sampled row
+_FINE, _SAMPLED_SLICES = 8, 1 / 8
+# Weight of upper bounds in the global clustering; 0.1 increased errors by a tenth (cornell)
 _SHARED_UNSEEN = 0.01
 
 
 @dataclass
 class SliceLights:
-    """Lights of one group that light slices: those of slice s in set r are ``first[r * slices + s]`` up to ``last``.
+    """Lights of one group that represent the clusters of slices.
 
-    ``light``: index in the group, ``scale``: the factor on its intensity.
+    Slice s in set r has the lights ``first[i]`` to ``last[i]`` - 1, with i = r · slices + s.  ``light``: index in the
+    group; ``scale``: factor on the intensity.
     """
 
     group: LightGroup
-    first: object
-    last: object
-    light: object
-    scale: object
+    first: mi.UInt32
+    last: mi.UInt32
+    light: mi.UInt32
+    scale: mi.Float
 
     def picker(self, entry, sets: int, count: int):
-        """A function from places to ``count`` candidates: the light in that place, and those that stand for the same
-        cluster in other ones of the ``sets``.
+        """Function from the index of a light to ``count`` candidates: the light, and its counterparts in other sets.
 
-        ``entry``: UInt32, the list of lights of each lane, r · slices + s.
+        ``entry``: list of lights of each lane, r · slices + s, UInt32; ``sets``: number of sets.
         """
         slices, places = (dr.opaque(mi.UInt32, dr.width(values) // sets) for values in (self.first, self.light))
         own, shifts = entry // slices, []
         for k in range(1, count):
             other = (own + dr.opaque(mi.UInt32, k * sets // count)) % dr.opaque(mi.UInt32, sets)
-            # Differences of places wrap around, as their sums do
+            # Differences of UInt32 wrap around, and so do the sums below
             shifts.append((other - own) * places)
         dr.eval(shifts)
 
         def candidates(j):
-            """Lights and their scales."""
+            """Candidate lights, and scales."""
             return [
                 (self.group.lights.gather(dr.gather(mi.UInt32, self.light, at)), dr.gather(mi.Float, self.scale, at))
                 for at in [j, *(j + shift for shift in shifts)]
@@ -72,7 +75,7 @@ class SliceLights:
 
 
 def fine_forest(lights: LightSet, most: int) -> ColumnForest:
-    """The largest clusters of lights by size alone: about ``most``, shared out to the groups by number of lights."""
+    """About ``most`` clusters, by splitting the largest: each group gets a number proportional to its lights."""
     parts = []
     for number, group in enumerate(lights.groups):
         records = group.tree.records()
@@ -84,15 +87,15 @@ def fine_forest(lights: LightSet, most: int) -> ColumnForest:
 def shared_columns(
     transport: Transport, clusters: PointClusters, points: np.ndarray, most: int, seed: int
 ) -> tuple[ColumnForest, int, int]:
-    """At most ``most`` clusters of lights that all slices share [LS: global clustering], rays and bounds spent on them.
+    """Shared columns by global clustering [LS]: (at most ``most`` columns, shadow rays, evaluated bounds).
 
-    ``points``: one of each slice, along the slices; at some of them, drawn at random, rows are sampled.
+    ``points``: a point of each slice; rows are sampled at random points among these.
     """
     fine = fine_forest(transport.lights, _FINE * most)
     if len(fine.columns) <= most:
         return fine, 0, 0
     forest = DeviceForest(fine, transport.lights)
-    points = np.random.default_rng(seed).permutation(points)[: max(round(_DECIDING * len(points)), 1)]
+    points = np.random.default_rng(seed).permutation(points)[: max(round(_SAMPLED_SLICES * len(points)), 1)]
     rows = SampledRows(transport, clusters.batch, forest, points)
     rows.balance()
     weights = ColumnWeights(rows, NearRows.all_of(rows.count), clusters, dr.zeros(mi.UInt32, 1), _SHARED_UNSEEN)
@@ -100,7 +103,7 @@ def shared_columns(
 
 
 def slice_places(clusters: PointClusters) -> np.ndarray:
-    """Places of slices, and where they face, as :func:`vpl.points.slices.six_dimensional` has it: (slices, 6)."""
+    """Positions and normals of slices in the space of :func:`vpl.points.slices.six_dimensional`: (slices, 6)."""
     receiver = clusters.gather(upload(mi.UInt32, clusters.tree.leaves)).receiver
     return six_dimensional(download(receiver.position), download(receiver.normal))
 
@@ -108,9 +111,9 @@ def slice_places(clusters: PointClusters) -> np.ndarray:
 def slice_lights(
     rows: SampledRows, near: NearRows, clusters: PointClusters, columns: int, unseen: float, sets: int, seed: int
 ) -> list[SliceLights]:
-    """At most ``columns`` lights for each slice and set, but one of each kind at least; one entry for every kind.
+    """At most ``columns`` lights for each slice and set, at least one per group of lights; a list entry per group.
 
-    ``rows``: one for each slice, ``near``: which of them tell about each; ``unseen``: see :class:`ColumnWeights`.
+    ``rows``: one per slice; ``near``: rows near each slice; ``unseen``: see :class:`ColumnWeights`.
     """
     forest, leaves = rows.forest, upload(mi.UInt32, clusters.tree.leaves)
     columns = min(columns, forest.columns)
@@ -124,10 +127,10 @@ def slice_lights(
 
 
 class _Chosen:
-    """Clusters of all slices, ``most`` places for each, and the column that stands for them in every set.
+    """Clusters of slices, in up to ``most`` slots each, and their representative columns in every set.
 
-    ``node``: of the forest; ``used``: how many places of a slice are; ``column``, ``scale``: set by set, the column
-    that was drawn and one over its probability.
+    ``node``: forest node of each slot; ``used``: number of used slots per slice; ``column``, ``scale``: drawn column
+    and inverse probability of each slot, set by set.
     """
 
     def __init__(self, slices: int, most: int, sets: int):
@@ -137,7 +140,7 @@ class _Chosen:
         dr.eval(self.node, self.used, self.column, self.scale)
 
     def choose(self, forest: DeviceForest, weights: ColumnWeights, columns: int, first: int) -> None:
-        """The clusters of some consecutive slices from ``first`` on: what costs more than fits is split."""
+        """Choose the clusters of consecutive slices from ``first`` on: the costliest clusters are split."""
         cost = download(weights.cost).reshape(weights.groups, -1)
         splits = columns - len(forest.forest.roots)
         threshold = split_threshold(cost[:, forest.forest.inner], splits)
@@ -145,7 +148,7 @@ class _Chosen:
 
     @dr.syntax
     def _walk(self, forest: DeviceForest, weights: ColumnWeights, threshold, first: int):
-        """From the roots down, split what costs more than the threshold; leave out what has no weight."""
+        """Descend from the roots, split nodes above the cost threshold, and leave out nodes without weight."""
         lane, size = dr.arange(mi.UInt32, weights.groups), dr.opaque(mi.UInt32, forest.size)
         piece = lane + dr.opaque(mi.UInt32, first)
         start = piece * dr.opaque(mi.UInt32, self.most)
@@ -161,7 +164,7 @@ class _Chosen:
         dr.eval(self.node, self.used)
 
     def draw_columns(self, forest: DeviceForest, weights: ColumnWeights, first: int, seed: int) -> None:
-        """A column of every cluster of some consecutive slices in each set, drawn by weight."""
+        """Draw a column of every cluster by weight, in each set, for consecutive slices from ``first`` on."""
         count, most, sums = weights.groups * self.most, dr.opaque(mi.UInt32, self.most), weights.cumulative
         for begin, end in even_chunks(self.sets, count):
             lane = dr.arange(mi.UInt32, (end - begin) * count)
@@ -179,19 +182,19 @@ class _Chosen:
             )
             target = place + (number + dr.opaque(mi.UInt32, begin)) * dr.opaque(mi.UInt32, self.places)
             dr.scatter(self.column, chosen - start, target, active)
-            # Rounding may pick a column without weight, where nothing arrives
+            # Rounding may draw a column without weight, and so without light
             dr.scatter(self.scale, mi.Float(dr.select(own > 0, whole / own, 0)), target, active)
             dr.eval(self.column, self.scale)
 
     def lights(self, forest: DeviceForest, seed: int) -> list[SliceLights]:
-        """For every group of lights: of each column that was drawn, a light by intensity."""
+        """Draw a light of each drawn column by intensity, for every group of lights."""
         used = np.arange(self.most) < download(self.used)[:, None]
         group = forest.forest.group[download(self.node)].reshape(used.shape)
         light, found = dr.zeros(mi.UInt32, len(self.column)), []
         dr.eval(light)
         begin, shift = np.arange(self.slices) * self.most, np.arange(self.sets)[:, None] * self.places
         for number, one in enumerate(forest.lights.groups):
-            # The clusters of a slice stand in the order of the groups
+            # The clusters of a slice are sorted by group
             end = begin + (used & (group == number)).sum(1)
             first, last = (upload(mi.UInt32, ends + shift) for ends in (begin, end))
             for low, high in even_chunks(self.sets, self.places):
@@ -201,7 +204,7 @@ class _Chosen:
         return found
 
     def _draw_lights(self, forest: DeviceForest, group: LightGroup, first, last, light, sets: tuple, seed: int) -> None:
-        """Replace the columns of a group by lights, and the factors by those on the intensities of these."""
+        """Replace the columns of a group by lights, and ``scale`` by factors on the intensities of these lights."""
         lane = dr.arange(mi.UInt32, (sets[1] - sets[0]) * self.places) + dr.opaque(mi.UInt32, sets[0] * self.places)
         piece = lane // dr.opaque(mi.UInt32, self.most)
         active = (lane >= dr.gather(mi.UInt32, first, piece)) & (lane < dr.gather(mi.UInt32, last, piece))
@@ -218,9 +221,9 @@ class _Chosen:
 
 @dr.syntax
 def _drawn_lights(tree: DeviceTree, nodes, sample, active=True):
-    """A light of each node, drawn by intensity, and the intensity of the node.
+    """(Light of each node, drawn by intensity; intensity of the node).
 
-    ``sample``: in double precision, for every level of the tree takes its part of it.
+    ``sample``: uniform number in double precision, because every level of the tree consumes some of its bits.
     """
     precise = type(sample)
     node, sample, end = mi.UInt32(nodes), precise(sample), tree.escape(nodes, active)

@@ -1,11 +1,14 @@
-"""Predicting the visibility of rows from those that were traced, column by column [MSR 5].
+"""Prediction of the visibility of rows from traced rows, column by column [MSR section 5].
 
-Three predictors know a column: by the nearest rows, by a line between light and shadow, and by what nearby columns and
-the same row show.  Each column is sampled until one of them errs on few enough of the new samples [MSR algorithm 2].
+A column has three predictors: by the nearest rows, by a linear boundary between light and shadow, and by Bayes' rule
+from nearby columns and the same row.  A column is sampled until a predictor has a small enough error on new samples
+[MSR algorithm 2].
 
-Departures from the paper: nearest rows are found by looking at all samples of the column, which are tens, instead of
-along shifted Hilbert curves; the line lies in the plane of the slice, and its slope counts half (equation 10 would be
-certain of light where 3 of 4 samples are lit).
+Departures from the paper:
+
+- Nearest rows are found by exhaustive search in the tens of samples of a column, not along shifted Hilbert curves.
+- The linear boundary lies in the tangent plane of the slice, and its slope counts half: equation 10 would be certain of
+  light if 3 of 4 samples are lit.
 """
 
 from __future__ import annotations
@@ -20,19 +23,19 @@ from .visibility_samples import NO_ROW, VisibilitySamples
 
 NEAREST, LINEAR, BAYES = range(3)
 PREDICTORS = {"nearest": NEAREST, "linear": LINEAR, "bayes": BAYES}
-# Columns to either side along the light tree that the Bayes predictor looks at: five with its own [MSR 5.1]
+# Columns to either side along the light tree for the Bayes predictor: five in total [MSR section 5.1]
 _BESIDE = 2
-# Samples that each class of visibility is taken to have had before any was seen
+# Imaginary prior samples of each class of visibility
 _PRIOR = 0.1
-# How much the least squares of the line are held back where samples do not span the plane
+# Ridge of the least squares per sample, for samples that do not span the plane
 _RIDGE = 1e-3
 
 
 class Predictors:
-    """The three predictors of some columns, as their samples are now.
+    """Predictors of some columns, learned from the present samples.
 
-    ``kinds``: which of them may be used; ``in_light``, ``in_shadow``: Float, the sums of V and 1 − V over the samples
-    of each column.
+    ``kinds``: available predictors; ``in_light``, ``in_shadow``: Float, sums of V and 1 − V over the samples of each
+    column.
     """
 
     def __init__(self, samples: VisibilitySamples, kinds: tuple[int, ...] = (NEAREST, LINEAR, BAYES)):
@@ -50,7 +53,7 @@ class Predictors:
         self.learn(number)
 
     def learn(self, index: np.ndarray) -> None:
-        """Take the present samples of some columns into account."""
+        """Update the predictors of some columns from the present samples."""
         column = upload(mi.UInt32, index)
         line, lit, number = self._fit(column)
         for target, value in zip(self._line, line, strict=True):
@@ -60,14 +63,14 @@ class Predictors:
         dr.eval(self._line, self.in_light, self.in_shadow)
 
     def predict(self, kind: int, column, row, draw):
-        """V of some rows of some columns, Float: 0 or 1, or between where it was traced so.
+        """Predict V of some rows of some columns, Float: 0 or 1, or the traced value of a nearest row.
 
-        ``row``: within the slice; ``draw``: uniform numbers, for predictors answer with probabilities.
+        ``row``: within the slice; ``draw``: uniform number that turns a probability into V.
         """
         if kind == NEAREST:
             return self._of_nearest(column, row, draw)
-        likely = self._by_line(column, row) if kind == LINEAR else self._by_bayes(column, row)
-        return dr.select(draw < likely, mi.Float(1), 0)
+        lit = self._by_line(column, row) if kind == LINEAR else self._by_bayes(column, row)
+        return dr.select(draw < lit, mi.Float(1), 0)
 
     def _place(self, column, row):
         first, _ = self.samples.entries.rows.range(dr.gather(mi.UInt32, self._piece, column))
@@ -75,29 +78,30 @@ class Predictors:
 
     @dr.syntax
     def _of_nearest(self, column, row, draw):
-        """V of one of the three nearest samples, drawn evenly; of rows without any, 1."""
+        """V of one of the three nearest samples, drawn uniformly [MSR section 5.1]; 1 without samples."""
         begin = column * dr.opaque(mi.UInt32, self.samples.most)
         count, k = dr.gather(mi.UInt32, self.samples.number, column), mi.UInt32(0)
         x, y = self._place(column, row)
-        first, second, third = (dr.full(mi.Float, np.inf, dr.width(column)) for _ in range(3))
-        one, two, three = (dr.full(mi.Float, 1, dr.width(column)) for _ in range(3))
+        # Squared distances and V of the nearest samples so far
+        distance1, distance2, distance3 = (dr.full(mi.Float, np.inf, dr.width(column)) for _ in range(3))
+        value1, value2, value3 = (dr.full(mi.Float, 1, dr.width(column)) for _ in range(3))
         while dr.hint(k < count, exclude=[self, begin, x, y]):
             value = dr.gather(mi.Float, self.samples.value, begin + k)
             u, v = (dr.gather(mi.Float, side, begin + k) for side in (self.samples.x, self.samples.y))
             distance = dr.square(u - x) + dr.square(v - y)
-            beats_first, beats_second, beats_third = distance < first, distance < second, distance < third
-            three = dr.select(beats_second, two, dr.select(beats_third, value, three))
-            third = dr.select(beats_second, second, dr.select(beats_third, distance, third))
-            two = dr.select(beats_first, one, dr.select(beats_second, value, two))
-            second = dr.select(beats_first, first, dr.select(beats_second, distance, second))
-            one, first = dr.select(beats_first, value, one), dr.minimum(first, distance)
+            first, second, third = distance < distance1, distance < distance2, distance < distance3
+            value3 = dr.select(second, value2, dr.select(third, value, value3))
+            distance3 = dr.select(second, distance2, dr.select(third, distance, distance3))
+            value2 = dr.select(first, value1, dr.select(second, value, value2))
+            distance2 = dr.select(first, distance1, dr.select(second, distance, distance2))
+            value1, distance1 = dr.select(first, value, value1), dr.minimum(distance1, distance)
             k += 1
-        share = draw * mi.Float(dr.minimum(count, 3))
-        return dr.select(share < 1, one, dr.select(share < 2, two, three))
+        rank = draw * mi.Float(dr.minimum(count, 3))
+        return dr.select(rank < 1, value1, dr.select(rank < 2, value2, value3))
 
     @dr.syntax
     def _fit(self, column):
-        """(Three coefficients of the line, sum of V, number) of the samples of columns [MSR equation 9]."""
+        """(Three coefficients of the linear boundary, sum of V, number of samples) of columns [MSR equation 9]."""
         begin = column * dr.opaque(mi.UInt32, self.samples.most)
         count, k = dr.gather(mi.UInt32, self.samples.number, column), mi.UInt32(0)
         matrix, right = (dr.zeros(kind, dr.width(column)) for kind in (mi.Matrix3f, mi.Vector3f))
@@ -115,9 +119,9 @@ class Predictors:
         return list(line), lit, count
 
     def _by_line(self, column, row):
-        """Probability that light arrives [MSR equation 10].
+        """Probability of light by the linear boundary [MSR equation 10].
 
-        The line was fitted to −1 and 1, so its slope counts half: where all samples agree, it is certain.
+        The function is fitted to −1 and 1 and counts half: the prediction is certain if the samples agree.
         """
         x, y = self._place(column, row)
         a, b, c = (dr.gather(mi.Float, values, column) for values in self._line)
@@ -125,7 +129,7 @@ class Predictors:
 
     @dr.syntax
     def _by_bayes(self, column, row):
-        """Probability that light arrives, from the samples of nearby columns: all of them, and those in this row."""
+        """Probability of light by Bayes' rule [MSR section 5.1], from samples of nearby columns and of the same row."""
         j, end = dr.gather(mi.UInt32, self._first, column), dr.gather(mi.UInt32, self._last, column)
         width = dr.width(column)
         light, shadow, row_light, row_shadow = (dr.full(mi.Float, _PRIOR, width) for _ in range(4))
@@ -138,7 +142,7 @@ class Predictors:
             j += 1
         _, rows = self.samples.entries.rows.range(dr.gather(mi.UInt32, self._piece, column))
         prior = _PRIOR * mi.Float(rows)
-        # P(v) P(i | v), and what both share left out
+        # P(v) P(i | v), up to a common factor
         odds_light, odds_shadow = light * row_light / (light + prior), shadow * row_shadow / (shadow + prior)
         return odds_light / (odds_light + odds_shadow)
 
@@ -146,9 +150,9 @@ class Predictors:
 def predict_columns(
     samples: VisibilitySamples, kinds: tuple[int, ...], count: int, error: float, rounds: int, seed: int
 ):
-    """Sample columns until a predictor errs on less than ``error`` of ``count`` new samples, or after ``rounds``.
+    """Sample columns until a predictor's error on ``count`` new samples is below ``error``, or for ``rounds`` rounds.
 
-    Returns (the predictors, the best one of every column, (c,)).
+    Returns (predictors, kind of the best predictor of every column, (c,)).
     """
     predictors, columns = Predictors(samples, kinds), samples.columns.count
     best, errors = np.zeros(columns, np.int64), np.zeros((columns, len(kinds)))
@@ -158,15 +162,16 @@ def predict_columns(
             break
         wrong, tested = _validate(predictors, active, count, derived_seed(seed, 2, number))
         errors[active] += wrong
-        # Of those that err as little now, the one that did before
+        # Earlier rounds break ties
         best[active] = (wrong + 1e-3 * errors[active]).argmin(1)
         predictors.learn(active)
+        # Without an error a column is done, even for ``error`` 0 or without samples
         active = active[wrong.min(1) >= np.maximum(error * tested, 1e-9)]
     return predictors, np.asarray(kinds)[best]
 
 
 def _validate(predictors: Predictors, index: np.ndarray, count: int, seed: int):
-    """Draw new samples and predict them before they are known: (errors of each predictor, (c, k), number, (c,))."""
+    """Predict new samples, then trace them: (error of each predictor, (c, k), number of samples, (c,))."""
     samples = predictors.samples
     rows = samples.draw(index, count)
     lane = dr.arange(mi.UInt32, len(index) * count)

@@ -1,7 +1,7 @@
-"""Samples of the visibility of some columns: rows that were traced, as lists and as bits.
+"""Samples of the visibility of columns: traced rows, in lists and bit masks.
 
-Only rows where light would arrive are traced.  They follow each other by steps of the golden ratio along the curve
-through all rows of the slice, which never leave a large gap, from a start that depends on the slice and the light.
+Only rows with a positive unoccluded contribution are traced.  Their order is a golden-ratio sequence along the
+space-filling curve through the rows of the slice, without large gaps.  Its start is a hash of slice and light.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from ..lights.light_set import LightGroup
 from ..transport.evaluation import unoccluded
 from .reduced_matrix import Columns, MatrixEntries
 
-_WORD = 32
-# In place of a row where a column has no more of them
+_WORD = 32  # bits of a word of the masks
+# Marks the end of a column's rows
 NO_ROW = 0xFFFFFFFF
 
 
 @dataclass
 class FirstSamples:
-    """Samples of some columns: ``rows`` and ``values``, (c, count), value -1 where there are no more; and at which step
-    of their sequence columns go on, ``following`` (c,)."""
+    """Samples of c columns: ``rows`` and ``values``, (c, count), with value -1 after the last sample; ``following``,
+    (c,): next step of the sequence of each column."""
 
     rows: np.ndarray
     values: np.ndarray
     following: np.ndarray
 
     def select(self, index) -> FirstSamples:
-        """Samples of some of the columns."""
+        """Select columns."""
         return FirstSamples(self.rows[index], self.values[index], self.following[index])
 
     def joined(self, other: FirstSamples) -> FirstSamples:
-        """Samples of these columns, then those of others."""
+        """Concatenate columns."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return FirstSamples(*(np.concatenate(pair) for pair in pairs))
 
 
 class VisibilitySamples:
-    """Samples of some columns, at most ``most`` of each.
+    """Samples of columns, at most ``most`` of each.
 
-    ``columns``: sorted; ``number``: UInt32, how many samples each has; sample k of column c stands at c · most + k of
-    ``row``, UInt32, the row within the slice, ``x`` and ``y``, Float, its place in the slice's plane, and ``value``,
-    Float, the fraction of light that arrives.
+    ``columns``: sorted; ``number``: UInt32, number of samples of each column.  Sample k of column c has the index
+    c · most + k in ``row``: UInt32, row within the slice; ``x``, ``y``: Float, position in the slice's tangent plane;
+    ``value``: Float, V.
     """
 
     def __init__(self, entries: MatrixEntries, columns: Columns, most: int, seed: int):
@@ -62,7 +62,7 @@ class VisibilitySamples:
 
     @classmethod
     def first(cls, entries: MatrixEntries, columns: Columns, count: int, seed: int) -> FirstSamples:
-        """The first ``count`` samples of columns."""
+        """Take the first ``count`` samples of columns."""
         if not columns.count:
             return FirstSamples(
                 np.zeros((0, count), np.uint32), np.zeros((0, count), np.float32), np.zeros(0, np.uint32)
@@ -75,14 +75,14 @@ class VisibilitySamples:
         return FirstSamples(*found, download(samples._next))
 
     def resume(self, first: FirstSamples) -> None:
-        """Begin with samples that were taken before."""
+        """Start from samples taken before."""
         self._next = upload(mi.UInt32, first.following)
         count = first.rows.shape[1]
         rows, values = upload(mi.UInt32, first.rows), upload(mi.Float, first.values)
         self._remember(dr.arange(mi.UInt32, self.columns.count), rows, values, count)
 
     def draw(self, index: np.ndarray, count: int):
-        """The next ``count`` rows of some columns, UInt32, column by column; NO_ROW where there are no more."""
+        """Next ``count`` rows of some columns, UInt32, column by column; NO_ROW after the last row."""
         found = dr.full(mi.UInt32, NO_ROW, len(index) * count)
         dr.eval(found)
         for group, inside in self.entries.by_group(self.columns.select(index)):
@@ -96,7 +96,7 @@ class VisibilitySamples:
         light, step = group.lights.gather(number), self.entries.rows.step(piece)
         first, rows = self.entries.rows.range(piece)
         start, _ = mi.sample_tea_32(number, piece ^ dr.opaque(mi.UInt32, self._seed), HASH_ROUNDS)
-        # The lanes that fill a kernel's last packet divide too, and find zeros
+        # Padding lanes of the last packet divide, too, and read zeros
         divisor = dr.maximum(rows, 1)
         k, taken = dr.gather(mi.UInt32, self._next, column), mi.UInt32(0)
         while dr.hint((k < rows) & (taken < count), exclude=[self, group, light, found]):
@@ -110,7 +110,7 @@ class VisibilitySamples:
         dr.eval(found, self._next)
 
     def trace(self, index: np.ndarray, rows, count: int):
-        """V at rows that were drawn, Float, -1 where there are none; they are remembered."""
+        """Trace V at drawn rows, and store the samples: Float, -1 for NO_ROW."""
         value = dr.full(mi.Float, -1, len(index) * count)
         dr.eval(value)
         for group, inside in self.entries.by_group(self.columns.select(index)):
@@ -121,8 +121,8 @@ class VisibilitySamples:
             row = dr.gather(mi.UInt32, rows, place)
             light = dr.gather(mi.UInt32, self._light, column)
             first, _ = self.entries.rows.range(dr.gather(mi.UInt32, self._piece, column))
-            passed, asked = self.entries.trace(group, light, first + row, light, row != NO_ROW)
-            dr.scatter(value, passed, place, asked)
+            passed, traced = self.entries.trace(group, light, first + row, light, row != NO_ROW)
+            dr.scatter(value, passed, place, traced)
             dr.eval(value)
         self._remember(upload(mi.UInt32, index), rows, value, count)
         return value
@@ -150,7 +150,7 @@ class VisibilitySamples:
         dr.eval(self.number, self.row, self.x, self.y, self.value, self._seen, self._lit)
 
     def at(self, column, row):
-        """(Whether a row was traced, whether light arrived there) for some columns and rows of their slices."""
+        """(1 if the row was traced, 1 if the row was lit), UInt32, for some columns and rows of their slices."""
         word = column * dr.opaque(mi.UInt32, self._words) + (row >> 5)
         bit = row & 31
         seen, lit = (dr.gather(mi.UInt32, bits, word) >> bit & 1 for bits in (self._seen, self._lit))

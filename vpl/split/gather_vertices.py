@@ -1,4 +1,9 @@
-"""Vertices of camera paths at which virtual lights are gathered, and which of them are."""
+"""Gather vertices: the vertices of camera paths where irradiance from virtual lights is added, and the choice of them.
+
+A path has a *first* gather vertex and may have *later* ones.  Not every vertex is lit: of a pixel with n samples, k
+first vertices are lit, and as many later ones as their weight deserves.  :class:`LitVertices` divides the weights by
+the fractions that are lit, so the sum over lit vertices has the expectation of the sum over all vertices.
+"""
 
 from __future__ import annotations
 
@@ -8,32 +13,32 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, download, upload
+from ..core.arrays import channel_mean, download, select_record, upload
 
 
 @dataclass
 class GatherVertices:
     """Vertices of paths, one per lane.
 
-    ``position``, ``normal`` (shading normal, on the side that is seen), ``flat`` (geometric normal), ``depth``: edges
-    from the camera, 0 where there is no vertex; ``weight``: what irradiance that virtual lights send there contributes
-    to the camera ray, unpolarized spectrum, may be negative; 0 where none is gathered.
+    ``position``: world units; ``normal``: shading normal on the visible side; ``flat``: geometric normal; ``weight``:
+    contribution to the camera ray per irradiance from virtual lights, an unpolarized spectrum, may be negative, 0 where
+    nothing is gathered; ``depth``: edges from the camera, 0 where the lane has no vertex.
     """
 
-    position: object
-    normal: object
-    flat: object
-    weight: object
-    depth: object
+    position: mi.Point3f
+    normal: mi.Normal3f
+    flat: mi.Normal3f
+    weight: mi.UnpolarizedSpectrum
+    depth: mi.UInt32
 
     @classmethod
     def none(cls, count: int) -> GatherVertices:
-        """No vertices."""
+        """Lanes without vertices."""
         weight = dr.zeros(mi.UnpolarizedSpectrum, count)
         return cls(mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0), weight, mi.UInt32(0))
 
-    def select(self, index, *factors) -> GatherVertices:
-        """Those picked by an index array, with their weights times some factors, evaluated."""
+    def select(self, index: mi.UInt32, *factors: mi.Float) -> GatherVertices:
+        """The vertices at ``index``, with weights multiplied by ``factors``, evaluated."""
         picked = GatherVertices(*(dr.gather(type(x), x, index) for x in vars(self).values()))
         for factor in factors if len(index) else ():
             picked.weight *= factor
@@ -41,16 +46,16 @@ class GatherVertices:
         return picked
 
     def and_then(self, more: GatherVertices) -> GatherVertices:
-        """These, and others after them, evaluated."""
+        """These vertices followed by ``more``, evaluated."""
         both = GatherVertices(*(joined(x, y) for x, y in zip(vars(self).values(), vars(more).values(), strict=True)))
         dr.eval(both)
         return both
 
 
 def joined(first, second):
-    """The lanes of one array and then those of another; to be evaluated by the caller.
+    """Concatenate the lanes of two arrays; the caller evaluates the result.
 
-    ``dr.concat`` holds the number of lanes in its kernel, which is then compiled anew for every one.
+    ``dr.concat`` puts the number of lanes into its kernel, which Dr.Jit then compiles for every number of lanes.
     """
     if dr.depth_v(first) > 1:
         return type(first)(*(joined(x, y) for x, y in zip(first, second, strict=True)))
@@ -63,60 +68,96 @@ def joined(first, second):
 
 
 @dataclass
-class Arrival:
-    """Second vertices of paths: after the first that scatters, or the first where lights are gathered; one per lane.
+class SecondVertices:
+    """Second vertices of paths: the vertex after the first one that scatters or gathers; one per lane.
 
-    ``position``; ``normal`` of the side that was met; ``weight``: what irradiance there would contribute if virtual
-    lights carried all of it (w = 1), 0 where they carry none; ``throughput`` of the path, and ``before``: the radiance
-    that it had found before; means over channels.
+    ``position``: world units; ``normal``: geometric normal on the side where the path arrived; ``weight``: contribution
+    per irradiance with w = 1, 0 where virtual lights carry nothing; ``throughput`` of the path up to the vertex;
+    ``before``: radiance that the path had found before.  The last three are means over channels.
     """
 
-    position: object
-    normal: object
-    weight: object
-    throughput: object
-    before: object
+    position: mi.Point3f
+    normal: mi.Normal3f
+    weight: mi.Float
+    throughput: mi.Float
+    before: mi.Float
 
     @classmethod
-    def none(cls) -> Arrival:
-        """No arrivals."""
+    def none(cls) -> SecondVertices:
+        """Lanes without vertices."""
         return cls(mi.Point3f(0), mi.Normal3f(0), mi.Float(0), mi.Float(0), mi.Float(0))
 
 
 @dataclass
+class Gathered:
+    """Gather vertices that paths have met so far, one record per lane.
+
+    ``first``; ``second``; ``later``: one of the later gather vertices, drawn by weight; ``later_level``: sum of the
+    weights of all later ones, mean over channels.
+    """
+
+    first: GatherVertices
+    second: SecondVertices
+    later: GatherVertices
+    later_level: mi.Float
+
+    @classmethod
+    def none(cls, count: int) -> Gathered:
+        """Lanes that have met nothing."""
+        return cls(GatherVertices.none(count), SecondVertices.none(), GatherVertices.none(count), mi.Float(0))
+
+    def add(self, vertex: GatherVertices, is_first: mi.Bool, sample: mi.Float) -> None:
+        """Record a vertex; ``sample``: a uniform number that decides whether it replaces the later one."""
+        self.first = select_record(is_first, vertex, self.first)
+        level = dr.select(is_first, 0, channel_mean(dr.abs(vertex.weight)))
+        self.later_level += level
+        self.later = select_record(sample * self.later_level < level, vertex, self.later)
+
+    def finish(self) -> None:
+        """Give the later vertex the weight of all later ones: its weight over the probability of drawing it."""
+        level = self.later_level
+        self.later.weight *= dr.select(level > 0, level / channel_mean(dr.abs(self.later.weight)), 0)
+
+
+@dataclass
 class LitVertices:
-    """Gather ``vertices`` that are lit, with the camera ray of each (``rays``, UInt32); ``alone``: so many, the last
-    ones, are of those after the first ones of their paths; ``kept``: samples of a pixel whose first one is lit."""
+    """Gather vertices that virtual lights light.
+
+    ``vertices``: their weights over the fraction of the vertices that is lit; ``rays``: the camera ray of each, UInt32;
+    ``alone``: number of later vertices, which come last and form clusters of their own.
+    """
 
     vertices: GatherVertices
-    rays: object
+    rays: mi.UInt32
     alone: int
-    kept: int
 
     @classmethod
     def of(cls, first: GatherVertices, later: GatherVertices, samples: int, most: int, seed: int) -> LitVertices:
-        """At most ``most`` first vertices of every pixel, and as many later ones as their light is worth."""
+        """Choose at most ``most`` first vertices of every pixel of ``samples`` rays, and later ones by their weight."""
         kept, number = min(most, samples), dr.opaque(mi.UInt32, samples)
         sample = dr.arange(mi.UInt32, dr.width(first.weight)) % number
         # Evenly among the samples of a pixel
         lit = mi.UInt64(sample) * dr.opaque(mi.UInt64, kept) % mi.UInt64(number) >= dr.opaque(mi.UInt64, samples - kept)
         rays = dr.compress(lit & (dr.max(dr.abs(first.weight)) > 0))
         later_rays, factor = drawn_later(first, later, samples, kept, seed)
-        # As many as there would be among the first vertices that are lit
-        share = dr.opaque(mi.Float, kept / samples)
-        picked = first.select(rays).and_then(later.select(later_rays, factor, share))
-        return cls(picked, joined(rays, later_rays), len(later_rays), kept)
+        # kept of samples first vertices are lit, so each stands for samples / kept of them
+        stands_for = dr.opaque(mi.Float, samples / kept)
+        picked = first.select(rays, stands_for).and_then(later.select(later_rays, factor))
+        return cls(picked, joined(rays, later_rays), len(later_rays))
 
     @property
     def count(self) -> int:
         return len(self.rays)
 
 
-def drawn_later(first: GatherVertices, later: GatherVertices, samples: int, most: int, seed: int):
-    """Some of the ``later`` vertices of each pixel, drawn so that each has the weight that ``most`` vertices of the
-    pixel would have on average if all of its light was theirs: (camera rays, ascending, factors of their weights).
+def drawn_later(
+    first: GatherVertices, later: GatherVertices, samples: int, most: int, seed: int
+) -> tuple[mi.UInt32, mi.Float]:
+    """Draw later vertices of each pixel in proportion to their weight.
 
-    Systematic sampling along each pixel, from a random start.  ``samples``: camera rays of a pixel, side by side.
+    Their expected number is ``most`` times the fraction of the pixel's total weight that later vertices have.  Returns
+    (camera rays, ascending; factors of the weights, the inverse of the expected number of times that each is drawn).
+    Systematic sampling along each pixel of ``samples`` consecutive rays, from a random start.
     """
     levels = [channel_mean(dr.abs(x.weight)) for x in (first, later)]
     dr.eval(levels)

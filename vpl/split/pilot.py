@@ -1,22 +1,28 @@
-"""Pilot: a few whole paths, which tell where virtual lights are wanted and whether they pay."""
+"""Pilot: a few whole paths that show where virtual lights are wanted, how bright the image is, and how noisy."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
+import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, download
-from .gather_vertices import Arrival, GatherVertices
-from .paths import Found
-from .pixel_means import means_of_others, pixel_means
+from ..core.arrays import channel_mean, download, upload
+from .cost_model import CostModel
+from .gather_vertices import GatherVertices, SecondVertices
+from .path_tracer import Traced, trace_camera_rays
+from .view import Gathering, Stream, View, ViewLights
 
 
-@dataclass
+@dataclass(frozen=True)
 class Arrivals:
-    """Second vertices of paths, (n, 3): ``position`` and the ``normal`` of the side that was met; (n,) float64:
-    ``weight``, what irradiance there contributes to the image, and ``level``, what the path brought from there."""
+    """Second vertices with a minorant, of paths whose first vertices have one, too.
+
+    ``position``, ``normal`` (n, 3): on the side where the path arrived; ``weight`` (n,) float64: contribution per
+    irradiance; ``level`` (n,) float64: radiance that the path brought from there.
+    """
 
     position: np.ndarray
     normal: np.ndarray
@@ -24,10 +30,10 @@ class Arrivals:
     level: np.ndarray
 
 
-@dataclass
+@dataclass(frozen=True)
 class Onward:
-    """Second vertices of paths, with a floor or without, (m, 3) each: ``position``, ``normal``; (m,): ``path`` that
-    each is of, ``throughput`` with which it arrived, ``sent``: the radiance that it sent back, ``edges`` beyond."""
+    """All second vertices: ``position``, ``normal`` (m, 3); (m,): ``path`` of each; ``throughput`` up to it; ``sent``:
+    radiance that it sent back; ``edges`` beyond it."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -37,15 +43,13 @@ class Onward:
     edges: np.ndarray
 
 
-@dataclass
+@dataclass(frozen=True)
 class Pilot:
-    """Paths, two next to each other from one pixel, or from two where each has a single sample.  What they found may be
-    negative where virtual lights carry a part.
+    """Paths in pairs of neighbours: of one pixel, or of two where a pixel has a single sample.
 
-    ``arrivals``: their second vertices, where they have a floor, as their first ones have; ``pixel``, ``radiance``,
-    ``indirect`` (n,): the pixel of each path, what it found, and the part that came by way of its second vertex.
-    ``vertices``: positions and normals, (m, 3) each, of both; ``onward``: what came by way of all second vertices;
-    ``size``: width of the image, and how many pixels it has.
+    ``pixel``, ``radiance`` (n,): of each path; ``indirect`` (n,): part of the radiance that came through arrivals.
+    Where virtual lights carry a part, values may be negative.  ``vertices``: positions and normals (k, 3) of first and
+    second vertices; ``size``: width of the image and number of pixels.
     """
 
     arrivals: Arrivals
@@ -55,35 +59,140 @@ class Pilot:
     radiance: np.ndarray
     indirect: np.ndarray
     size: tuple[int, int]
+    model: CostModel
 
     @classmethod
-    def of(
-        cls, found: Found, vertices: GatherVertices, arrival: Arrival, pixel: np.ndarray, size: tuple[int, int]
-    ) -> Pilot:
-        """The pilot of some paths of the pixels ``pixel`` in an image of a ``size``."""
-        radiance = np.nan_to_num(download(channel_mean(found.radiance)).astype(np.float64), posinf=0, neginf=0)
-        position, normal, weight, throughput, before = (download(x) for x in vars(arrival).values())
-        beyond, edges = np.maximum(radiance - np.nan_to_num(before), 0), download(found.edges).astype(np.int64)
-        onward = (throughput > 0) & np.isfinite(throughput) & np.isfinite(position).all(1)
-        path, throughput = np.flatnonzero(onward), throughput[onward].astype(np.float64)
-        onward = Onward(position[onward], normal[onward], path, throughput, beyond[path] / throughput, edges[path] - 1)
-        arrived = (weight > 0) & np.isfinite(weight) & np.isfinite(position).all(1)
-        indirect = np.where(arrived, beyond, 0)
-        arrivals = Arrivals(position[arrived], normal[arrived], weight[arrived].astype(np.float64), indirect[arrived])
-        first, facing, depth = (download(x) for x in (vertices.position, vertices.normal, vertices.depth))
-        seen = (depth > 0) & np.isfinite(first).all(1)
-        vertices = tuple(np.concatenate(x) for x in ((first[seen], position[arrived]), (facing[seen], normal[arrived])))
-        return cls(arrivals, onward, vertices, pixel, radiance, indirect, size)
+    def trace(cls, view: View, lights: ViewLights) -> Pilot:
+        """Trace pairs of paths all over the image, always the same ones, without the light that ``lights`` carry."""
+        lane = view.pairs(view.model.pilot_rays)
+        settings = view.settings(lights, Gathering.AT_FIRST)
+        traced = trace_camera_rays(view, upload(mi.UInt32, lane), settings, Stream.PILOT)
+        return cls.of(traced, lane // view.samples, (view.width, view.pixels), view.model)
+
+    @classmethod
+    def of(cls, traced: Traced, pixel: np.ndarray, size: tuple[int, int], model: CostModel) -> Pilot:
+        """The pilot of traced paths in the pixels ``pixel`` (n,)."""
+        radiance = np.nan_to_num(download(channel_mean(traced.radiance)).astype(np.float64), posinf=0, neginf=0)
+        edges = download(traced.edges).astype(np.int64)
+        arrivals, onward, indirect = _second_vertices(traced.gathered.second, radiance, edges)
+        first, facing = _first_vertices(traced.gathered.first)
+        vertices = np.concatenate([first, arrivals.position]), np.concatenate([facing, arrivals.normal])
+        return cls(arrivals, onward, vertices, pixel, radiance, indirect, size, model)
 
     @property
     def brightness(self) -> np.ndarray:
-        """Mean radiance around each path, (n,), as the others tell."""
+        """Mean radiance around each path, (n,), estimated from the other paths."""
         return self._of_others[0]
 
     def nearby(self, values: np.ndarray) -> np.ndarray:
-        """Mean of the paths' ``values`` around each pixel of the image, (pixels,)."""
+        """Mean of the paths' ``values`` (n,) around each pixel of the image, (pixels,)."""
         return pixel_means(values, self.pixel, *self.size, self._of_others[1])
 
     @cached_property
     def _of_others(self) -> tuple[np.ndarray, list[float]]:
-        return means_of_others(self.radiance, self.pixel, *self.size)
+        return means_of_others(self.radiance, self.pixel, *self.size, self.model)
+
+
+def _second_vertices(second: SecondVertices, radiance: np.ndarray, edges: np.ndarray):
+    """(Arrivals, all second vertices, radiance (n,) through arrivals) of paths."""
+    position, normal, weight, throughput, before = (download(x) for x in vars(second).values())
+    beyond = np.maximum(radiance - np.nan_to_num(before), 0)
+    known = np.isfinite(position).all(1)
+    onward = (throughput > 0) & np.isfinite(throughput) & known
+    path, throughput = np.flatnonzero(onward), throughput[onward].astype(np.float64)
+    onward = Onward(position[onward], normal[onward], path, throughput, beyond[path] / throughput, edges[path] - 1)
+    arrived = (weight > 0) & np.isfinite(weight) & known
+    indirect = np.where(arrived, beyond, 0)
+    arrivals = Arrivals(position[arrived], normal[arrived], weight[arrived].astype(np.float64), indirect[arrived])
+    return arrivals, onward, indirect
+
+
+def _first_vertices(first: GatherVertices) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and normals (n, 3) of first gather vertices."""
+    position, facing, depth = (download(x) for x in (first.position, first.normal, first.depth))
+    seen = (depth > 0) & np.isfinite(position).all(1)
+    return position[seen], facing[seen]
+
+
+# ---------------------- Relative variance ----------------------
+
+
+def relative_variance(values: np.ndarray, brightness: np.ndarray, model: CostModel) -> float:
+    """Variance of a path, from the ``values`` (n,) of pairs, over the squared ``brightness`` (n,).
+
+    Leaves out the largest errors and adds a constant to the brightness, as the error of the comparison does.
+    """
+    count = len(values) // 2
+    first, second = values[: 2 * count].astype(np.float64).reshape(-1, 2).T
+    error = np.sort(0.5 * (first - second) ** 2 / judged_by(brightness, model)[: 2 * count : 2] ** 2)
+    return float(np.mean(error[: count - int(model.trimmed * count)])) if count else 0.0
+
+
+def judged_by(brightness: np.ndarray, model: CostModel) -> np.ndarray:
+    """Denominator of relative errors (n,) where an image has a ``brightness`` (n,)."""
+    level = np.sqrt(brightness**2 + model.black * np.mean(brightness) ** 2)
+    return np.maximum(level, np.finfo(np.float64).tiny ** 0.5)
+
+
+# ---------------------- Means around pixels ----------------------
+#
+# The image is divided into four blocks, each block into four again, down to single pixels. The mean of a block combines
+# its own values with that of the larger block, which counts as a number of values: more of them, the noisier values
+# are.
+
+
+def means_of_others(
+    values: np.ndarray, at: np.ndarray, width: int, count: int, model: CostModel
+) -> tuple[np.ndarray, list[float]]:
+    """Mean around each of ``values`` (n,), in pairs, without the value itself and its neighbour.
+
+    ``at``: pixel of each value, of ``count`` pixels in rows of ``width``.  Returns (means (n,), for each size of blocks
+    the number of values that the mean of the larger block counts as).
+    """
+    number = len(values)
+    beside = np.arange(number) ^ 1
+    rest = max(number - 2, 1)
+    others = (np.sum(values) - values - values[beside]) / rest if number > 2 else np.full(number, np.mean(values))
+    priors = []
+    for (down, across), block in _divisions(at, width, count):
+        # The relative variance of n values is below n
+        priors.append(min(relative_variance(values, others, model), number) / model.brightness_spread)
+        inside, total = _sums(block, values, down * across)
+        both = block == block[beside]
+        total, inside = total[block] - values - both * values[beside], inside[block] - 1 - both
+        others = _mean(total, inside, priors[-1], others)
+    return others, priors
+
+
+def pixel_means(values: np.ndarray, at: np.ndarray, width: int, count: int, priors: list[float]) -> np.ndarray:
+    """Mean of ``values`` (n,) at the pixels ``at`` (n,) around each of ``count`` pixels in rows of ``width``: (count,).
+
+    ``priors``: see :func:`means_of_others`.
+    """
+    grid = np.full((1, 1), np.mean(values))
+    for ((down, across), block), prior in zip(_divisions(at, width, count), priors, strict=True):
+        inside, total = _sums(block, values, down * across)
+        around = grid.repeat(2, 0).repeat(2, 1)[:down, :across].reshape(-1)
+        grid = _mean(total, inside, prior, around).reshape(down, across)
+    return grid.reshape(-1)[:count]
+
+
+def _divisions(at: np.ndarray, width: int, count: int) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
+    """((Blocks down, blocks across), block of each of the pixels ``at``), from four blocks to one for each pixel."""
+    height = -(-count // width)
+    side = 1 << (max(width, height) - 1).bit_length()
+    while side > 1:
+        side //= 2
+        down, across = -(-height // side), -(-width // side)
+        yield (down, across), at // width // side * across + at % width // side
+
+
+def _sums(block: np.ndarray, values: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]:
+    """(Number, sum) of the values in each block."""
+    return np.bincount(block, minlength=blocks), np.bincount(block, values, blocks)
+
+
+def _mean(total, number, prior: float, around):
+    """Means of ``number`` values with the sum ``total`` and of ``prior`` values with the mean ``around``."""
+    whole = number + prior
+    return np.where(whole > 0, total + prior * around, around) / np.where(whole > 0, whole, 1)

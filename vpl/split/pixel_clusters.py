@@ -1,10 +1,9 @@
-"""Light of virtual lights at gather vertices: one light cut for those vertices of a pixel that are alike.
+"""Light from virtual lights at gather vertices: one light cut for the vertices of a pixel that face the same way.
 
-The vertices of a pixel that face the same way form a cluster.  A light cut is chosen for the whole cluster, by bounds
-on its box and cone of normals [MDLC]; for each pair of the cluster and a node of the cut one of its vertices and one of
-the node's lights are drawn, by weight and by intensity, anew for every pair.  So neighbouring pixels do not share what
-stands for a cluster, and errors are noise, which vanishes from one sample to the next and which a denoiser takes for
-what it is.
+These vertices form a cluster.  Bounds on its box and its cone of normals choose one light cut for the whole cluster, as
+in Multidimensional Lightcuts [MDLC].  For each pair of the cluster and a node of the cut, a vertex is drawn by weight
+and a light of the node by intensity, anew for every pair.  So neighbouring pixels share no representative lights, and
+the error is uncorrelated noise, which averages out over samples and which a denoiser recognises.
 """
 
 from __future__ import annotations
@@ -21,19 +20,19 @@ from ..cuts.light_cuts import collect_cuts, limited_cuts, upload_thresholds
 from ..points.bsdf_proxies import MaterialProxy
 from ..points.surfaces import LambertianSurface, Receiver
 from ..transport.evaluation import Transport, evaluate_pairs
-from .facing import WAYS, facing
 from .gather_vertices import LitVertices
+from .spatial_cells import FACINGS, facing
 
 
 @dataclass
 class Receivers:
-    """Clusters as :mod:`vpl.cuts.light_cuts` sees gather points: boxes with cones of normals, evaluated."""
+    """Clusters in the form of gather points for :mod:`vpl.cuts.light_cuts`: boxes with cones of normals, evaluated."""
 
     receiver: Receiver
 
     @classmethod
     def of(cls, center, extent, axis, cosine) -> Receivers:
-        """Boxes, (n, 3) each, and cones of normals, axes (n, 3) and cosines of half-angles (n,)."""
+        """From boxes (n, 3) and cones of normals: axes (n, 3), cosines of half-angles (n,)."""
         count = len(center)
         white, no = mi.Color3f(*(dr.opaque(mi.Float, 1.0, count) for _ in range(3))), mi.Bool(False)
         proxy = MaterialProxy(white, None, None, None, no, no, False, False)
@@ -47,7 +46,7 @@ class Receivers:
         return dr.width(self.receiver.position)
 
     def select(self, index) -> Receivers:
-        """Some of them, evaluated."""
+        """The clusters at ``index``, evaluated."""
         one = self.receiver
         position, normal, extent, cosine, base = (
             dr.gather(type(x), x, index)
@@ -61,16 +60,18 @@ class Receivers:
 
 
 class PixelClusters:
-    """Clusters of the gather vertices of pixels, of which there are some; later ones are clusters of their own.
-    ``samples``: camera rays of a pixel, next to each other."""
+    """Clusters of lit vertices (at least one) by pixel and facing; each later vertex is a cluster of its own.
+
+    ``samples``: camera rays of a pixel, side by side.
+    """
 
     def __init__(self, lit: LitVertices, samples: int):
         vertices, rays, alone = lit.vertices, lit.rays, lit.alone
-        # Components apart, (3, n), in which NumPy is several times faster
+        # Shape (3, n), in which NumPy is several times faster
         position, normal = (np.stack([download(x) for x in vector]) for vector in (vertices.position, vertices.normal))
         pixel = download(rays).astype(np.int64) // samples
-        key = pixel * WAYS + facing(normal.T)
-        key[len(key) - alone :] = (pixel.max() + 1) * WAYS + np.arange(alone)
+        key = pixel * FACINGS + facing(normal.T)
+        key[len(key) - alone :] = (pixel.max() + 1) * FACINGS + np.arange(alone)
         order = np.argsort(key, kind="stable")
         position, normal, key = position.take(order, 1), normal.take(order, 1), key[order]
         first = np.flatnonzero(np.diff(key, prepend=-1))
@@ -81,7 +82,7 @@ class PixelClusters:
         self.cluster = np.repeat(np.arange(len(first)), size)
         cosine = np.minimum.reduceat((normal * axis.take(self.cluster, 1)).sum(0), first)
         self.pixel = pixel[order[first]]
-        # Rounded down, so that every normal is inside
+        # Rounded down by 16 units in the last place, so that the cone holds every normal
         box = 0.5 * (low + high), 0.5 * (high - low), axis
         self.receivers = Receivers.of(*(x.T for x in box), np.maximum(cosine - 2e-6, -1))
         self.first, self.size = upload(mi.UInt32, first), upload(mi.UInt32, size)
@@ -103,7 +104,7 @@ class PixelClusters:
         return self.receivers.count
 
     def draw(self, cluster, sample):
-        """A vertex of each cluster by weight: (camera ray, Lambertian surface of albedo 1, weight over probability)."""
+        """Draw a vertex of each cluster by weight: (camera ray, white Lambertian surface, weight over probability)."""
         first = dr.gather(mi.UInt32, self.first, cluster)
         last = first + dr.gather(mi.UInt32, self.size, cluster)
         row = find_interval(self.cumulative, first, last, sample)
@@ -123,11 +124,11 @@ class PixelClusters:
 
 
 def light_clusters(transport: Transport, clusters: PixelClusters, allowed: np.ndarray, max_cut: int, seed: int, result):
-    """Add to ``result`` (per camera ray) what virtual lights send to the clusters: shadow rays traced.
+    """Add the light of virtual lights at the clusters to ``result``, per camera ray; returns the number of shadow rays.
 
-    ``allowed``: per cluster, by how much a pair may add to what the vertices of its pixel contribute together.
+    ``allowed`` (clusters,): largest bound of a pair, as a contribution to the sum over the samples of its pixel.
     """
-    with np.errstate(over="ignore"):  # of a cluster without weight, anything is allowed
+    with np.errstate(over="ignore"):  # a cluster without weight may have any error
         allowed = allowed / np.maximum(clusters.weight, np.finfo(np.float64).tiny)
     threshold, sizes, _ = limited_cuts(transport.lights, clusters.receivers, upload_thresholds(allowed), max_cut)
     rays = 0

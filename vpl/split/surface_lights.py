@@ -1,15 +1,16 @@
-"""Virtual lights drawn on surfaces where paths from the camera arrive, each with what one path from it finds.
+"""Virtual lights on surfaces where camera paths arrive, each with the irradiance that one path finds there.
 
-Random lines through the cells in which camera paths arrive (:mod:`vpl.split.cells`) meet surfaces at points of known
-density.  Each becomes a light: irradiance there, found by next-event estimation and one path, times the floor of its
-BSDF.  No path from an emitter is followed, so that nothing needs adjoint BSDFs, corrections for shading normals or rays
-that leave emitters, and an environment that lights a room by its windows is met as ``path`` meets it.
+Random lines (:mod:`vpl.split.line_sampling`) meet surfaces with a known density.  Each hit on a surface with a minorant
+becomes a light: irradiance × minorant over the density.  The irradiance comes from next-event estimation and one path
+that starts at the light.  No path starts at an emitter, so the method needs no adjoint BSDFs, no correction for shading
+normals and no emission sampling, and an environment lights a room through its windows as in ``path``.
 
-Cells are chosen by what a pilot's paths brought to the camera from there: light is wanted where it is seen and bright.
+Lines go to the cells from which a pilot's paths brought radiance: lights are wanted where they are seen and bright.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -18,78 +19,100 @@ import numpy as np
 
 from ..core.arrays import download, ones, spectrum_to_rgb, upload, upload_vectors
 from ..core.loops import recorded_once
+from ..core.parameters import fingerprint_without_camera
 from ..core.sampling import derived_seed, independent_sampler
 from ..lights.emission import bounding_box
+from ..lights.light_set import ScatteredGroup
 from ..lights.virtual_lights import VirtualLights
-from .cells import Cells, Lines
-from .irradiance import Places, irradiance_from_emitters
-from .numbers import SpreadNumbers
-from .paths import PAST, PLACING, FirstEdge, Limits
+from .emitters.base import EmitterSampler, Places, irradiance_from_emitters
+from .lattice import Lattice
+from .line_sampling import ArrivalOctree, Lines
+from .path_tracer import trace_paths
 from .pilot import Arrivals
-from .remainder import follow
+from .roulette import OutgoingRadiance
+from .view import FirstEdge, Gathering, PathSettings, State, Stream, View, ViewLights
 
-# Arrivals of average brightness that a cell is taken to have had, besides its own
+# Arrivals of average radiance that each leaf has besides its own: a leaf holds 16 arrivals at most
 _PRIOR = 2.0
-# Samples of emitters that a light has where there are many of these
+# Emitter samples of a light in scenes of many emitters: with one, a light near a lamp was a bright blotch
 _EMITTER_SAMPLES = 4
-# Surfaces that one line meets at most, so that an endless row of hits at one place comes to an end
+# Surfaces that a line may meet: ends an endless row of hits at one place
 _MOST_LAYERS = 1024
+# Lights of all seeds that are kept together, some 400 bytes each
+_MOST_KEPT = 1 << 21
 
 
-@dataclass
+@dataclass(frozen=True)
 class SurfaceLights:
-    """``lights``: of kind "surface"; ``cells``, ``lines``: what they were drawn by, and how often."""
+    """``lights`` of kind "surface", drawn by ``lines`` lines through ``octree``; ``group``: the lights with their tree,
+    None where there are none."""
 
     lights: VirtualLights
-    cells: Cells
+    octree: ArrivalOctree
     lines: int
+    group: ScatteredGroup | None
 
     def spacing(self, arrivals: Arrivals) -> float:
         """Typical distance between lights where camera paths arrive, world units."""
-        density = self.lines * self.cells.density(arrivals.position, arrivals.normal)
+        density = self.lines * self.octree.density(arrivals.position, arrivals.normal)
         return float(np.median(1 / np.sqrt(density)))
 
 
-def surface_lights(scene, emission, arrivals: Arrivals, count: int, limits: Limits, seed: int) -> SurfaceLights:
-    """The lights that ``count`` lines meet.  ``limits``: of the paths that find their irradiance."""
+def surface_lights(view: View, arrivals: Arrivals, count: int, announce_tree: Callable[[], None]) -> SurfaceLights:
+    """The lights that ``count`` lines meet, with their tree; calls ``announce_tree`` before building the tree."""
+    # A path from a light lacks the two edges between camera and light; it is no camera path, so nothing is known of its
+    # expected contribution
+    rules = replace(view.rules, max_depth=view.rules.max_depth - 2, rr_depth=1)
+    settings = replace(view, rules=rules, outgoing=OutgoingRadiance.unknown()).settings(ViewLights())
+    seed = derived_seed(view.seed, Stream.SURFACE_LIGHTS)
+    lights, octree = _drawn_lights(view.scene, view.emitters, arrivals, count, settings, seed)
+    group = None
+    if lights.count:
+        announce_tree()
+        group = ScatteredGroup.of(lights, derived_seed(view.seed, Stream.TREE))
+    return SurfaceLights(lights, octree, count, group)
+
+
+def _drawn_lights(scene, emitters: EmitterSampler, arrivals: Arrivals, count: int, settings: PathSettings, seed: int):
+    """(Lights that ``count`` lines meet, octree of the lines)."""
     generator = np.random.default_rng(seed)
     box = bounding_box(scene)
     low, extent = np.array(box.min, np.float64), np.array(box.extents(), np.float64)
-    # A little larger, so that no surface lies on its sides
+    # A little larger, so that no surface lies on the sides of the cube
     size = 1.001 * max(float(extent.max()), np.finfo(np.float32).tiny)
-    cells = Cells(
+    octree = ArrivalOctree(
         arrivals.position, arrivals.normal, arrivals.weight, low + 0.5 * (extent - size), size, generator
     )  # fmt: skip
-    cells.choose_by(_importance(cells, arrivals))
-    lights = _lights_along(scene, emission, cells.lines(count, generator), limits, derived_seed(seed, 1))
-    density = count * cells.density(lights.position, lights.direction)
+    octree.choose_by(_importance(octree, arrivals))
+    lights = _lights_along(scene, emitters, octree.lines(count, generator), settings, derived_seed(seed, 1))
+    density = count * octree.density(lights.position, lights.direction)
     with np.errstate(over="ignore"):
         lights.intensity = (lights.intensity / density[:, None]).astype(np.float32)
-    # What single precision cannot hold after that is no light either
-    return SurfaceLights(lights.without_bad()[0], cells, count)
+    # Drops the intensities that single precision cannot hold
+    return lights.without_bad()[0], octree
 
 
-def _importance(cells: Cells, arrivals: Arrivals) -> np.ndarray:
-    """Share of lights that each leaf should have: by its arrivals and the root mean square of what they brought."""
-    leaf, size = cells.leaf_of_point, len(cells.leaf_weight)
+def _importance(octree: ArrivalOctree, arrivals: Arrivals) -> np.ndarray:
+    """Fraction of the lights for each leaf: its number of arrivals times the root mean square of their radiance."""
+    leaf, size = octree.leaf_of_point, len(octree.leaf_weight)
     number = np.bincount(leaf, minlength=size)
     squared = np.bincount(leaf, arrivals.level**2, size)
     typical = np.mean(arrivals.level**2)
     if not typical > 0:
-        return cells.leaf_weight
+        return octree.leaf_weight
     return number * np.sqrt((squared + _PRIOR * typical) / (number + _PRIOR))
 
 
-def _lights_along(scene, emission, lines: Lines, limits: Limits, seed: int) -> VirtualLights:
-    """A light wherever a line meets a surface with a floor: their intensities are floor × irradiance, per hit."""
+def _lights_along(scene, emitters: EmitterSampler, lines: Lines, settings: PathSettings, seed: int) -> VirtualLights:
+    """A light wherever a line meets a surface with a minorant; intensities are minorant × irradiance."""
     rays = _rays_to_surfaces(scene, lines)
     if dr.width(rays.o) == 0:
         return VirtualLights.of("surface", [], [], [])
-    places, floor = _places_with_floors(scene, emission, rays, limits, derived_seed(seed, 3))
+    places, minorant = _places_with_minorants(scene, emitters, rays, settings, derived_seed(seed, 3))
     if places.count == 0:
         return VirtualLights.of("surface", [], [], [])
-    irradiance, length = _irradiance(scene, emission, places, limits, seed)
-    columns = (places.position, places.normal, spectrum_to_rgb(floor * irradiance), length)
+    irradiance, length = _irradiance(scene, emitters, places, settings, seed)
+    columns = (places.position, places.normal, spectrum_to_rgb(minorant * irradiance), length)
     dr.eval(columns)
     lights = VirtualLights.of("surface", *(download(column) for column in columns))
     lights.facing = download(places.facing)
@@ -97,11 +120,11 @@ def _lights_along(scene, emission, lines: Lines, limits: Limits, seed: int) -> V
 
 
 def _rays_to_surfaces(scene, lines: Lines):
-    """Rays, one for every surface that a line meets, that begin shortly before it; line by line."""
+    """A ray for every surface that a line meets, which begins shortly before the surface; line by line."""
     origin, direction = (upload_vectors(mi.Point3f, x) for x in (lines.origin, lines.direction))
     direction, length = mi.Vector3f(direction), upload(mi.Float, lines.length)
     lines = origin, direction, length
-    # The same kernel counts them and finds them
+    # The same kernel counts the surfaces and finds them
     number = _meet(scene, lines, dr.zeros(mi.UInt32, len(length)), False, dr.zeros(mi.Point3f, 1), mi.UInt32(0))
     count = int(dr.sum(number)[0])
     if count == 0:
@@ -114,8 +137,11 @@ def _rays_to_surfaces(scene, lines: Lines):
 @recorded_once
 @dr.syntax
 def _meet(scene, lines, first, find: bool, starts, line):
-    """How many surfaces each of the ``lines`` (origin, direction, length) meets.  Where ``find`` is set, the place
-    before each and the number of its line are written to ``starts`` and ``line``, those of a line from ``first`` on."""
+    """Number of surfaces that each of the ``lines`` (origin, direction, length) meets.
+
+    With ``find``, writes the point before each surface to ``starts`` and the number of its line to ``line``, for each
+    line from the index ``first`` on.
+    """
     origin, direction, length = lines
     find = dr.opaque(mi.Bool, find)
     dr.make_opaque(first, starts, line)
@@ -135,17 +161,19 @@ def _meet(scene, lines, first, find: bool, starts, line):
     return number
 
 
-def _places_with_floors(scene, emission, rays, limits: Limits, seed: int):
-    """Places that rays meet where there is a floor, with normals on the side that was met: (places, floors), evaluated.
+def _places_with_minorants(scene, emitters, rays, settings: PathSettings, seed: int):
+    """(Points where rays meet a surface with a minorant, minorants), evaluated; normals on the side that was met.
 
-    Found by the kernel that follows paths, for another with the code of all materials would take long to compile.
+    Uses the kernel of :func:`vpl.split.path_tracer.trace_paths`: another one with the code of all materials would take
+    long to compile.
     """
     count = dr.width(rays.o)
-    depth, gathering = dr.opaque(mi.UInt32, 2), dr.opaque(mi.UInt32, PLACING)
-    limits = replace(limits, max_depth=depth, gathering=gathering, emitters_carried=dr.opaque(mi.Bool, True))
-    numbers = SpreadNumbers(dr.arange(mi.UInt32, count), 1, derived_seed(seed, 0))
+    depth, gathering = dr.opaque(mi.UInt32, 2), dr.opaque(mi.UInt32, Gathering.PLACING)
+    settings = replace(settings, max_depth=depth, gathering=gathering, emitters_carried=dr.opaque(mi.Bool, True))
+    lattice = Lattice(dr.arange(mi.UInt32, count), 1, derived_seed(seed, 0))
     sampler = independent_sampler(derived_seed(seed, 1), count)
-    _, met, *_ = follow(scene, emission, FirstEdge.of_camera(rays, 1.0, True), numbers, sampler, limits)
+    edge = FirstEdge.of_camera(rays, 1.0, True)
+    met = trace_paths(scene, emitters, edge, lattice, sampler, settings).gathered.first
     met = met.select(dr.compress((met.depth > 0) & (dr.max(met.weight) > 0)))
     outward = met.flat * dr.mulsign(mi.Float(1), dr.dot(met.flat, met.normal))
     places = Places(met.position, outward, met.normal)
@@ -153,28 +181,60 @@ def _places_with_floors(scene, emission, rays, limits: Limits, seed: int):
     return places, met.weight
 
 
-def _irradiance(scene, emission, places: Places, limits: Limits, seed: int):
-    """Irradiance of each place by one path: (unpolarized spectrum, edges of a path that found it)."""
+def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: int):
+    """Irradiance of each place by one path: (unpolarized spectrum, edges of the path that found it)."""
     count = places.count
-    site = emission.choice.site(places.position, places.facing) + dr.opaque(mi.UInt32, 0, count)
+    cell = emitters.cell(places.position, places.facing) + dr.opaque(mi.UInt32, 0, count)
     sampler = independent_sampler(derived_seed(seed, 0), count)
-    # A path that begins with a direction drawn by the cosine
+    # The path starts in a cosine-distributed direction
     local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
     ray = places.interaction().spawn_ray(mi.Frame3f(places.facing).to_world(local))
     density, draw = local.z * dr.inv_pi, sampler.next_1d()
-    dr.eval(site, ray, density, draw)
-    # A light is seen by many pixels: where there are many emitters, what it has of one of them would show
-    samples = _EMITTER_SAMPLES if emission.lights is not None else 1
-    nearest, _ = irradiance_from_emitters(scene, emission, places, site, samples, derived_seed(seed, 2))
-    # A direction has a weight of pi, by which roulette lets paths go on: ended by what surfaces leave of it, they would
-    # cost lights 7% less and leave 12% more of their noise (kitchen)
-    edge = FirstEdge.of(places.position, ray, ones(count) * dr.pi, density, False, PAST, site, 1.0, True)
-    numbers = SpreadNumbers(dr.arange(mi.UInt32, count), 1, seed)
-    found, *_ = follow(scene, emission, edge, numbers, independent_sampler(derived_seed(seed, 1), count), limits)
-    # Gather points further from the camera may use shorter paths only: a light stands for paths of one length, and has
-    # the colour of none but these
+    dr.eval(cell, ray, density, draw)
+    # Many pixels see a light: with few of many emitters, its irradiance would vary visibly
+    samples = _EMITTER_SAMPLES if emitters.lights is not None else 1
+    nearest, _ = irradiance_from_emitters(scene, emitters, places, cell, samples, derived_seed(seed, 2))
+    # The throughput starts with pi, the weight of a direction, which lets paths go on longer: with 1, lights would cost
+    # 7% less and have 12% more variance (kitchen)
+    edge = FirstEdge.of(places.position, ray, ones(count) * dr.pi, density, False, State.PAST, cell, 1.0, True)
+    lattice = Lattice(dr.arange(mi.UInt32, count), 1, seed)
+    found = trace_paths(scene, emitters, edge, lattice, independent_sampler(derived_seed(seed, 1), count), settings)
+    # A light stands for paths of one length, because gather vertices far from the camera may use short paths only. It
+    # takes one contribution, drawn by its share, with that contribution's colour
     level, more = dr.sum(nearest), dr.sum(found.drawn)
     is_nearest = draw * (level + more) < level
     one = dr.select(is_nearest, nearest, found.drawn)
     irradiance = dr.select(level + more > 0, one * (level + more) / dr.sum(one), 0)
     return irradiance, dr.select(is_nearest, mi.UInt32(1), found.length)
+
+
+class KeptLights:
+    """Surface lights by what they depend on besides the scene, such as a seed, of one scene at a time.
+
+    Their density is positive on every surface, so they light other cameras without bias, with fewer lights where the
+    first camera did not look.  A scene counts as the same while everything that Mitsuba prints and lists as a parameter
+    of its objects, without sensors and integrator, is the same: see :func:`vpl.core.parameters.fingerprint`.
+    ``most``: largest number of lights that are kept.
+    """
+
+    def __init__(self):
+        self.most = _MOST_KEPT
+        self._scene: str | None = None
+        self._known: dict[tuple, SurfaceLights] = {}
+
+    @property
+    def count(self) -> int:
+        """Number of lights."""
+        return sum(one.lights.count for one in self._known.values())
+
+    def find(self, scene, key: tuple, make: Callable[[], SurfaceLights]) -> SurfaceLights:
+        """The lights of a scene and a key: kept ones, or the result of ``make``."""
+        found = fingerprint_without_camera(scene)
+        if found != self._scene:
+            self._scene, self._known = found, {}
+        if key in self._known:
+            return self._known[key]
+        made = make()
+        if self.count + made.lights.count <= self.most:
+            self._known[key] = made
+        return made

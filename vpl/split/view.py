@@ -1,86 +1,215 @@
-"""View: the camera rays of one image, or of one pass of it, and what all paths that begin with them share."""
+"""View: the camera rays of one image or pass, the lights that light them, and the settings of their paths."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.sampling import derived_seed, independent_sampler
+from ..core.arrays import ones
 from ..lights.light_set import LightGroup, LightSet
 from ..lights.perturbed import Perturbed
-from .numbers import SpreadNumbers
-from .paths import AT_FIRST, EVERYWHERE, NOWHERE, FirstEdge, Limits, Rules
-from .remainder import follow
-from .view_lights import ViewLights, spaced_lights
-from .worth import Worth
+from .cost_model import CostModel
+from .emitters.base import EmitterSampler
+from .roulette import OutgoingRadiance
 
-# c of paths that are whole, beyond every distance, world units: nothing is left to virtual lights
+# c of paths that virtual lights carry nothing of, world units: beyond every distance, and its square is finite
 _WHOLE = 1e15
 
 
-@dataclass
-class View:
-    """Camera rays: the ``scene`` and how its emitters are sampled (``emission``), its shapes without a
-    floor (``perturbed``); the ``rules`` of its paths; the camera's ``ray`` and which of them are ``active``, evaluated;
-    ``width`` of the image and ``samples`` of a pixel, which lie next to each other; ``seed``; ``importance`` of
-    radiance in each pixel, and the ``worth`` of paths (:mod:`vpl.split.worth`), once they are known."""
+class Stream(IntEnum):
+    """Streams of random numbers, derived from the seed of a view."""
 
-    scene: object
-    emission: object
+    PILOT = 1
+    SURFACE_LIGHTS = 2
+    TREE = 3
+    IMAGE = 4
+    GATHER = 5
+    LEARNING = 6
+    EMITTER_LIGHTS = 7
+
+
+class State:
+    """Position of a path relative to its first gather vertex x1: plain integers, which Dr.Jit compares with arrays."""
+
+    SEEKING = 1  # before x1
+    CONNECTING = 2  # on the edge from a gather vertex to the next vertex
+    PAST = 3  # on any other edge
+
+
+class Gathering:
+    """Vertices where irradiance from virtual lights is gathered, by the last state in which a minorant is evaluated."""
+
+    NOWHERE = 0
+    AT_FIRST = State.CONNECTING
+    EVERYWHERE = State.PAST
+    # Virtual lights are placed at the first vertices, also where the shading normal faces away: the density of lights
+    # does not depend on the shading normal
+    PLACING = State.PAST + 1
+
+
+@dataclass(frozen=True)
+class PathRules:
+    """Parameters of Mitsuba's ``path``: ``max_depth`` (edges, may be infinite), ``rr_depth``, ``hide_emitters``."""
+
+    max_depth: float
+    rr_depth: int
+    hide_emitters: bool
+
+
+@dataclass
+class PathSettings:
+    """Settings of :func:`trace_paths`, opaque on the device unless stated.
+
+    ``max_depth``, ``rr_depth``: as in ``path``; ``squared_c``: c², world units²; ``gathering``: a :class:`Gathering`;
+    ``emitters_carried``: whether virtual lights stand for emitters, with ``emitters_squared_c``; ``outgoing``: for
+    Russian roulette; ``perturbed``: shapes without a minorant; ``hide_emitters``: a Python bool.
+    """
+
+    max_depth: mi.UInt32
+    rr_depth: mi.UInt32
+    squared_c: mi.Float
+    gathering: mi.UInt32
+    emitters_carried: mi.Bool
+    emitters_squared_c: mi.Float
+    outgoing: OutgoingRadiance
     perturbed: Perturbed
-    rules: Rules
-    ray: object
-    active: object
+    hide_emitters: bool
+
+
+@dataclass
+class Edge:
+    """Edges of paths, one per lane.
+
+    ``vertex``: origin; ``ray``; ``throughput``: β; ``density`` of the direction, 1 / sr; ``delta``: whether the
+    direction has no density; ``state``: a :class:`State`; ``cell`` of the origin, see
+    :class:`vpl.split.emitters.base.EmitterSampler`; ``importance``: see
+    :meth:`vpl.split.roulette.OutgoingRadiance.survival`; ``active``.
+    """
+
+    vertex: mi.Point3f
+    ray: mi.Ray3f
+    throughput: mi.UnpolarizedSpectrum
+    density: mi.Float
+    delta: mi.Bool
+    state: mi.UInt32
+    cell: mi.UInt32
+    importance: mi.Float
+    active: mi.Bool
+
+
+@dataclass
+class FirstEdge(Edge):
+    """First edges of paths, evaluated."""
+
+    @classmethod
+    def of_camera(cls, ray, importance, active) -> FirstEdge:
+        """Rays that begin at no surface, such as camera rays."""
+        density = dr.opaque(mi.Float, 1.0, dr.width(ray.d))
+        return cls.of(ray.o, ray, ones(len(density)), density, True, State.SEEKING, mi.UInt32(0), importance, active)
+
+    @classmethod
+    def of(cls, vertex, ray, throughput, density, delta: bool, state: int, cell, importance, active) -> FirstEdge:
+        """Rays whose directions have a ``density``."""
+        count = dr.width(ray.d)
+        # Arrays of full width, opaque and distinct, give one kernel for all uses
+        wide = dr.opaque(mi.Float, 0.0, count)
+        ray = mi.Ray3f(ray.o + wide, ray.d + wide, ray.time + wide)
+        ray.maxt = dr.largest(mi.Float) + wide
+        active = mi.Bool(active) & dr.opaque(mi.Bool, True, count)
+        edge = cls(
+            vertex + dr.opaque(mi.Float, 0.0, count),
+            ray,
+            throughput,
+            density,
+            wide == (0 if delta else 1),
+            dr.full(mi.UInt32, state, count),
+            cell + dr.opaque(mi.UInt32, 0, count),
+            importance + wide,
+            active,
+        )
+        dr.make_opaque(edge)
+        return edge
+
+
+@dataclass(frozen=True)
+class ViewLights:
+    """Virtual lights on ``surfaces`` and those that stand for ``emitters``; None where there are none.
+
+    The smallest distance of each set is its c, see :mod:`vpl.transport.carried_share`.
+    """
+
+    surfaces: LightSet | None = None
+    emitters: LightSet | None = None
+
+    @property
+    def all(self) -> list[LightSet]:
+        """The sets that exist."""
+        return [lights for lights in (self.surfaces, self.emitters) if lights is not None]
+
+
+@dataclass(frozen=True)
+class View:
+    """Camera rays of one image or pass.
+
+    ``scene``; ``emitters``: its emitter sampler; ``perturbed``: its shapes without a minorant; ``rules`` of the paths;
+    ``ray``, ``active``: of the camera, evaluated, the ``samples`` of a pixel side by side; ``width`` of the image in
+    pixels; ``seed``; ``importance``: of radiance in each pixel, and ``outgoing`` radiance of surfaces, for Russian
+    roulette; ``model``: constants of the decisions.
+    """
+
+    scene: mi.Scene
+    emitters: EmitterSampler
+    perturbed: Perturbed
+    rules: PathRules
+    ray: mi.Ray3f
+    active: mi.Bool
     width: int
     samples: int
     seed: int
-    importance: object
-    worth: Worth
+    importance: mi.Float
+    outgoing: OutgoingRadiance
+    model: CostModel
 
     @property
     def count(self) -> int:
+        """Number of camera rays."""
         return dr.width(self.ray.o)
 
     @property
     def pixels(self) -> int:
-        """How many pixels there are."""
+        """Number of pixels."""
         return -(-self.count // self.samples)
 
     def pairs(self, most: int) -> np.ndarray:
-        """Some of the rays, two next to each other at a time, evenly over the image: so many at most."""
+        """Indices of at most ``most`` rays in pairs of neighbours, evenly over the image."""
         pairs = max(min(most, self.count // 4) // 2, 1)
         first = np.arange(pairs) * self.count // pairs // 2 * 2
         return np.minimum(first[:, None] + [0, 1], self.count - 1).reshape(-1)
 
-    def emitter_lights(self, groups: list[LightGroup]) -> LightSet:
-        """The lights that stand for emitters, in ``groups``; none where only their c is wanted."""
-        lights = self.emission.lights
-        return spaced_lights(groups, lights.spacing(lights.points(self.count)), self.rules.max_depth)
+    def light_set(self, groups: list[LightGroup], spacing: float) -> LightSet:
+        """The light set of ``groups`` whose lights have a typical distance ``spacing``, world units; sets its c."""
+        return LightSet(groups, self.model.c_per_spacing * spacing, self.rules.max_depth, 0, 0, {})
 
-    def limits(self, lights: ViewLights, least: int = NOWHERE) -> Limits:
-        """Limits, by the view's rules and worth, of paths of which ``lights`` carry a part; ``least``: where lights are
-        gathered (:mod:`vpl.split.paths`) even if there are none, to learn of these vertices."""
-        # At later vertices, few of which are lit, lights that stand for emitters alone bring noise of their own
-        gathering = EVERYWHERE if lights.surfaces else AT_FIRST if lights.emitters else least
+    def emitter_lights(self, groups: list[LightGroup]) -> LightSet:
+        """The light set that stands for emitters; ``groups`` may be empty where only its c is needed."""
+        lights = self.emitters.lights
+        return self.light_set(groups, lights.spacing(lights.points(self.count, self.model)))
+
+    def settings(self, lights: ViewLights, least: int = Gathering.NOWHERE) -> PathSettings:
+        """Settings of paths of which ``lights`` carry a part; without lights, vertices are gathered by ``least``."""
+        # Lights that stand for emitters alone are gathered at x1 only: at the few later vertices that are lit, they
+        # would add more variance than they take away
+        gathering = Gathering.EVERYWHERE if lights.surfaces else Gathering.AT_FIRST if lights.emitters else least
         longest = dr.opaque(mi.UInt32, int(min(self.rules.max_depth, 0xFFFFFFFF)))
         squared_c, of_emitters = (
             dr.opaque(mi.Float, (x.smallest_distance if x else _WHOLE) ** 2) for x in (lights.surfaces, lights.emitters)
         )
-        return Limits(
+        return PathSettings(
             longest, dr.opaque(mi.UInt32, self.rules.rr_depth), squared_c, dr.opaque(mi.UInt32, gathering),
-            dr.opaque(mi.Bool, lights.emitters is not None), of_emitters, self.worth, self.perturbed,
+            dr.opaque(mi.Bool, lights.emitters is not None), of_emitters, self.outgoing, self.perturbed,
             self.rules.hide_emitters,
         )  # fmt: skip
-
-    def follow(self, lane, limits: Limits, *stream: int):
-        """Follow the camera rays ``lane`` (UInt32): see :func:`vpl.split.remainder.follow`."""
-        seed, ray = derived_seed(self.seed, *stream), self.ray
-        part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
-        importance = dr.gather(mi.Float, self.importance, lane // dr.opaque(mi.UInt32, self.samples))
-        edge = FirstEdge.of_camera(part, importance, dr.gather(mi.Bool, self.active, lane))
-        numbers = SpreadNumbers(lane, self.samples, derived_seed(seed, 0))
-        sampler = independent_sampler(derived_seed(seed, 1), dr.width(lane))
-        return follow(self.scene, self.emission, edge, numbers, sampler, limits)

@@ -18,6 +18,7 @@ from ..lights.light_tree import Node
 from ..lights.virtual_lights import AT_INFINITY
 from ..points.bsdf_proxies import MaterialProxy
 from ..points.surfaces import Receiver
+from .carried_share import carried_geometry_term
 
 
 def cosine_to_box(axis, center, extent, distance2, radius):
@@ -76,8 +77,8 @@ def contribution_bound(kind: str, receiver: Receiver, node: Node, smallest_dista
         factor = _geometry_bound(kind, node, center, extent, distance2, radius, smallest_distance)
     reflected = channel_mean(_material_bound(proxy, cosine, mirror) * node.intensity)
     if kind == "surface":
-        # G / (1 + c² G) grows with the geometry term G
-        factor = dr.rcp(dr.rcp(factor * cosine) + dr.square(smallest_distance))
+        # w G grows with the geometry term G
+        factor = carried_geometry_term(dr.square(smallest_distance), factor * cosine)
         reflected = channel_mean(proxy.base * node.intensity) & (cosine > 0)
     # A point inside a flat box has an infinite factor and no cosine: that is nothing, not NaN
     return dr.select(reflected > 0, factor * reflected, 0)

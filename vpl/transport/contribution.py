@@ -1,13 +1,12 @@
-"""What one virtual light contributes to one gather point, and how much of it arrives: the only place for both.
+"""Contribution of one virtual light to one gather point, and its visibility: the only place for both.
 
-Opaque surfaces block.  Surfaces that let light pass unscattered (masks, thin glass) dim it by their transmission, but
-only for lights that a camera path could also reach by passing through them; towards point lights, spots and directional
-emitters they block, because no path that Mitsuba's ``path`` counts passes there, and towards surface lights because
-what passes there is traced.  Each of them that a shadow ray passes is an edge more of its path, as in ``path``.
+Opaque surfaces block.  Null surfaces, which let light pass unscattered (masks, thin glass), dim the light of oriented
+and environment lights by their transmission, and count as an edge of the path, as in Mitsuba's ``path``.  Null surfaces
+block point lights, spots and directional emitters, because ``path`` counts no path through them, and surface lights,
+because ``manylights`` traces the light that passes.
 
-Points on emitters that are no virtual lights are sampled in :mod:`vpl.direct`, by ``emitter_sampling`` and
-``cluster_sampling``, which trace their own shadow rays: as in ``path`` every surface blocks these, and what shines
-through masks and glass is found by BSDF samples.
+Emitters that are no virtual lights are sampled in :mod:`vpl.direct`, whose modules trace their own shadow rays: every
+surface blocks these, and BSDF samples find the light through masks and glass, as in ``path``.
 """
 
 from __future__ import annotations
@@ -17,19 +16,19 @@ import mitsuba as mi
 
 from ..core.arrays import finite_or_zero, rgb_to_spectrum
 from ..lights.virtual_lights import AT_INFINITY, Light, geometry
+from .carried_share import carried_share
 
 
 def contribution(kind: str, surface, light: Light, smallest_distance, active=True):
     """Radiance that leaves a surface due to an unoccluded light: BSDF × cosine × geometry × intensity.
 
-    ``surface``: see :mod:`vpl.points.surfaces`, Lambertian for surface lights; ``smallest_distance``: for these, c of
-    :mod:`vpl.split.floors`.  Values that are not finite count as zero.
+    ``surface``: see :mod:`vpl.points.surfaces`, Lambertian for surface lights, whose contribution is multiplied by w;
+    ``smallest_distance``: the clamp, or c for surface lights.  Values that are not finite count as zero.
     """
     to_light, factor = geometry(kind, surface.interaction.p, light, smallest_distance)
     if kind == "surface":
-        # The share w = 1 / (1 + c² cosθ1 cosθ2 / d²) is theirs
         cosine = dr.maximum(dr.dot(surface.normal, to_light), 0)
-        factor /= 1 + dr.square(smallest_distance) * cosine * factor
+        factor *= carried_share(dr.square(smallest_distance), cosine * factor)
     active = active & (factor > 0)
     reflected = surface.reflected(to_light, active)
     return finite_or_zero(reflected * rgb_to_spectrum(light.intensity) * factor) & active

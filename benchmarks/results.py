@@ -1,0 +1,138 @@
+"""Result files: the numbers of one part of a benchmark, from which docs/tables.py fills the tables of the documents."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shlex
+import subprocess
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+from comparison import machine
+
+ROOT = Path(__file__).resolve().parents[1]
+DIGITS = 6
+CHANGED_SOURCES = ("status", "--porcelain", "-uno", "--", ".", ":!docs", ":!*.md")
+# Quantities that a row may hold, with their units
+UNITS = {
+    "absolute": "mean absolute error of pixels, fraction of the mean of the image",
+    "bias": "excess of the mean over that of `path` or of the reference, fraction",
+    "bias_deviation": "standard error of the bias, fraction",
+    "bounds": "upper bounds computed per pixel",
+    "columns": "columns of the light matrix per slice",
+    "cost": "sum of cluster sizes, relative to the root of the tree",
+    "cpu_seconds": "s of processor time, all threads",
+    "cut": "clusters or pairs per pixel",
+    "depth": "levels of the tree",
+    "error": "property `error`",
+    "fewer_rays": "shadow rays of the other method over those of this one, at equal error",
+    "hidden": "whether the noise of the reference exceeds the error",
+    "light_paths": "light paths of a render",
+    "lights": "number of lights",
+    "load_seconds": "s",
+    "memory": "GiB at the peak, above the loaded scene where `path` has none",
+    "product": "relative variance times s",
+    "product_ratio": "product over that of the chosen number of light paths",
+    "rate": "shadow rays over matrix entries",
+    "rays": "shadow rays per pixel",
+    "rays_per_second": "million shadow rays per s",
+    "relative_l1": "mean absolute error of gather points, fraction of the mean of the image",
+    "relmse": "relative mean squared error, without the largest 0.1%",
+    "rmse": "root mean square error, fraction of the mean of the image",
+    "samples": "samples per pixel",
+    "second_seconds": "s of the second render of a process",
+    "seconds": "s",
+    "set_deviation": "standard deviation of the mean between sets of lights, fraction",
+    "shared_seconds": "s for lights, trees and gather points",
+    "slowdown": "seconds over those with one sample per pixel",
+    "speedup": "time of the other method over that of this one, at equal error",
+    "tree_seconds": "s",
+}
+
+
+def add_json_option(parser) -> None:
+    """Add the option ``--json FILE`` to an argument parser."""
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows of the one part to a result file")
+
+
+def check_json_option(parser, options) -> None:
+    """End the program with a message if ``--json`` is given with several ``--parts``."""
+    if options.json and len(options.parts) != 1:
+        parser.error(f"--json takes one part, --parts names {len(options.parts)}: {' '.join(options.parts)}")
+
+
+def write_results(path, part: str, settings: dict, rows: dict) -> None:
+    """Write the result file of one part.
+
+    ``rows``: {row: {quantity: number}}, or {row: {method: {quantity: number}}}, where a row is a scene, and the
+    quantities are keys of ``UNITS``. The file replaces an older one at once. Raises ValueError for an unknown
+    quantity or a number that is not finite.
+    """
+    quantities: set = set()
+    rows = {str(name): _checked(row, str(name), quantities) for name, row in rows.items()}
+    content = {
+        "command": command(),
+        "part": part,
+        "commit": commit(),
+        "date": datetime.now(UTC).date().isoformat(),
+        "machine": described_machine(),
+        "settings": settings,
+        "units": {name: UNITS[name] for name in sorted(quantities)},
+        "rows": rows,
+    }
+    path = Path(path)
+    unfinished = path.with_name(f"{path.name}.part")
+    unfinished.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    os.replace(unfinished, path)
+
+
+def _checked(row: dict, place: str, quantities: set) -> dict:
+    """Round the numbers of a row to ``DIGITS`` digits, and collect its quantities."""
+    found = {}
+    for name, value in row.items():
+        if isinstance(value, dict):
+            found[name] = _checked(value, f"{place}: {name}", quantities)
+            continue
+        if name not in UNITS:
+            raise ValueError(f"{place} has the unknown quantity {name!r}; allowed are {', '.join(UNITS)}")
+        if not math.isfinite(value):
+            raise ValueError(f"{place}: {name} is {value}; allowed are finite numbers")
+        quantities.add(name)
+        found[name] = value if isinstance(value, int) else float(f"{value:.{DIGITS}g}")
+    return found
+
+
+def command() -> str:
+    """The command line of this process, without ``--json FILE``."""
+    program, *arguments = sys.argv
+    if "--json" in arguments:
+        place = arguments.index("--json")
+        del arguments[place : place + 2]
+    return shlex.join(["./run", "--", "python", os.path.relpath(program, ROOT), *arguments])
+
+
+def commit() -> str:
+    """Short hash of the commit of this project, with ``+changes`` if tracked files other than documents differ."""
+
+    def git(*arguments):
+        return subprocess.run(["git", *arguments], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+
+    return git("rev-parse", "--short", "HEAD") + ("+changes" if git(*CHANGED_SOURCES) else "")
+
+
+def described_machine() -> dict:
+    """Processor, number of cores, and vector width in 32-bit numbers."""
+    found = machine.describe()
+    return {"processor": found["processor"], "cores": found["cores"], "vector_width": vector_width()}
+
+
+def vector_width() -> int | None:
+    """32-bit numbers in the widest vector register, for which Dr.Jit compiles; None without /proc/cpuinfo."""
+    try:
+        flags = set(Path("/proc/cpuinfo").read_text().split())
+    except OSError:
+        return None
+    return 16 if "avx512vl" in flags else 8 if "avx" in flags else 4

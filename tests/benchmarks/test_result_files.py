@@ -1,0 +1,66 @@
+"""Result files of benchmarks: contents, the option `--json`, and refused quantities and numbers."""
+
+import argparse
+import json
+import sys
+
+import pytest
+
+from benchmarks import results
+
+
+@pytest.fixture
+def run_as(monkeypatch):
+    """Set the command line of this process."""
+
+    def set_command(*arguments):
+        monkeypatch.setattr(sys, "argv", [str(results.ROOT / "benchmarks" / "lightcuts.py"), *arguments])
+
+    return set_command
+
+
+def test_a_file_holds_its_origin_and_its_rows(run_as, tmp_path, monkeypatch):
+    run_as("--parts", "cold", "--json", "a.json", "--scenes", "kitchen")
+    monkeypatch.setattr(results, "commit", lambda: "0123456")
+    rows = {"kitchen": {"path": {"seconds": 1 / 3, "hidden": True}, "lights": 4}}
+    results.write_results(tmp_path / "a.json", "cold", {"width": 256}, rows)
+    found = json.loads((tmp_path / "a.json").read_text())
+    assert found["command"] == "./run -- python benchmarks/lightcuts.py --parts cold --scenes kitchen"
+    assert found["commit"] == "0123456" and found["part"] == "cold" and found["settings"] == {"width": 256}
+    assert found["machine"]["cores"] >= 1
+    assert found["rows"] == {"kitchen": {"path": {"seconds": 0.333333, "hidden": True}, "lights": 4}}
+    assert set(found["units"]) == {"seconds", "hidden", "lights"}
+    assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_the_commit_tells_of_changes(monkeypatch):
+    answers = {"rev-parse": "0123456\n", "status": " M README.md\n"}
+
+    def git(command, **_):
+        return argparse.Namespace(stdout=answers[command[1]])
+
+    monkeypatch.setattr(results.subprocess, "run", git)
+    assert results.commit() == "0123456+changes"
+    answers["status"] = ""
+    assert results.commit() == "0123456"
+
+
+@pytest.mark.parametrize(
+    "row, message",
+    [({"second": 1.0}, "unknown quantity 'second'"), ({"path": {"seconds": float("nan")}}, "seconds is nan")],
+)
+def test_unknown_quantities_and_numbers_that_are_not_finite_are_refused(row, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        results.write_results(tmp_path / "a.json", "cold", {}, {"kitchen": row})
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_file_takes_one_part(capsys):
+    parser = argparse.ArgumentParser()
+    results.add_json_option(parser)
+    parser.add_argument("--parts", nargs="+")
+    results.check_json_option(parser, parser.parse_args(["--json", "a.json", "--parts", "cold"]))
+    results.check_json_option(parser, parser.parse_args(["--parts", "cold", "path"]))
+    with pytest.raises(SystemExit):
+        results.check_json_option(parser, parser.parse_args(["--json", "a.json", "--parts", "cold", "path"]))
+    assert "--parts names 2" in capsys.readouterr().err

@@ -1,0 +1,227 @@
+"""Denoising: auxiliary features, the error, and files."""
+
+import re
+import subprocess
+import sys
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import compare
+import manylights
+from comparison import images
+from comparison.denoising import Denoiser, auxiliary_features
+from tests.support.comparisons import results_of
+from tests.support.paths import CORNELL
+from tests.support.rendering import render
+from tests.support.scenes import cornell, sensor, wall
+
+RED = (0.6, 0.1, 0.2)
+
+
+def features(spp=64, size=8, **things):
+    scene = mi.load_dict({"type": "scene", "sensor": sensor(size), **things})
+    found = auxiliary_features(scene, scene.sensors()[0], spp, 0)
+    assert all(plane.shape == (size, size, 3) and plane.dtype == np.float32 for plane in found.values())
+    assert np.isfinite(found["albedo"]).all() and np.isfinite(found["normal"]).all()
+    return found["albedo"], found["normal"]
+
+
+def red_wall(**more):
+    """Behind what is at the origin, and larger than the image."""
+    return {"behind": wall([0, 0, -1], [0, 1, 0], 0, 5, RED), **more}
+
+
+def screen(bsdf):
+    return wall([0, 0, 0], [0, 1, 0], 0, 5, bsdf=bsdf)
+
+
+def test_features_are_those_of_the_surface_that_is_seen():
+    albedo, normal = features(**red_wall())
+    np.testing.assert_allclose(albedo, np.broadcast_to(RED, albedo.shape), rtol=1e-4)
+    np.testing.assert_allclose(normal, np.broadcast_to((0, 0, 1), normal.shape), atol=1e-5)
+
+
+def test_normals_are_turned_towards_the_viewer():
+    two_sided = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+    _, normal = features(away=wall([0, 0, 0], [0, 1, 0], 180, 5, bsdf=two_sided))
+    np.testing.assert_allclose(normal, np.broadcast_to((0, 0, 1), normal.shape), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "passed"),
+    [
+        ({"type": "thindielectric"}, 1.0),
+        ({"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0}, 1.0),
+        ({"type": "mask", "opacity": 0.0, "nested": {"type": "diffuse"}}, 1.0),
+        ({"type": "null"}, 1.0),
+        ({"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse", "reflectance": 0.0}}, 0.5),
+    ],
+)
+def test_features_are_those_behind_glass_and_masks(bsdf, passed):
+    albedo, normal = features(512, screen=screen(bsdf), **red_wall())
+    np.testing.assert_allclose(albedo.mean((0, 1)), passed * np.array(RED), rtol=0.12 if passed == 1 else 0.05)
+    np.testing.assert_allclose(normal[..., 2].mean(), 1, rtol=0.12)
+
+
+def test_features_are_those_in_a_mirror():
+    """A mirror at 45 degrees shows a wall at the side."""
+    mirror = {"type": "conductor", "specular_reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
+    albedo, normal = features(
+        mirror=wall([0, 0, 0], [0, 1, 0], 45, 5, bsdf=mirror), side=wall([9, 0, 0], [0, 1, 0], -90, 50, RED)
+    )
+    np.testing.assert_allclose(albedo, np.broadcast_to(0.5 * np.array(RED), albedo.shape), rtol=1e-3)
+    np.testing.assert_allclose(normal, np.broadcast_to((-1, 0, 0), normal.shape), atol=1e-5)
+
+
+def test_plastic_is_what_is_seen_of_it():
+    albedo, normal = features(512, screen=screen({"type": "plastic", "diffuse_reflectance": 0.4}), **red_wall())
+    np.testing.assert_allclose(normal, np.broadcast_to((0, 0, 1), normal.shape), atol=1e-5)
+    np.testing.assert_allclose(albedo[..., 0], albedo[..., 1], rtol=1e-4)  # nothing of what is behind
+    assert 0.2 < albedo.mean() < 0.5
+
+
+def test_emitters_are_seen_and_nothing_is_black():
+    albedo, normal = features()
+    assert (albedo == 0).all() and (normal == 0).all()
+    albedo, normal = features(sky={"type": "constant", "radiance": {"type": "rgb", "value": [0.25, 0.5, 30.0]}})
+    np.testing.assert_allclose(albedo, np.broadcast_to((0.25, 0.5, 1), albedo.shape), rtol=1e-4)
+    assert (normal == 0).all()
+
+
+def test_mirrors_that_face_each_other_end():
+    mirrors = {
+        f"m{z}": wall([0, 0, z], [0, 1, 0], 0 if z < 0 else 180, 50, bsdf={"type": "conductor"}) for z in (-1, 5)
+    }
+    albedo, normal = features(**mirrors)
+    assert (albedo == 0).all() and (normal == 0).all()
+
+
+def squared_error(image, exact):
+    return np.mean(np.square(image - exact) / (np.square(exact) + 0.01 * exact.mean() ** 2))
+
+
+@pytest.fixture(scope="module")
+def exact(variant):
+    return render(cornell(64).load(), "path", 2048, 99, max_depth=6)
+
+
+@pytest.mark.parametrize("integrator", ["path", "lightcuts", "manylights"])
+def test_denoised_image_is_closer_to_the_reference(exact, integrator):
+    scene = cornell(64).load()
+    image, took = manylights.render(scene, mi.load_dict({"type": integrator, "max_depth": 6}), spp=16, denoise=True)
+    raw, denoised = (squared_error(one.numpy(), exact) for one in (took.raw, image))
+    assert denoised < (1 if integrator == "lightcuts" else 0.3) * raw
+    assert abs(image.numpy().mean() / exact.mean() - 1) < 0.02
+    assert 0 < took.denoise_seconds < took.seconds
+
+
+def test_the_raw_image_is_the_one_without_denoising():
+    scene = cornell().load()
+    np.testing.assert_allclose(
+        manylights.render(scene, spp=4, denoise=True)[1].raw.numpy(), manylights.render(scene, spp=4)[0].numpy()
+    )
+
+
+def test_time_includes_denoising(monkeypatch):
+    """What the filter will take is reserved."""
+    told = []
+    original = manylights.render.__globals__["PassSizes"]
+
+    def sizes(pixels, spp, time, *more, **keywords):
+        told.append(time)
+        return original(pixels, spp, time, *more, **keywords)
+
+    monkeypatch.setitem(manylights.render.__globals__, "PassSizes", sizes)
+    manylights.render(cornell().load(), time=1, denoise=True)
+    assert 0 < told[0] < 1
+
+
+def test_only_colour_is_denoised_and_bad_pixels_stay_alone():
+    scene = cornell(32).load()
+    image = np.random.default_rng(0).random((32, 32, 5)).astype(np.float32)
+    image[3, 4, 1] = np.nan
+    channels = ["R", "G", "B", "A", "cut_size"]
+    found = Denoiser(scene).denoise(image, channels)
+    assert np.isfinite(found).all() and found.shape == image.shape
+    np.testing.assert_array_equal(found[..., 3:], image[..., 3:])
+    assert found[..., :3].std() < image[..., [0, 2]].std()
+
+
+def command(*arguments):
+    try:
+        return manylights.main([CORNELL, "-D", "resx=24", "-D", "resy=24", "--spp", "4", *map(str, arguments)])
+    except SystemExit as error:
+        return error.code
+
+
+def test_denoised_exr_is_beside_the_raw_one(tmp_path):
+    assert command("-o", tmp_path / "a.exr", "--denoise") == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.denoised.exr", "a.exr"]
+    raw, _, _ = images.read_exr(tmp_path / "a.exr")
+    denoised, _, metadata = images.read_exr(tmp_path / "a.denoised.exr")
+    assert command("-o", tmp_path / "b.exr") == 0
+    np.testing.assert_array_equal(raw, images.read_exr(tmp_path / "b.exr")[0])
+    assert raw.shape == denoised.shape and np.abs(raw - denoised).max() > 0.01
+    assert 0 < metadata["denoise_seconds"] < metadata["render_seconds"]
+
+
+def test_png_shows_the_denoised_image(tmp_path):
+    assert command("-o", tmp_path / "a.png", "--denoise", "--exposure", "0") == 0
+    assert command("-o", tmp_path / "a.exr", "--denoise") == 0
+    denoised, channels, _ = images.read_exr(tmp_path / "a.denoised.exr")
+    expected = images.tone_map(images.colour(denoised, channels), 1.0)
+    assert np.abs(images.read_png(tmp_path / "a.png").astype(int) - expected).max() <= 1
+
+
+def test_without_the_package_the_message_says_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
+    assert command("-o", tmp_path / "a.exr", "--denoise") == 1
+    assert "needs the package 'mitsuba_oidn'; pip install 'manylights[denoise]'" in capsys.readouterr().err
+    with pytest.raises(ModuleNotFoundError, match="manylights\\[denoise\\]"):
+        manylights.render(cornell().load(), denoise=True)
+    assert command("-o", tmp_path / "a.exr") == 0  # nothing else needs it
+
+
+def test_mono_variant(tmp_path):
+    script = f"""
+import manylights
+size = ["-D", "resx=24", "-D", "resy=24"]
+assert manylights.main([{CORNELL!r}, *size, "-o", "a.exr", "-m", "llvm_ad_mono", "--spp", "4", "--denoise"]) == 0
+"""
+    environment = {"cwd": tmp_path, "capture_output": True, "text": True}
+    root = manylights.__file__.rpartition("/")[0]
+    done = subprocess.run([sys.executable, "-c", f"import sys; sys.path.insert(0, {root!r}){script}"], **environment)
+    assert done.returncode == 0, done.stderr
+    assert images.read_exr(tmp_path / "a.denoised.exr")[1] == ["Y"]
+
+
+def test_comparison_shows_raw_and_denoised(tmp_path, capsys):
+    arguments = [
+        CORNELL, "-i", "path,direct", "--spp", "8", "--seeds", "2", "--width", "64", "--reference", "path:512", "-o",
+        str(tmp_path / "out"), "--cache", str(tmp_path / "cache"), "--denoise",
+    ]  # fmt: skip
+    assert compare.main(arguments) == 0
+    first = results_of(tmp_path / "out")["scenes"][0]
+    labels = [render["label"] for render in first["renders"]]
+    assert labels == ["path", "path, denoised", "direct", "direct, denoised"] + [
+        "direct", "direct, denoised", "path", "path, denoised"
+    ]  # fmt: skip
+    for raw, denoised in zip(first["renders"][::2], first["renders"][1::2], strict=True):
+        assert denoised["denoised"] and not raw["denoised"]
+        assert denoised["seconds"] == raw["seconds"] + raw["denoise_seconds"] > raw["seconds"]
+        for one in (raw, denoised):
+            assert images.read_exr_metadata(one["output"])["run"] == raw["run"]
+    path, denoised = first["renders"][:2]
+    assert denoised["errors"]["relmse_trimmed"] < 0.7 * path["errors"]["relmse_trimmed"]
+    assert {point["label"] for point in first["points"]} >= {"path", "path, denoised"}
+    assert (tmp_path / "out" / "cornell.path.denoised.png").is_file()
+    page = (tmp_path / "out" / "report.html").read_text()
+    titles = re.findall('"title": "([^"]*)"', page)
+    assert titles == ["reference", "path", "path, denoised", "direct", "direct, denoised"]
+    assert "\npath, denoised  " in capsys.readouterr().out
+
+    assert compare.main([*arguments, "--resume"]) == 0
+    again = results_of(tmp_path / "out")["scenes"][0]
+    assert [render["seconds"] for render in again["renders"]] == [render["seconds"] for render in first["renders"]]

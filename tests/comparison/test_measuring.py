@@ -1,0 +1,111 @@
+"""Passes of an image for a time budget or a number of samples, and the measured passes among them."""
+
+import pytest
+
+from comparison import measuring, rendering, worker
+
+
+class Recorded(rendering.Progressive):
+    """A render with prescribed durations, by default one second per sample after ``start``; it records requests."""
+
+    def __init__(self, pixels, *seconds, start=0.0):
+        self._pixels, self._seconds, self._start, self.asked = pixels, list(seconds), start, []
+        self.restart()
+
+    pixels, integrator = property(lambda self: self._pixels), None
+
+    def render(self, spp, seed=None):
+        self.asked.append((spp, seed is not None))
+        seconds = self._seconds.pop(0) if self._seconds else self._start + spp
+        self.passes.append(rendering.Pass(seed or 0, spp, seconds))
+        return self.passes[-1]
+
+
+def test_kernels_of_every_size_of_pass_are_compiled_before_the_clock_runs():
+    job = worker.Job("p", "path", "s.xml", "a.exr", spp=19)
+    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 9, 2.0)
+    assert measuring.measure(progressive, job) == 2.0
+    assert progressive.asked == [(5, True), (1, True), (5, True), (9, True), (9, False), (9, False), (1, False)]
+    assert sum(one.spp for one in progressive.passes) == 19
+
+
+def test_only_small_passes_compile_where_passes_are_long():
+    job = worker.Job("p", "path", "s.xml", "a.exr", spp=16)
+    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 16, measuring.LONG_PASS + 1, measuring.LONG_PASS / 2)
+    measuring.measure(progressive, job)
+    assert progressive.asked == [(4, True), (4, True), (16, False)]
+
+
+def test_what_compiles_for_longer_than_the_budget_is_measured_warm():
+    progressive = Recorded(100, 60.0)
+    cold = measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=30))
+    assert cold == 60 and progressive.seconds == 30 == progressive.spp
+    progressive = Recorded(100, 60.0, start=40.0)
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=30))
+    assert progressive.seconds == 41 and progressive.spp == 1
+
+
+@pytest.mark.parametrize(
+    ("effort", "passes"),
+    [
+        ({"spp": 20}, [16, 4]),
+        ({"budget": 8.0, "pass_spp": 2}, [2, 2]),
+        ({"budget": 20.0}, [4, 4, 4, 4, 2]),
+        ({"budget": 5.0}, [4]),
+    ],
+)
+def test_cold_images_hold_every_pass(effort, passes):
+    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 16, 6.0)
+    assert measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", cold=True, **effort)) == 6
+    assert progressive.asked == [(spp, False) for spp in passes]
+    assert [one.spp for one in progressive.passes] == passes
+
+
+@pytest.mark.parametrize(
+    ("budget", "pass_spp", "passes"),
+    [
+        (35, 10, [10, 10, 10, 5]),
+        (30, 10, [10, 10, 10]),
+        (33, 10, [10, 10, 10, 4]),  # 4 are nearer to 3 than none
+        (31, 10, [10, 10, 10]),
+        (4.9, 2, [2, 2]),
+        (5.6, 2, [2, 2, 2]),
+        (3.4, 1, [1, 1, 1]),
+        (12, 10, [10]),
+    ],
+)
+def test_the_last_pass_fills_the_budget(budget, pass_spp, passes):
+    progressive = Recorded(100)
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget, pass_spp=pass_spp))
+    assert [one.spp for one in progressive.passes] == passes
+    assert abs(progressive.seconds - budget) <= min(pass_spp, measuring.WARM_SPP) / 2
+
+
+@pytest.mark.parametrize(
+    ("budget", "start", "passes"),
+    [
+        (30, 2, [8, 8, 8]),
+        (30, 4, [11, 11]),  # starting them takes no more than three tenths
+        (30, 15, [1, 1]),  # one sample takes half of it
+        (10_000, 0, [2048, 2048, 2048, 2048, 1808]),  # the largest pass
+    ],
+)
+def test_passes_are_as_large_as_the_cost_of_starting_one_asks_for(budget, start, passes):
+    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 2048, start=float(start))
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget))
+    assert [one.spp for one in progressive.passes] == passes and abs(progressive.seconds - budget) <= 2
+
+
+def test_passes_may_turn_out_to_be_slower_or_faster():
+    assert measuring._samples_of_a_pass(Recorded(100, 1.0, 4.0, 5.0, 4.0, 50.0, 50.0), 30, iter(range(100)))[0] == 2
+    # Of two passes of one size, the first may have compiled
+    assert measuring._samples_of_a_pass(Recorded(100, 1.0, 4.0, 5.0, 4.0, 50.0, 10.0), 30, iter(range(100)))[0] == 10
+    progressive = Recorded(100, 13.0, 13.0, 16.0, 17.0, 16.0, 30.0, 25.5, start=12.0)
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=30))
+    assert progressive.seconds == 25.5  # four more samples would take 15 seconds
+
+
+def test_cold_images_go_on_after_a_size_that_compiled():
+    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 64, 2.0, 0.04, 2.0, 0.08, 0.16, 0.16)
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", cold=True, budget=8.0))
+    assert [spp for spp, _ in progressive.asked][:7] == [4, 4, 8, 8, 16, 16, 32]

@@ -1,0 +1,161 @@
+"""Sizes of passes, with integrators whose cost is made up."""
+
+from collections import Counter
+
+import pytest
+
+from comparison.pass_sizes import PASS_SECONDS, PassSizes
+from comparison.rendering import MAXIMUM_PASS_SAMPLES, Pass
+
+SQUARE = 256 * 256
+
+
+def render(pixels, start, each, compilation=3.0, more=None, slow=None, **limits):
+    """Passes that take `start` seconds and `each` per sample, three times that from number `slow` on, and once for each
+    kernel `compilation`, or `more` but for the first: (passes, why the render ended)."""
+    sizes, passes, elapsed, kernels = PassSizes(pixels, **limits), [], 0.0, set()
+    while len(passes) < 2000:
+        spp = sizes.next(passes, elapsed)
+        if isinstance(spp, str):
+            return passes, spp
+        kernel = spp if spp < 4 or spp & (spp - 1) else "usual"
+        seconds = start + each * spp + (0 if kernel in kernels else compilation)
+        compilation = compilation if more is None else more
+        seconds *= 3 if slow is not None and len(passes) >= slow else 1
+        kernels.add(kernel)
+        passes.append(Pass(0, spp, seconds))
+        elapsed += seconds
+    raise AssertionError("endless")
+
+
+@pytest.mark.parametrize("spp", [*range(1, 20), 64, 100, 1023])
+@pytest.mark.parametrize("each", [0.001, 0.3, 40.0])
+def test_samples_are_those_that_were_asked_for(spp, each):
+    passes, ended_by = render(SQUARE, 0.1, each, spp=spp)
+    assert sum(one.spp for one in passes) == spp and ended_by == "spp"
+
+
+@pytest.mark.parametrize("start", [0.0, 0.5])
+@pytest.mark.parametrize("each", [0.001, 0.02, 0.3])
+def test_passes_take_about_two_seconds_and_repeat(start, each):
+    passes, _ = render(SQUARE // 16, start, each, time=120)
+    usual, count = Counter(one.spp for one in passes).most_common(1)[0]
+    assert count > 0.7 * len(passes)
+    assert passes[-2].seconds <= 1.5 * PASS_SECONDS
+    assert 2 * (start + each * usual) > PASS_SECONDS or usual * SQUARE // 16 == MAXIMUM_PASS_SAMPLES
+    assert len({one.spp for one in passes if one.spp < 4}) == 0
+
+
+def test_passes_that_take_long_are_as_small_as_can_be():
+    passes, _ = render(SQUARE, 1.0, 5.0, spp=64)
+    assert passes[0].spp == passes[1].spp == 4
+    assert {one.spp for one in passes[2:]} == {1}
+
+
+def test_large_images_begin_with_one_sample():
+    passes, _ = render(1 << 21, 0.1, 0.2, spp=20)
+    assert [one.spp for one in passes] == [1] * 20
+    passes, _ = render(1 << 19, 0.1, 0.1, compilation=0.1, spp=20)
+    assert [one.spp for one in passes] == [1, 4, 4, 4, 4, 3]
+
+
+@pytest.mark.parametrize("start", [0.7, 1.4, 2.4])
+@pytest.mark.parametrize("each", [0.01, 0.2, 1.0])
+def test_in_parts_a_quarter_of_a_pass_starts_it(start, each):
+    passes, _ = render(SQUARE // 16, start, each, time=200, more=0.1, in_parts=True)
+    usual, count = Counter(one.spp for one in passes).most_common(1)[0]
+    assert count > 0.5 * len(passes)
+    # Sizes are powers of two
+    assert 0.12 < start / (start + each * usual) < 0.4 or usual * SQUARE // 16 == 4 * MAXIMUM_PASS_SAMPLES
+    assert max(one.seconds for one in passes) < 1.5 * 10
+
+
+@pytest.mark.parametrize("each", [0.02, 0.3])
+def test_in_parts_passes_that_cost_nothing_to_start_are_no_longer(each):
+    passes, _ = render(SQUARE // 16, 0.0, each, time=120, more=0.1, in_parts=True)
+    assert passes[-2].seconds <= 1.5 * PASS_SECONDS
+    assert sum(one.seconds > 2 * PASS_SECONDS for one in passes) <= 3
+
+
+def test_in_parts_large_images_are_not_left_with_one_sample():
+    passes, _ = render(1 << 20, 2.4, 0.9, time=60, more=0.1, in_parts=True)
+    assert {one.spp for one in passes[3:-1]} <= {4, 8}
+    passes, _ = render(1 << 20, 6.0, 1.5, time=60, more=0.1, in_parts=True)
+    assert {one.spp for one in passes[3:-1]} <= {2, 4}
+
+
+@pytest.mark.parametrize("spp", [*range(1, 20), 64, 100, 1023])
+def test_in_parts_samples_are_those_that_were_asked_for_and_no_small_pass_ends_them(spp):
+    passes, ended_by = render(SQUARE // 2, 0.7, 0.05, spp=spp, more=0.1, in_parts=True)
+    assert sum(one.spp for one in passes) == spp and ended_by == "spp"
+    assert passes[-1].spp >= passes[-2].spp / 2 if len(passes) > 1 else passes[-1].spp < 8
+    assert max(one.spp for one in passes) <= 4 * MAXIMUM_PASS_SAMPLES // (SQUARE // 2)
+
+
+@pytest.mark.parametrize("start", [9.0, 12.0, 25.0])
+def test_in_parts_a_start_of_ten_seconds_is_worth_many_samples(start):
+    passes, _ = render(SQUARE // 4, start, 0.01, time=600, more=0.1, in_parts=True)
+    usual = Counter(one.spp for one in passes).most_common(1)[0][0]
+    # A pass has at most 512 samples
+    assert usual >= 256
+    assert max(one.seconds for one in passes) < 3 * start
+
+
+@pytest.mark.parametrize("in_parts", [False, True])
+@pytest.mark.parametrize("start", [0.1, 1.0])
+def test_sizes_settle_when_the_machine_gets_slower(start, in_parts):
+    passes, _ = render(SQUARE // 16, start, 0.1, time=300, slow=10, more=0.1, in_parts=in_parts)
+    assert len({one.spp for one in passes[-10:-2]}) == 1
+
+
+@pytest.mark.parametrize("spp", [5, 6, 7, 60])
+def test_in_parts_an_error_has_more_than_one_pass_however_few_the_samples(spp):
+    passes, _ = render(SQUARE, 1.0, 0.1, spp=spp, many=True, more=0.1, in_parts=True)
+    assert len(passes) > 1 and sum(one.spp for one in passes) == spp
+
+
+@pytest.mark.parametrize("time", [10, 12, 13, 14, 20])
+def test_in_parts_only_a_last_pass_has_an_odd_size(time):
+    passes, ended_by = render(SQUARE, 0.3, 0.1, spp=100, time=time, more=0.1, in_parts=True)
+    odd = [one.spp for one in passes if one.spp & (one.spp - 1)]
+    assert odd == [] or (odd == [passes[-1].spp] and ended_by == "spp")
+
+
+def test_in_parts_an_error_still_has_many_passes():
+    passes, done = render(SQUARE, 2.0, 0.01, time=300, many=True, more=0.1, in_parts=True)[0], 0
+    for one in passes:
+        assert one.spp <= max(4, done / 8)
+        done += one.spp
+
+
+@pytest.mark.parametrize("start", [0.05, 1.0])
+@pytest.mark.parametrize("each", [0.002, 0.1, 0.4])
+@pytest.mark.parametrize("time", [5, 11, 60])
+@pytest.mark.parametrize("in_parts", [False, True])
+def test_time_is_used_and_not_exceeded_by_much(start, each, time, in_parts):
+    passes, ended_by = render(SQUARE // 4, start, each, time=time, more=0.1 if in_parts else None, in_parts=in_parts)
+    assert ended_by == "time"
+    least = min(one.seconds for one in passes)
+    assert abs(sum(one.seconds for one in passes) - time) <= least + 0.1
+
+
+def test_there_is_always_one_pass():
+    passes, ended_by = render(SQUARE, 5.0, 1.0, time=1)
+    assert len(passes) == 1 and ended_by == "time"
+
+
+def test_what_comes_first_ends_a_render():
+    assert render(SQUARE, 0.0, 0.1, time=1000, spp=20)[1] == "spp"
+    assert render(SQUARE, 0.0, 0.1, time=10, spp=2000)[1] == "time"
+
+
+def test_sizes_that_are_given_stay():
+    passes, _ = render(SQUARE, 0.0, 0.1, spp=20, fixed=6)
+    assert [one.spp for one in passes] == [6, 6, 6, 2]
+
+
+def test_for_an_error_there_are_many_passes_of_similar_sizes():
+    passes, done = render(SQUARE // 16, 0.0, 1e-4, time=20, many=True)[0], 0
+    for one in passes[:100]:
+        assert one.spp <= max(4, done / 8)
+        done += one.spp

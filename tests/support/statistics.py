@@ -1,0 +1,78 @@
+"""Statistical tests of images with a stated least detectable bias.
+
+A test of equal means is no stronger than the spread of its renders allows. :func:`compare_means` computes the least
+relative bias of the image mean that a test with this spread finds nine times in ten; :func:`assert_same_mean` fails if
+this bias exceeds the declared bound.
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy import optimize, stats
+
+# Least p value of a first sample that settles the matter, and of the four times larger sample that settles the others
+SCREENING, SIGNIFICANCE = 0.05, 0.01
+POWER = 0.9  # probability that a detectable bias is found
+CONFIRMATION = 4  # size of the second sample, in sizes of the first
+
+
+class Comparison(NamedTuple):
+    """Result of a test of equal means."""
+
+    p_value: float
+    detectable: float  # least relative bias of the image mean that is found with probability POWER
+
+
+def relative_error(image, expected):
+    """Sum of absolute differences over the sum of the expected values."""
+    return np.abs(image - expected).sum() / expected.sum()
+
+
+@cache
+def detectable_shift(count, significance):
+    """Least difference of a mean from 0, in standard errors, found with probability POWER by a two-sided t test."""
+    critical = stats.t.ppf(1 - significance / 2, count - 1)
+    return optimize.brentq(lambda shift: stats.nct.sf(critical, count - 1, shift) - POWER, 1, 10 * critical)
+
+
+def compare_means(pairs, tiles=4):
+    """Test images for equal means; ``pairs``: (found, expected) of each seed, arrays (height, width, channels).
+
+    Two t tests share the level [Šidák 1967]: a test of the image mean, and a test of the means of tiles and of
+    channels, with the least p value corrected for their number.
+    """
+    found, expected = (np.array(images) for images in zip(*pairs, strict=True))
+    count, height, width, channels = found.shape
+    difference = found - expected
+    means = difference.mean((1, 2, 3))
+    rows, columns = height // tiles, width // tiles
+    blocks = difference[:, : rows * tiles, : columns * tiles]
+    blocks = blocks.reshape(count, tiles, rows, tiles, columns, channels).mean((2, 4)).reshape(count, -1)
+    parts = np.concatenate([blocks, difference.mean((1, 2))], axis=1)
+    # Tiles that see nothing but an emitter differ by rounding alone
+    noisy = parts.std(0) > 1e-6 * np.abs(expected).mean()
+    assert noisy[-channels:].all(), "images without variance need no statistical test"
+    of_parts = corrected(stats.ttest_1samp(parts[:, noisy], 0).pvalue.min(), noisy.sum())
+    of_mean = stats.ttest_1samp(means, 0).pvalue
+    error = means.std(ddof=1) / np.sqrt(count) / expected.mean()
+    return Comparison(corrected(min(of_mean, of_parts), 2), detectable_shift(count, 1 - (1 - SCREENING) ** 0.5) * error)
+
+
+def corrected(p_value, count):
+    """Probability that the least of ``count`` independent p values is at most ``p_value`` [Šidák 1967]."""
+    return 1 - (1 - p_value) ** count
+
+
+def assert_same_mean(pair, seeds, finds=0.01, tiles=4):
+    """Fail if images differ in mean, or if their spread hides a relative bias of the image mean of ``finds``.
+
+    ``pair(seed)`` renders (found, expected), arrays (height, width, channels), for each seed of ``range(seeds)``.
+    A difference at the level SCREENING is tested again at the level SIGNIFICANCE with four times as many new seeds:
+    equal means fail once in 2000 tests, and a bias shows more clearly.
+    """
+    result = compare_means([pair(seed) for seed in range(seeds)], tiles)
+    assert result.detectable <= finds, f"a bias below {result.detectable:.2%} would go unseen"
+    if result.p_value <= SCREENING:
+        result = compare_means([pair(seed) for seed in range(seeds, (1 + CONFIRMATION) * seeds)], tiles)
+        assert result.p_value > SIGNIFICANCE, f"p value {result.p_value:.2g}"

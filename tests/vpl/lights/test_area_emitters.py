@@ -1,0 +1,66 @@
+"""Area emitters on shapes with a wrong density in Mitsuba: turned or textured spheres, smooth meshes."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests.support.rendering import render
+from tests.support.rooms import smooth_octahedron
+from tests.support.scenes import closed_box
+from tests.support.statistics import assert_same_mean
+
+# Plugins that find emitters in ways of their own, with light paths of two edges
+DIRECT = {
+    "nee": ("lightcuts", {"direct": "nee"}),
+    "vpl": ("vpl", {"direct": "vpl", "direct_count": 2000, "clamping": 0.0}),
+    "adaptivedirect": ("adaptivedirect", {"error": 0.1}),
+    "unoccludeddirect": ("unoccludeddirect", {"error": 0.5, "max_samples": 200}),
+    "manylights": ("manylights", {}),
+}
+
+
+def ball(radiance):
+    """A glowing sphere in the middle of the closed box, rotated off the axes of the world."""
+    turned = mi.ScalarTransform4f().translate([0, 0.1, 0]).rotate([0, 0, 1], 25).rotate([1, 0, 0], 60).scale(0.35)
+    return {"ball": {"type": "sphere", "to_world": turned, "emitter": {"type": "area", "radiance": radiance}}}
+
+
+def half_bright():
+    """A texture of large patches with a bright half."""
+    pixels = np.random.default_rng(3).uniform(0, 4, (4, 8, 3)).astype(np.float32)
+    pixels[1, :4] = 20
+    return {"type": "bitmap", "raw": True, "filter_type": "nearest", "bitmap": mi.Bitmap(pixels)}
+
+
+def assert_light_of_path(emitters, plugin, spp, max_depth=2, **more):
+    scene = mi.load_dict(closed_box(emitters, 16))
+
+    def pair(seed):
+        found = render(scene, plugin, spp, seed, max_depth=max_depth, **more)
+        return found, render(scene, "path", 1024, 1000 + seed, max_depth=max_depth)
+
+    assert_same_mean(pair, 8)
+
+
+@pytest.mark.parametrize("method", DIRECT)
+def test_a_textured_sphere_lights_from_where_its_texture_is_bright(method):
+    plugin, more = DIRECT[method]
+    assert_light_of_path(ball(half_bright()), plugin, 16, **more)
+
+
+def test_light_paths_leave_a_turned_sphere_outwards():
+    white = {"type": "rgb", "value": 4.0}
+    assert_light_of_path(ball(white), "vpl", 16, max_depth=3, vpl_count=2000, clamping=0.0)
+
+
+@pytest.mark.parametrize("method", ["adaptivedirect", "unoccludeddirect"])
+def test_a_mesh_with_vertex_normals_emits_to_the_side_of_its_shading_normals(method):
+    """``path`` itself takes shading normals for the density of what it draws by area: BSDF samples are right."""
+    plugin, more = DIRECT[method]
+    scene = mi.load_dict(closed_box(smooth_octahedron(), 16))
+    bsdf_samples = {"emitter_samples": 0, "bsdf_samples": 1}
+
+    def pair(seed):
+        return render(scene, plugin, 16, seed, **more), render(scene, "direct", 4096, 1000 + seed, **bsdf_samples)
+
+    assert_same_mean(pair, 8)

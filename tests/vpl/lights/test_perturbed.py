@@ -1,0 +1,105 @@
+"""Light that surfaces with bump or normal maps send on: means over seeds are those of ``path``."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests.support.rendering import render
+from tests.support.scenes import closed_box, image, rgb, sensor, wall
+from tests.support.statistics import assert_same_mean
+
+WHITE = {"type": "diffuse", "reflectance": rgb(0.8)}
+# Plugins with virtual lights, with settings for nearly the sum of all lights
+PLUGINS = {
+    "vpl": {},
+    "lightcuts": {"error": 0.001, "max_cut": 0},
+    "mdlightcuts": {"error": 0.001, "max_cut": 0},
+    "illuminationcut": {"error": 0.001, "max_cut": 0},
+}
+
+
+def turned(angle, nested=WHITE, **more):
+    """A material with a normal map that is the same everywhere: so many degrees towards x."""
+    normal = np.array([np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))])
+    return {"type": "normalmap", "normalmap": image(np.tile(0.5 + 0.5 * normal, (2, 2, 1))), "nested": nested, **more}
+
+
+def bumpy(scale):
+    relief = image(np.random.default_rng(0).uniform(0, 1, (8, 8, 1)))
+    return {"type": "bumpmap", "bump": relief, "scale": scale, "nested": WHITE}
+
+
+# Of the floor, and the direction of the sun: along the normal, against it, and so on
+CASES = {
+    "along": (lambda: turned(45), [-1, -1, 0]),
+    "against": (lambda: turned(45), [1, -1, 0]),
+    "above": (lambda: turned(45), [0, -1, 0]),
+    "never turned round": (lambda: turned(30, flip_invalid_normals=False, use_shadowing_function=False), [-1, -1, 0]),
+    "two sides": (lambda: {"type": "twosided", "of": turned(45)}, [0.2, -1, 0]),
+    "under a mask": (lambda: {"type": "mask", "opacity": 0.6, "nested": turned(45)}, [-0.2, -1, 0]),
+    "bumps": (lambda: bumpy(1.0), [1, -0.15, 0]),
+    "low bumps": (lambda: bumpy(0.2), [1, -0.15, 0]),
+}
+
+
+def sunlit(floor, direction):
+    """A sunlit floor, and a detached wall with no light except for the floor's."""
+    sun = {"sun": {"type": "directional", "direction": direction, "irradiance": rgb(3.0)}}
+    return {
+        "type": "scene", "sensor": sensor(16, fov=50), "floor": wall([0, -1, 0], [1, 0, 0], -90, bsdf=floor),
+        "back": wall([0, 0.2, -1.6], [0, 1, 0], 0, 1.6), **sun,
+    }  # fmt: skip
+
+
+def indirect_of_path(scene, seed, spp=512):
+    return render(scene, "path", spp, seed, max_depth=3) - render(scene, "path", spp, seed, max_depth=2)
+
+
+def assert_indirect_light_of_path(description, plugin, seeds=12, **more):
+    scene, settings = mi.load_dict(description), {"direct": "none", "clamping": 0.0, "vpl_count": 2000, **more}
+
+    def pair(seed):
+        return render(scene, plugin, 16, seed, max_depth=3, **settings), indirect_of_path(scene, 1000 + seed)
+
+    assert_same_mean(pair, seeds)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_sunlit_floor(case):
+    floor, direction = CASES[case]
+    assert_indirect_light_of_path(sunlit(floor(), direction), "vpl")
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_every_plugin_knows_where_its_lights_shine(plugin):
+    assert_indirect_light_of_path(sunlit(turned(45), [0.2, -1, 0]), plugin, 8, **PLUGINS[plugin])
+
+
+@pytest.mark.parametrize("nested", ["plastic", "roughplastic", "principled"])
+def test_glossy_light_is_spread_and_none_is_lost(nested):
+    """The light of glossy lobes is spread evenly, so only its sum is correct."""
+    material = {"type": nested} | ({"roughness": 0.8} if nested == "principled" else {})
+    scene = mi.load_dict(sunlit(turned(30, material), [0.2, -1, 0]))
+    found = np.mean([
+        render(scene, "vpl", 16, seed, max_depth=3, direct="none", clamping=0.0, vpl_count=2000) for seed in range(8)
+    ])  # fmt: skip
+    expected = np.mean([indirect_of_path(scene, 1000 + seed) for seed in range(8)])
+    assert found == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize("shape", ["rectangle", "shape group"])
+def test_light_goes_on_between_perturbed_walls(shape):
+    bulb = {"bulb": {"type": "point", "position": [0.3, 0.4, 0.6], "intensity": rgb(1.0)}}
+    box = closed_box(bulb, 16)
+    for name in ("floor", "left", "right", "back"):
+        box[name]["bsdf"] = turned(35)
+    if shape == "shape group":
+        box["group"] = {"type": "shapegroup", "floor": box.pop("floor")}
+        box["floor"] = {"type": "instance", "of": {"type": "ref", "id": "group"}}
+    scene = mi.load_dict(box)
+
+    def pair(seed):
+        found = render(scene, "vpl", 8, seed, max_depth=5, clamping=0.0, vpl_count=1000)
+        return found, render(scene, "path", 256, 1000 + seed, max_depth=5)
+
+    assert_same_mean(pair, 10)

@@ -1,0 +1,82 @@
+"""The balance of lights and paths: decisions for images of known noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vpl.split.cost_model import CostModel
+from vpl.split.plan import Evidence, Option, choose, may_pay, price
+
+MODEL = CostModel()
+
+
+def balanced(direct, indirect, paths, samples, left=None):
+    """The balance of an image of an even brightness; ``left``: of it besides lights on surfaces, if followed."""
+    option = Option(True, False, direct + indirect, indirect, left)
+    return choose(Evidence(direct + indirect, direct, np.ones(len(direct)), paths, samples, False, MODEL), [option])
+
+
+def test_lights_pay_where_indirect_light_is_the_noise_and_only_there():
+    rng = np.random.default_rng(0)
+    indirect, direct = rng.exponential(size=(2, 10_000))
+    none = np.zeros(10_000)
+    assert balanced(none, indirect, 10**8, 64).light_paths > 0
+    assert balanced(none, indirect, 10**4, 64).light_paths == 0
+    assert balanced(direct, 1e-3 * indirect, 10**7, 64).light_paths == 0
+    assert choose(Evidence(direct, direct, none + 1, 10**8, 64, False, MODEL), []).light_paths == 0
+
+
+def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
+    """Veils stop the light of virtual lights and let paths pass."""
+    rng = np.random.default_rng(0)
+    indirect, direct = rng.exponential(size=(2, 10_000))
+    assert balanced(0.1 * direct, indirect, 10**8, 64).light_paths > 0
+    assert balanced(0.1 * direct, indirect, 10**8, 64, left=0.95 * indirect).light_paths == 0
+
+
+@pytest.mark.parametrize("emitters", (False, True))
+@pytest.mark.parametrize("samples", (1, 64, 1024))
+@pytest.mark.parametrize("paths", (10**4, 10**6, 10**9))
+def test_the_more_lights_leave_the_higher_their_price(paths, samples, emitters):
+    """The lights prove worse than assumed only after they are followed."""
+    rng = np.random.default_rng(0)
+    indirect, direct = rng.exponential(size=(2, 10_000))
+    for scale in (1e-3, 1, 1e3):
+        traced, small = direct + scale * indirect, 1e-3 * indirect
+        evidence = Evidence(traced, direct, np.ones(10_000), paths, samples, emitters, MODEL)
+        assumed = Option(True, emitters, traced, scale * indirect)
+        prices = [price(evidence, replace(assumed, residual=noise * traced)) for noise in (0, 0.1, 0.5, 1, 2, 8, 64)]
+        assert prices[0] == price(evidence, assumed)
+        assert (np.diff(prices) >= 0).all() and prices[-1] > 10 * prices[0]
+        assert price(evidence, replace(assumed, residual=small)) == prices[0]
+
+
+def test_what_is_followed_has_to_promise_more_than_all_that_is_known():
+    rng = np.random.default_rng(0)
+    indirect, direct = rng.exponential(size=(2, 10_000))
+    evidence, none = Evidence(direct + indirect, direct, np.ones(10_000), 10**8, 64, False, MODEL), np.zeros(10_000)
+    good, better = Option(True, False, direct + indirect, indirect), Option(False, True, 0.1 * direct, none)
+    useless = replace(good, residual=4 * indirect)
+    assert may_pay(evidence, good, []) and may_pay(evidence, better, [good])
+    assert not may_pay(evidence, good, [better]) and not may_pay(evidence, useless, [])
+
+
+def test_more_vertices_are_lit_the_less_noise_there_is_besides():
+    rng = np.random.default_rng(0)
+    indirect, direct = rng.exponential(size=(2, 10_000))
+    found = [balanced(share * direct, indirect, 10**8, 64).vertices for share in (0.0, 0.3, 1.0)]
+    assert 64 >= found[0] > found[1] > found[2] >= 8
+    assert balanced(0.1 * direct, indirect, 10**8, 1).vertices == 1
+
+
+def test_more_light_paths_are_followed_the_noisier_indirect_light_is():
+    rng = np.random.default_rng(0)
+    direct = rng.exponential(size=10_000)
+    found = [balanced(direct, rng.gamma(1 / noise, noise, 10_000), 10**7, 64).light_paths for noise in (1, 4, 16)]
+    assert 0 < 1.2 * found[0] < found[1] < found[2] / 1.2
+
+
+def test_one_sample_has_no_noise_that_lights_could_take_away():
+    chosen = balanced(np.full(2, 0.5), np.full(2, 0.5), 1, 1)
+    assert chosen.light_paths == 0 and "nan" not in chosen.reason

@@ -1,0 +1,393 @@
+"""The parts of the split: minorants, numbers, cells, clusters, bounds; each against its definition."""
+
+import itertools
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from tests.support.catalogue import EMITTERS, MATERIALS, one_of, stage
+from tests.support.properties import examples, unit_vectors
+from vpl.core.arrays import upload
+from vpl.direct.emitter_sampling import power_heuristic
+from vpl.lights.light_set import ScatteredGroup
+from vpl.lights.perturbed import Perturbed
+from vpl.lights.virtual_lights import DeviceLights, VirtualLights
+from vpl.points.surfaces import LambertianSurface
+from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
+from vpl.split.lattice import Lattice, lattice_multiplier
+from vpl.split.line_sampling import ArrivalOctree
+from vpl.split.minorant import agrees, minorant_of, side_of
+from vpl.split.pixel_clusters import PixelClusters, Receivers
+from vpl.split.view import View
+from vpl.transport.bounds import contribution_bound
+from vpl.transport.carried_share import carried_geometry_term, carried_share
+from vpl.transport.contribution import contribution
+
+
+def points(columns):
+    return mi.Point3f(*(upload(mi.Float, columns[:, k]) for k in range(3)))
+
+
+def seeds(usual):
+    """A property of random scenes, by their seed."""
+
+    def decorate(test):
+        return settings(max_examples=examples(usual), deadline=None)(given(st.integers(0, 2**31))(test))
+
+    return decorate
+
+
+# ---------------------- Minorants ----------------------
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_a_minorant_is_the_same_from_everywhere_on_its_side(material):
+    """For the same points, seen from random directions on the same side."""
+    scene = mi.load_dict(stage(EMITTERS["point"](), one_of(MATERIALS[material]()), 8))
+    rng, camera, found = np.random.default_rng(0), mi.Point3f(0, 0, 4), []
+    target = points(rng.normal(size=(500, 3)) * 0.3 + [-0.6, -0.4, 0.3])
+    first = scene.ray_intersect(mi.Ray3f(camera, dr.normalize(target - camera)))
+    outward = first.n * side_of(first) * dr.sign(dr.dot(first.n, first.sh_frame.n))
+    for _ in range(3):
+        away = mi.Vector3f(points(unit_vectors(rng, 500)))
+        away = dr.normalize(away + outward * 1.05)
+        si = scene.ray_intersect(mi.Ray3f(first.p + away * 1e-2, -away))
+        same = first.is_valid() & si.is_valid() & (dr.norm(si.p - first.p) < 1e-4) & (si.shape == first.shape)
+        side = side_of(si)
+        minorant = minorant_of(si, si.bsdf(), side, Perturbed(scene), agrees(si, side))
+        found.append(np.where(np.array(same), np.array(minorant), np.nan))
+        assert np.array(same).sum() > 50
+    found = np.array(found)
+    assert np.nanmin(found) >= 0
+    np.testing.assert_allclose(np.nanmax(found, 0), np.nanmin(found, 0), rtol=2e-2, atol=1e-4)
+
+
+@seeds(50)
+def test_the_share_of_virtual_lights_is_a_share(seed):
+    rng = np.random.default_rng(seed)
+    c2, d2 = 10.0 ** rng.uniform(-8, 8, (2, 64))
+    geometry = np.append(rng.random(60) / d2[:60], [0, 0, np.inf, np.inf])
+    squared_c, term = upload(mi.Float, c2), upload(mi.Float, geometry)
+    w, carried = np.array(carried_share(squared_c, term)), np.array(carried_geometry_term(squared_c, term))
+    np.testing.assert_allclose(w, 1 / (1 + c2 * geometry), rtol=1e-5, atol=1e-30)
+    assert (w >= 0).all() and (w <= 1).all()
+    np.testing.assert_allclose(carried[:62], w[:62] * geometry[:62], rtol=1e-5, atol=1e-30)
+    np.testing.assert_allclose(carried[62:], 1 / c2[62:], rtol=1e-5)
+
+
+@seeds(50)
+def test_weights_of_two_densities_add_up_however_large_they_are(seed):
+    a, b = (upload(mi.Float, x) for x in 10.0 ** np.random.default_rng(seed).uniform(-18, 30, (2, 64)))
+    np.testing.assert_allclose(np.array(power_heuristic(a, b) + power_heuristic(b, a)), 1, rtol=1e-5)
+    assert not np.array(power_heuristic(mi.Float(0), b)).any()
+
+
+def test_rough_metal_has_next_to_no_minorant_and_diffuse_walls_all_of_it():
+    nowhere = Perturbed(mi.load_dict({"type": "scene"}))
+    for material, least, most in (("diffuse", 0.2 / np.pi, 0.7 / np.pi), ("roughconductor", 0, 1e-6)):
+        bsdf = mi.load_dict(MATERIALS[material]())
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
+        minorant = np.array(minorant_of(si, bsdf, mi.Float(1), nowhere, mi.Bool(True)))
+        assert (minorant >= 0.999 * least).all() and (minorant <= 1.001 * most).all()
+
+
+def test_minorants_are_0_where_none_is_asked_for_and_the_same_elsewhere():
+    bsdf, si = mi.load_dict(MATERIALS["diffuse"]()), dr.zeros(mi.SurfaceInteraction3f, 64)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
+    asked, nowhere = dr.arange(mi.UInt32, 64) % 3 == 0, Perturbed(mi.load_dict({"type": "scene"}))
+    some, whole = (np.array(minorant_of(si, bsdf, mi.Float(1), nowhere, mask)) for mask in (asked, mi.Bool(True)))
+    assert (whole > 0).all() and (some == np.where(np.array(asked), whole, 0)).all()
+
+
+# ---------------------- Numbers ----------------------
+
+
+@pytest.mark.parametrize("samples", [1, 4, 16, 64, 6, 100, 3000])
+def test_numbers_are_uniform_and_stratified_in_every_pixel(samples):
+    pixels = max(2**18 // samples, 512)
+    numbers = Lattice(dr.arange(mi.UInt32, pixels * samples), samples, 7).at(mi.UInt32(3))
+    columns = [np.array(x).reshape(-1, pixels, samples) for x in numbers]
+    # Numbers have 24 bits
+    far = max(samples // 1024, 1)
+    for dimension in (x for column in columns for x in column):
+        assert dimension.min() >= 0 and dimension.max() < 1
+        for sample in (0, -1):
+            assert stats.kstest(dimension[:, sample], "uniform").pvalue > 1e-4
+        gaps = np.diff(np.sort(dimension, axis=1), axis=1, append=1 + dimension.min(1, keepdims=True))
+        assert np.allclose(gaps * samples, 1, atol=1e-3 * far)
+    if samples >= 16:
+        for pair in columns[1::2]:
+            # None is much closer to the first than points of a square grid; in a lattice, that holds for any two
+            away = np.abs(pair[:, :64, 1:] - pair[:, :64, :1])
+            assert (np.minimum(away, 1 - away) ** 2).sum(0).min() * samples > 0.4
+
+
+def test_no_lattice_of_as_many_points_is_much_better():
+    """By the worst error over smooth periodic functions, against all multipliers."""
+
+    def worst_error(multiplier, count):
+        x = np.stack([np.arange(count), np.arange(count) * multiplier % count]) / count
+        return np.prod(1 + 2 * np.pi**2 * (x * x - x + 1 / 6), axis=0).mean() - 1
+
+    for count in (2, 3, 7, 36, 64):
+        others = [worst_error(g, count) for g in range(1, count) if np.gcd(g, count) == 1]
+        assert worst_error(lattice_multiplier(count), count) == pytest.approx(min(others))
+    assert worst_error(lattice_multiplier(1009), 1009) < 1.1 * min(worst_error(g, 1009) for g in range(1, 1009))
+
+
+def test_products_of_numbers_are_no_noisier_than_those_of_random_ones():
+    """Orders that keep halves of the points together would double the variance."""
+    samples, pixels = 64, 8192
+    numbers = Lattice(dr.arange(mi.UInt32, pixels * samples), samples, 5)
+    first, second = (numbers.at(mi.UInt32(vertex)) for vertex in (0, 1))
+    chosen = first[0], first[1].x, first[2], first[3].y, second[0]
+    halves = [np.where(np.array(x).reshape(pixels, samples) < 0.5, 1, -1) for x in chosen]
+    for one, other in itertools.combinations(halves, 2):
+        assert (one * other).mean(1).var() * samples < 1.15
+
+
+def test_numbers_of_other_dimensions_vertices_pixels_and_seeds_are_independent():
+    lane = dr.arange(mi.UInt32, 4 * 4096)
+    columns = [
+        np.array(x).reshape(-1, 4 * 4096)
+        for seed, vertex in ((1, 0), (1, 1), (2, 0))
+        for x in Lattice(lane, 4, seed).at(mi.UInt32(vertex))
+    ]
+    correlation = np.corrcoef(np.concatenate(columns))
+    assert np.abs(correlation - np.eye(len(correlation))).max() < 0.05
+    pixels = np.concatenate(columns).reshape(-1, 4096, 4)
+    for dimension in pixels:
+        assert abs(np.corrcoef(dimension[:-1, 0], dimension[1:, 0])[0, 1]) < 0.08
+
+
+# ---------------------- Cells ----------------------
+
+
+def cells_on_sphere_and_plane(seed, tilt):
+    """Points on the outside of a sphere and on top of a plane; `tilt`: whether their normals are given."""
+    rng = np.random.default_rng(seed)
+    ball = unit_vectors(rng, 300).astype(np.float64)
+    plane = np.column_stack([rng.uniform(-2, 2, (300, 2)), np.full(300, -1.5)])
+    position = np.concatenate([0.8 * ball, plane])
+    normal = np.concatenate([ball, np.repeat([[0.0, 0.0, 1.0]], 300, 0)]) * tilt
+    return ArrivalOctree(position, normal, rng.uniform(0.1, 1, 600), [-2.5] * 3, 5.0, rng)
+
+
+def hits_of_sphere(lines, radius=0.8):
+    """(position, normal of the hit side) of all hits."""
+    o, d = lines.origin.astype(np.float64), lines.direction.astype(np.float64)
+    b = (o * d).sum(1)
+    disc = b**2 - (o**2).sum(1) + radius**2
+    found = []
+    for sign in (-1, 1):
+        t = -b + sign * np.sqrt(np.maximum(disc, 0))
+        ok = (disc > 0) & (t > 0) & (t < lines.length)
+        p = (o + t[:, None] * d)[ok]
+        found.append((p, -sign * p / radius))
+    return tuple(np.concatenate(columns) for columns in zip(*found, strict=True))
+
+
+def hits_of_plane(lines, height=-1.5):
+    o, d = lines.origin.astype(np.float64), lines.direction.astype(np.float64)
+    t = (height - o[:, 2]) / d[:, 2]
+    p = o + t[:, None] * d
+    ok = (t > 0) & (t < lines.length) & (np.abs(p[:, :2]) < 2).all(1)
+    return p[ok], np.where(d[ok, 2:] < 0, 1.0, -1.0) * [[0, 0, 1]]
+
+
+@pytest.mark.parametrize("tilt", [0, 1])
+@pytest.mark.parametrize("seed", range(3))
+def test_lines_meet_surfaces_with_the_density_that_is_said(seed, tilt):
+    """The mean of 1 / density over hits is the area of each side, in every octant and quadrant."""
+    cells, count = cells_on_sphere_and_plane(seed, tilt), 400_000
+    lines = cells.lines(count, np.random.default_rng(seed + 100))
+    for hits, area in ((hits_of_sphere, 4 * np.pi * 0.64 / 8), (hits_of_plane, 16 / 4)):
+        position, normal = hits(lines)
+        density = cells.density(position, normal)
+        assert (density > 0).all()
+        outside = (normal * (position if hits is hits_of_sphere else [[0, 0, 1]])).sum(1) > 0
+        parts = position[:, 0] > 0, position[:, 1] > 0, (position[:, 2] > 0) & (hits is hits_of_sphere)
+        key = sum(part * 2**k for k, part in enumerate(parts))
+        for side in (False, True):
+            for octant in np.unique(key):
+                weight = np.where((outside == side) & (key == octant), 1 / density, 0)
+                error = np.sqrt((weight**2).sum()) / count
+                assert abs(weight.sum() / count - area) < 5 * error
+
+
+@seeds(20)
+def test_lines_stay_in_the_scene_and_every_side_has_a_density(seed):
+    rng = np.random.default_rng(seed)
+    size = 10.0 ** rng.uniform(-4, 4)
+    count = int(rng.integers(1, 200))
+    flat = rng.random(3) < 0.3
+    position = np.where(flat, 0.5, rng.random((count, 3))) * size
+    normal = unit_vectors(rng, count)
+    cells = ArrivalOctree(position, normal, rng.uniform(0.1, 1, count), [-0.1 * size] * 3, 1.2 * size, rng)
+    cells.choose_by(rng.random(len(cells.leaf_weight)) + 1e-3)
+    assert (cells.density(position, normal) > 0).all() and (cells.density(position, -normal) > 0).all()
+    assert np.isfinite(cells.density(position, normal)).all()
+    lines = cells.lines(500, rng)
+    assert np.isfinite(lines.origin).all() and (lines.length >= 0).all()
+    np.testing.assert_allclose(np.linalg.norm(lines.direction, axis=1), 1, atol=1e-5)
+
+
+# ---------------------- Bounds, lights and clusters ----------------------
+
+
+def surface_lights(rng, count, spread=1.0):
+    position = (rng.normal(size=(count, 3)) * spread).astype(np.float32)
+    direction = unit_vectors(rng, count)
+    lights = VirtualLights.of(
+        "surface", position, direction, rng.uniform(0.01, 1, (count, 3)).astype(np.float32),
+        np.ones(count, np.uint32),
+    )  # fmt: skip
+    facing = direction + 0.3 * unit_vectors(rng, count)
+    lights.facing = (facing / np.linalg.norm(facing, axis=1, keepdims=True)).astype(np.float32)
+    return lights
+
+
+@seeds(60)
+def test_bounds_are_above_what_lights_of_surfaces_contribute(seed):
+    """Pairs from a box of points with a cone of normals and a box of lights with one; in double precision."""
+    rng, count = np.random.default_rng(seed), 40
+    center, extent = rng.normal(size=(2, 3)) * 2, rng.uniform(0, 1, (2, 3)) * 10.0 ** rng.uniform(-3, 0)
+    axes, cosines = unit_vectors(rng, 2).astype(np.float64), rng.uniform(-0.2, 1, 2)
+    place = center[:, None] + extent[:, None] * rng.uniform(-1, 1, (2, count, 3))
+    around = axes[:, None] + 10.0 ** rng.uniform(-2, 0.5) * rng.normal(size=(2, count, 3))
+    around /= np.linalg.norm(around, axis=2, keepdims=True)
+    around = np.where(((around * axes[:, None]).sum(2) >= cosines[:, None])[..., None], around, axes[:, None])
+    c, intensity = 10.0 ** rng.uniform(-3, 1), rng.uniform(0.1, 2)
+    offset = place[1][None] - place[0][:, None]
+    d2 = (offset**2).sum(2)
+    to_light = offset / np.sqrt(d2)[..., None]
+    cosine1 = np.maximum((around[0][:, None] * to_light).sum(2), 0)
+    cosine2 = np.maximum(-(around[1][None] * to_light).sum(2), 0)
+    true = (cosine1 * cosine2 / (d2 + c**2 * cosine1 * cosine2) * intensity).max()
+    receivers = Receivers.of(*(x[None] for x in (center[0], extent[0], axes[0])), cosines[:1])
+    node = SimpleNamespace(
+        center=points(center[1:]), extent=mi.Vector3f(points(extent[1:])), axis=mi.Vector3f(points(axes[1:])),
+        cosine=upload(mi.Float, cosines[1:]), intensity=mi.Color3f(intensity),
+    )  # fmt: skip
+    bound = float(np.array(contribution_bound("surface", receivers.receiver, node, mi.Float(c)))[0])
+    assert bound >= true * (1 - 1e-4)
+
+
+def test_a_pair_contributes_what_the_split_leaves_to_it():
+    """F G w, in double precision; nothing behind the geometric or the shading normal of either end."""
+    rng, count, c = np.random.default_rng(2), 2000, 0.4
+    lights = surface_lights(rng, count)
+    position, normal = rng.normal(size=(count, 3)).astype(np.float32), unit_vectors(rng, count)
+    offset = lights.position.astype(np.float64) - position
+    d2 = (offset**2).sum(1)
+    to_light = offset / np.sqrt(d2)[:, None]
+    cosine1, cosine2 = np.maximum((normal * to_light).sum(1), 0), np.maximum(-(lights.direction * to_light).sum(1), 0)
+    shared = cosine1 * cosine2 / (d2 + c**2 * cosine1 * cosine2) * ((lights.facing * to_light).sum(1) < 0)
+    interaction = dr.zeros(mi.Interaction3f, count)
+    interaction.p, interaction.n = points(position), mi.Normal3f(points(normal))
+    surface = LambertianSurface(interaction, dr.full(mi.UInt32, 1, count), interaction.n, mi.Color3f(1))
+    light = DeviceLights(lights).gather(dr.arange(mi.UInt32, count))
+    found = np.array(contribution("surface", surface, light, mi.Float(c))).T
+    np.testing.assert_allclose(found, shared[:, None] * lights.intensity, rtol=1e-3, atol=1e-5)
+
+
+def test_lights_of_a_node_are_drawn_by_their_share_of_its_intensity():
+    rng = np.random.default_rng(0)
+    lights = surface_lights(rng, 60)
+    group = ScatteredGroup.of(lights, 1)
+    first, last, order = (np.array(x) for x in (group.first, group.last, group.order))
+    level = lights.intensity.mean(1)
+    draws = 200_000
+    for node in range(0, len(first), 13):
+        inside = order[first[node] : last[node]]
+        sample = (np.arange(draws) + 0.5) / draws
+        light, scale = group.draw(dr.full(mi.UInt32, node, draws), upload(mi.Float, sample))
+        x = np.array(light.position).T
+        share = np.array([(x == lights.position[i]).all(1).mean() for i in inside])
+        np.testing.assert_allclose(share, level[inside] / level[inside].sum(), atol=1e-4)
+        sent = (np.array(light.intensity) * np.array(scale)).mean(1)
+        np.testing.assert_allclose(sent, lights.intensity[inside].sum(0), rtol=1e-3)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 9, 1000, 131_072, 160_000, 163_839, 10**7])
+def test_the_pilot_has_pairs_all_over_the_image(count):
+    view = SimpleNamespace(count=count)
+    rays = View.pairs(view, 1 << 15)
+    first, second = rays.reshape(-1, 2).T
+    assert len(rays) <= max(1 << 15, 2) and (first % 2 == 0).all() and (second - first <= 1).all()
+    assert (np.diff(first) > 0).all() and second[-1] < count
+    assert np.diff(first, append=count).max() <= count / len(first) + 2
+
+
+@pytest.mark.parametrize(("samples", "most"), [(1, 1), (7, 5), (16, 16), (64, 41), (64, 100)])
+def test_so_many_vertices_of_a_pixel_are_lit_evenly_among_its_samples(samples, most):
+    pixels, kept = 3, min(most, samples)
+    # A single entry has no weight, and some weights are negative
+    weight = np.ones(pixels * samples)
+    weight[1], weight[-1] = -1, 0
+    light = mi.UnpolarizedSpectrum(upload(mi.Float, weight))
+    place = [dr.zeros(kind, len(weight)) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f)]
+    first = GatherVertices(*place, light, dr.full(mi.UInt32, 1, len(weight)))
+    later = GatherVertices(*place, dr.zeros(mi.UnpolarizedSpectrum, len(weight)), dr.zeros(mi.UInt32, len(weight)))
+    lit = LitVertices.of(first, later, samples, most, 1)
+    assert lit.alone == 0
+    np.testing.assert_allclose(np.abs(np.array(lit.vertices.weight)), samples / kept, rtol=1e-6)
+    sample = np.sort(np.array(lit.rays))
+    number = [np.count_nonzero(sample // samples == pixel) for pixel in range(pixels)]
+    assert number == [kept, kept, kept - 1]
+    apart = np.diff(sample[sample < samples])
+    assert set(apart) <= {samples // kept, -(-samples // kept)}
+
+
+def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
+    rng, count, samples = np.random.default_rng(1), 400, 8
+    weight = rng.uniform(0.01, 1, (count, 3))
+    normal = unit_vectors(rng, count).astype(np.float64)
+    position = points(rng.normal(size=(count, 3)))
+    vertices = GatherVertices(
+        position, mi.Normal3f(points(normal)), mi.Normal3f(points(normal)), mi.Color3f(points(weight)),
+        dr.full(mi.UInt32, 1, count),
+    )  # fmt: skip
+    clusters = PixelClusters(LitVertices(vertices, dr.arange(mi.UInt32, count), 0), samples)
+    first, size = np.array(clusters.first), np.array(clusters.size)
+    assert size.sum() == count and (clusters.pixel[clusters.cluster] == np.array(clusters.ray) // samples).all()
+    draws = 20_000
+    for cluster in range(0, clusters.count, 31):
+        members = np.array(clusters.ray)[first[cluster] : first[cluster] + size[cluster]]
+        ray, _, value = clusters.draw(
+            dr.full(mi.UInt32, cluster, draws), upload(mi.Float, (np.arange(draws) + 0.5) / draws)
+        )  # fmt: skip
+        assert set(np.unique(np.array(ray))) == set(members)
+        np.testing.assert_allclose(np.array(value).mean(1), weight[members].sum(0), rtol=2e-3)
+
+
+def test_later_vertices_are_drawn_by_weight_and_stand_for_all_of_them():
+    rng, pixels, samples, most = np.random.default_rng(2), 50, 8, 3
+    weights = []
+    for share in (0.5, 0.3):
+        weight = rng.exponential(size=(pixels * samples, 3)) * (rng.random((pixels * samples, 1)) < share)
+        weights.append(np.where(rng.random((pixels * samples, 1)) < 0.2, -weight, weight))
+    first, later = (
+        GatherVertices(None, None, None, mi.Color3f(*(upload(mi.Float, x) for x in weight.T)), None)
+        for weight in weights
+    )
+    mean, seeds = np.zeros(pixels * samples), 4000
+    for seed in range(seeds):
+        ray, factor = (np.array(x) for x in drawn_later(first, later, samples, most, seed))
+        assert (np.diff(ray.astype(int)) >= 0).all()
+        assert np.bincount(ray // samples, minlength=pixels).max() <= most
+        np.add.at(mean, ray, factor / seeds)
+    drawn = np.abs(weights[1]).mean(1) > 0
+    assert (mean[~drawn] == 0).all()
+    # Systematic sampling: a count is right on average, with a variance below the variance of one draw
+    total = np.abs(weights).mean(2).sum(0).reshape(pixels, samples).sum(1).repeat(samples) / most
+    share = np.abs(weights[1]).mean(1) / total
+    spread = (np.maximum(share, 1e-9) / seeds) ** 0.5
+    assert (np.abs(mean - 1)[drawn] * share[drawn] < 5 * spread[drawn]).all()

@@ -1,0 +1,41 @@
+"""Clock: seconds that a render spends in each of its stages."""
+
+from __future__ import annotations
+
+from time import perf_counter
+
+import drjit as dr
+
+from .stages import Stage, tell
+
+
+class Clock:
+    """Seconds by stage; the first stage begins at once.
+
+    A stage ends when the next one begins or the clock is stopped, and the device has finished.  A listener
+    (:func:`vpl.core.stages.listening`) is told of each stage.
+    """
+
+    def __init__(self, stage: Stage):
+        self.seconds: dict[str, float] = {}
+        self._stage: Stage | None = None
+        self.begin(stage)
+
+    def begin(self, stage: Stage) -> None:
+        """End the current stage and begin another one."""
+        self.stop()
+        tell(stage)
+        self._stage, self._start = stage, perf_counter()
+
+    def stop(self) -> None:
+        """End the current stage."""
+        if self._stage is not None:
+            dr.sync_thread()
+            self.add({self._stage: perf_counter() - self._start})
+            self._stage = None
+
+    def add(self, seconds: dict[str, float]) -> None:
+        """Add times of stages that were measured elsewhere."""
+        for stage, spent in seconds.items():
+            # Plain text, because statistics are printed
+            self.seconds[str(stage)] = self.seconds.get(stage, 0.0) + spent

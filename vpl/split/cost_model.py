@@ -1,0 +1,205 @@
+"""Cost model: every constant by which ``manylights`` decides, with its unit, its meaning and its evidence.
+
+A pilot measures relative variances; the constants turn them into predictions of cost and of remaining variance
+(:mod:`vpl.split.plan`, :mod:`vpl.split.roulette`).  Predictions use counts and never the clock, so the same seed makes
+the same decisions on every machine.  ``benchmarks/cost_model.py`` halves and doubles each constant and prints the
+effect on variance × time; :func:`table` lists all of them.
+
+Costs are in units of one camera path without virtual lights.  A relative variance is the variance of one path over the
+squared brightness of its pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+
+def _constant(default: float, unit: str, meaning: str, evidence: str) -> float:
+    return field(default=default, metadata={"unit": unit, "meaning": meaning, "evidence": evidence})
+
+
+_SENSITIVITY = "benchmarks/cost_model.py"
+_LIGHTS = "benchmarks/manylights.py --parts lights"
+_PRODUCT = "benchmarks/manylights.py --parts product"
+
+
+@dataclass(frozen=True)
+class CostModel:
+    """Constants of the decisions of ``manylights``."""
+
+    # ---------------------- Pilot ----------------------
+    pilot_rays: int = _constant(1 << 15, "camera rays", "Largest size of a pilot.", _SENSITIVITY)
+    learned_cost: float = _constant(
+        1.15,
+        "paths",
+        "Cost of a path with learned emitters: more of its shadow rays reach an emitter.",
+        "15% and more in living_room and kitchen",
+    )
+    trimmed: float = _constant(
+        0.001,
+        "fraction",
+        "Largest squared errors that a relative variance leaves out, as the comparison's trimmed relMSE does.",
+        "definition of the error",
+    )
+    black: float = _constant(
+        0.01,
+        "squared mean",
+        "Squared brightness added to that of every pixel, as the comparison's relMSE does.",
+        "definition of the error",
+    )
+    brightness_spread: float = _constant(
+        0.15,
+        "relative variance",
+        "Variance of the brightness of a quarter of an image block around that of the block.",
+        _SENSITIVITY,
+    )
+
+    # ---------------------- Variance that remains ----------------------
+    stratified: float = _constant(
+        0.5,
+        "fraction",
+        "Fraction of the variance of direct light that stratified samples retain; at least n^-0.5 for n samples.",
+        _SENSITIVITY,
+    )
+    stratified_many: float = _constant(
+        1.0,
+        "fraction",
+        "The same where there are many emitters: samples are hardly stratified over more emitters than samples.",
+        "everything8003: lights are not chosen with 0.5",
+    )
+    carried: float = _constant(
+        0.9,
+        "fraction",
+        "Fraction of the variance of indirect light that virtual lights take away, until it is measured.",
+        "within a few percent in kitchen, sponza_crytek, classroom, blender_room",
+    )
+    doubtful: float = _constant(
+        1.5,
+        "ratio",
+        "The measured residual replaces the assumed one only where it exceeds this multiple of it.",
+        "living_room: 59% is measured where lights pay",
+    )
+    light_variance: float = _constant(
+        50.0,
+        "paths",
+        "Relative variance that a light set leaves in a pixel, times its light paths, over the variance of the "
+        "indirect light of one camera path.",
+        f"{_LIGHTS}: 52 kitchen, 43 veach_ajar, 64 everything8003",
+    )
+    shared: float = _constant(
+        4.0,
+        "ratio",
+        "Weight of the variance that neighbouring pixels share: a denoiser keeps half of it, and 7 to 16% of the rest.",
+        f"{_LIGHTS} and --parts denoised",
+    )
+    set_error: float = _constant(
+        0.03,
+        "fraction",
+        "Largest standard error of the image mean due to one light set.",
+        f"{_PRODUCT}, column sets: 0.02 to 0.81%",
+    )
+    cut_variance: float = _constant(
+        0.3,
+        "shadow rays",
+        "Relative variance that the cuts leave in a pixel, times its shadow rays.",
+        "0.17 cornell to 4.6 classroom: the optimum is flat",
+    )
+    vertex_variance: float = _constant(
+        0.06,
+        "relative variance",
+        "Relative variance of a single gather vertex that stands for its pixel.",
+        "0.018 kitchen to 0.23 veach_ajar",
+    )
+
+    # ---------------------- Costs ----------------------
+    fixed_cost: float = _constant(
+        200_000, "paths", "Cost of starting lights and cuts: recorded kernels, trees.", _SENSITIVITY
+    )
+    light_path_cost: float = _constant(4.0, "paths", "Cost of a virtual light with its path.", _LIGHTS)
+    ray_cost: float = _constant(0.2, "paths", "Cost of a shadow ray of a cut, with its bounds.", _SENSITIVITY)
+    emitter_cuts: float = _constant(
+        0.4,
+        "ratio",
+        "Variance and rays of cuts through emitters over those of cuts through surface lights.",
+        "hall: 0.11 and 0.14 of variance × samples",
+    )
+    vertex_cost: float = _constant(0.8, "paths", "Cost of a gather vertex: its clusters and its cuts.", "hall, kitchen")
+    first_edges: float = _constant(
+        4.0, "edges", "Cost of a path up to its second vertex, in later edges.", _SENSITIVITY
+    )
+
+    # ---------------------- Decisions ----------------------
+    pays_below: float = _constant(
+        1.0,
+        "ratio",
+        "Lights are used where variance × cost with lights is below this multiple of that without.",
+        "definition",
+    )
+    fewest_light_paths: int = _constant(20_000, "light paths", "Smallest number of light paths.", _LIGHTS)
+    most_light_paths: int = _constant(
+        2_000_000, "light paths", "Largest number of light paths: bounds memory.", _LIGHTS
+    )
+    least_light_share: float = _constant(1 / 64, "light paths", "Fewest light paths for a camera ray.", _LIGHTS)
+    most_light_share: float = _constant(1 / 8, "light paths", "Most light paths for a camera ray.", _LIGHTS)
+    c_per_spacing: float = _constant(
+        6.0,
+        "lights",
+        "c of the split over the distance between lights.",
+        "four times: least raw variance in five scenes; six: less in blocks of pixels, for denoisers",
+    )
+    least_rays: float = _constant(0.25, "shadow rays", "Fewest shadow rays of cuts for a sample.", _SENSITIVITY)
+    most_rays: float = _constant(8.0, "shadow rays", "Most shadow rays of cuts for a sample.", _SENSITIVITY)
+    cut_error: float = _constant(
+        0.05,
+        "fraction of the pixel",
+        "Error bound at which the cuts of a pixel have `rays_at_error` shadow rays.",
+        "benchmarks/lightcuts.py",
+    )
+    rays_at_error: float = _constant(
+        110, "shadow rays", "Shadow rays of a pixel at `cut_error`.", "benchmarks/lightcuts.py"
+    )
+    error_slope: float = _constant(1.6, "exponent", "The error bound falls with this power of the rays.", _SENSITIVITY)
+    finest_error: float = _constant(0.001, "fraction of the pixel", "Smallest error bound.", _SENSITIVITY)
+    coarsest_error: float = _constant(2.0, "fraction of the pixel", "Largest error bound.", _SENSITIVITY)
+    dark_pixel: float = _constant(
+        0.1, "image means", "Pixels darker than this are lit as precisely as if they were as bright.", _SENSITIVITY
+    )
+    largest_cut: int = _constant(1000, "nodes", "Largest cut of a cluster of gather vertices.", _SENSITIVITY)
+    emitter_points_share: float = _constant(
+        0.03, "points", "Virtual lights on area emitters for a camera ray.", _SENSITIVITY
+    )
+    fewest_emitter_points: int = _constant(
+        10_000, "points", "Smallest number of lights on area emitters.", _SENSITIVITY
+    )
+    most_emitter_points: int = _constant(200_000, "points", "Largest number of lights on area emitters.", _SENSITIVITY)
+    least_vertices: float = _constant(
+        1 / 8, "fraction", "Least fraction of a pixel's samples that are lit.", _SENSITIVITY
+    )
+
+    # ---------------------- Russian roulette ----------------------
+    least_survival: float = _constant(
+        0.1,
+        "probability",
+        "Least probability of going on: expected contributions are rough.",
+        "0.05 to 0.2: living_room −12%, kitchen −7%, others +1 to 4%",
+    )
+    roulette_gain: float = _constant(
+        0.95, "ratio", "Roulette is used where the predicted variance × cost falls below this ratio.", _SENSITIVITY
+    )
+    roulette_cells: int = _constant(
+        1024, "cells", "Largest number of spatial cells with an outgoing radiance.", _SENSITIVITY
+    )
+    roulette_prior: float = _constant(
+        4.0, "vertices", "Vertices of average radiance that each cell has besides its own.", _SENSITIVITY
+    )
+
+
+def table() -> str:
+    """The constants as a Markdown table: name, value, unit, meaning, evidence."""
+    lines = ["| constant | value | unit | meaning | evidence |", "|---|---|---|---|---|"]
+    for one in fields(CostModel):
+        about = one.metadata
+        lines.append(
+            f"| `{one.name}` | {one.default:.6g} | {about['unit']} | {about['meaning']} | {about['evidence']} |"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,40 @@
+"""Emitter samplers: how next-event estimation chooses an emitter, and with what density.
+
+- ``base``: the interface of all samplers, their results, the uniform sampler, irradiance by a sampler
+- ``learned``: emitters and regions of the environment, chosen by what a pilot's vertices see of them
+- ``tree``: many emitters, chosen through a tree over them
+"""
+
+from __future__ import annotations
+
+from ...lights.emitters import read_emitters
+from .base import EmitterSampler, UniformEmitters
+from .learned import LearnedEmitters
+from .tree import TreeEmitters
+
+# With fewer emitters, occlusion matters more than distance, and the tree gains nothing over learned probabilities
+_FEWEST_IN_TREE = 64
+
+
+def emitter_sampler(scene, rays: int) -> EmitterSampler:
+    """The sampler that suits a scene, with about ``rays`` rays to learn by.
+
+    :class:`TreeEmitters` where there are 64 emitters or more, all of kinds that arrays can hold;
+    :class:`UniformEmitters` for a single emitter with a place; :class:`LearnedEmitters` elsewhere.
+    """
+    count = len(scene.emitters())
+    if count > 1 or scene.environment() is not None:
+        return (_tree(scene, rays) if count >= _FEWEST_IN_TREE else None) or LearnedEmitters(scene)
+    return UniformEmitters(scene)
+
+
+def _tree(scene, rays: int) -> TreeEmitters | None:
+    """The tree over the emitters; None where a tree cannot hold them."""
+    try:
+        emitters = read_emitters(scene)
+    except ValueError:
+        # Only Mitsuba can sample a point on one of the emitters
+        return None
+    if emitters.others or emitters.area.textured or emitters.dropped or not TreeEmitters.located(emitters):
+        return None
+    return TreeEmitters(scene, emitters, rays)

@@ -1,0 +1,170 @@
+"""Interface of the emitter samplers, the uniform sampler, and the irradiance that a sampler finds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...core.arrays import channel_mean, finite_or_zero
+from ...core.loops import recorded_once
+from ...core.sampling import independent_sampler
+from ...direct.emitter_sampling import power_heuristic
+from ..emitter_lights import EmitterLights
+
+
+@dataclass
+class EmitterSample:
+    """Sampled directions to emitters, one per lane.
+
+    ``direction``: unit vector; ``weight``: unoccluded radiance over the density; ``density``: 1 / sr, 1 for points and
+    directions, which ``is_point`` marks; ``ray``: shadow ray.  ``nearness``: cosine at the emitter over the squared
+    distance, 0 for points, infinite where no virtual light stands for the emitter; None where no virtual light stands
+    for any emitter.
+    """
+
+    direction: mi.Vector3f
+    weight: mi.UnpolarizedSpectrum
+    density: mi.Float
+    is_point: mi.Bool
+    ray: mi.Ray3f
+    nearness: mi.Float | None = None
+
+    def chosen_with(self, probability: mi.Float) -> EmitterSample:
+        """The sample where the emitter was chosen with a probability."""
+        weight = finite_or_zero(self.weight / probability)
+        return EmitterSample(self.direction, weight, self.density * probability, self.is_point, self.ray, self.nearness)
+
+    def arriving(self, scene, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """The weight where the emitter is visible, 0 elsewhere: traces a shadow ray where the weight matters."""
+        possible = active & (dr.max(self.weight) > 0) & (self.density > 0)
+        return dr.select(possible & ~scene.ray_test(self.ray, possible), self.weight, 0)
+
+
+@dataclass
+class MetEmitter:
+    """Emitters that rays met: ``radiance``; ``density`` with which the sampler draws the direction, 1 / sr;
+    ``nearness``: see :class:`EmitterSample`."""
+
+    radiance: mi.UnpolarizedSpectrum
+    density: mi.Float
+    nearness: mi.Float | None = None
+
+
+class EmitterSampler(Protocol):
+    """Choice of emitters for next-event estimation.
+
+    ``lights``: virtual lights that may stand for the emitters, None where none can.
+    """
+
+    lights: EmitterLights | None
+
+    def cell(self, position: mi.Point3f, facing: mi.Normal3f) -> mi.UInt32:
+        """Number of the spatial cell of each vertex; ``facing``: shading normal on the visible side."""
+        raise NotImplementedError
+
+    def sample(self, si, cell, chosen, member, place, active) -> EmitterSample:
+        """Sample a direction to an emitter for each vertex ``si``.
+
+        ``chosen``, ``member``, ``place``: uniform numbers that choose a source, a part of it, and a point on the part.
+        """
+        raise NotImplementedError
+
+    def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
+        """Emission that a ray from ``vertex`` met at ``si``; ``has_density``: whether its direction has a density."""
+        raise NotImplementedError
+
+    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> bool:
+        """Learn from vertices (n, 3) with about ``rays`` rays; returns whether anything was learned."""
+        raise NotImplementedError
+
+    def forget(self) -> None:
+        """Return to the probabilities before :meth:`learn`."""
+        raise NotImplementedError
+
+
+class UniformEmitters:
+    """Mitsuba's own choice: every emitter with the same probability.  There is nothing to learn."""
+
+    lights = None
+
+    def __init__(self, scene):
+        self._scene = scene
+
+    def cell(self, position, facing):
+        """The only cell."""
+        return mi.UInt32(0)
+
+    def sample(self, si, cell, chosen, member, place, active) -> EmitterSample:
+        """See :meth:`EmitterSampler.sample`."""
+        ds, weight = self._scene.sample_emitter_direction(si, place, False, active)
+        far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        ray = dr.select(far, si.spawn_ray(ds.d), si.spawn_ray_to(ds.p))
+        return EmitterSample(ds.d, finite_or_zero(mi.unpolarized_spectrum(weight)), ds.pdf, ds.delta, ray)
+
+    def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
+        """See :meth:`EmitterSampler.met`."""
+        origin = dr.zeros(mi.Interaction3f)
+        origin.p = vertex
+        ds = mi.DirectionSample3f(self._scene, si, origin)
+        density = self._scene.pdf_emitter_direction(origin, ds, active & has_density)
+        emitted = si.emitter(self._scene, active).eval(si, active)
+        return MetEmitter(finite_or_zero(mi.unpolarized_spectrum(emitted)) & active, density)
+
+    def learn(self, position, normal, rays: int, seed: int) -> bool:
+        """See :meth:`EmitterSampler.learn`."""
+        return False
+
+    def forget(self) -> None:
+        """See :meth:`EmitterSampler.forget`."""
+
+
+# ---------------------- Irradiance ----------------------
+
+
+@dataclass
+class Places:
+    """Points on surfaces, one per lane, evaluated: ``position``, geometric ``normal``, and ``facing``: the shading
+    normal on the lit side."""
+
+    position: mi.Point3f
+    normal: mi.Normal3f
+    facing: mi.Normal3f
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return dr.width(self.position)
+
+    def interaction(self) -> mi.SurfaceInteraction3f:
+        """Surface interactions with the fields that emitters and rays need."""
+        si = dr.zeros(mi.SurfaceInteraction3f, self.count)
+        si.p, si.n, si.sh_frame = self.position, self.normal, mi.Frame3f(self.facing)
+        return si
+
+
+@recorded_once
+@dr.syntax
+def irradiance_from_emitters(scene, emitters: EmitterSampler, places: Places, cell, samples: int, seed: int):
+    """Irradiance straight from emitters by next-event estimation with ``samples`` samples for each of the ``places``.
+
+    Returns, evaluated: the irradiance, an unpolarized spectrum, weighted for multiple importance sampling with
+    cosine-distributed directions; and the mean over channels of the unoccluded irradiance, without that weight.
+    Virtual lights and learning samplers share this kernel, because compiling it takes a good part of a first render.
+    """
+    si, sampler, number = places.interaction(), independent_sampler(seed, places.count), mi.UInt32(0)
+    wanted = dr.opaque(mi.UInt32, samples)
+    reached, unoccluded = dr.zeros(mi.UnpolarizedSpectrum, places.count), dr.zeros(mi.Float, places.count)
+    while dr.hint(number < wanted, exclude=[scene, emitters, si, places, cell, wanted]):
+        sample = emitters.sample(si, cell, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
+        cosine = dr.maximum(dr.dot(places.facing, sample.direction), 0)
+        mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, cosine * dr.inv_pi))
+        reached += dr.select(sample.density > 0, sample.arriving(scene, cosine > 0) * cosine * mis, 0)
+        unoccluded += channel_mean(sample.weight) * cosine
+        number += 1
+    reached, unoccluded = reached / mi.Float(wanted), unoccluded / mi.Float(wanted)
+    dr.eval(reached, unoccluded)
+    return reached, unoccluded

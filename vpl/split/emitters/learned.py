@@ -1,0 +1,327 @@
+"""Emitters chosen by spatial cell, from the light of each that a pilot's vertices receive.
+
+Vertices in a cell trace a few rays to every source of light; neighbouring cells count as well.  A fraction of the
+samples keeps the usual probabilities, which are all that cells without vertices have.  Sources are the emitters one by
+one, and regions of the environment (:mod:`vpl.direct.environment_regions`), so that a room that sees the sky through a
+window samples the window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...core.arrays import channel_mean, download, finite_or_zero, upload, upload_vectors
+from ...core.registry import RegistryTable
+from ...core.sampling import RowChoice, derived_seed, independent_sampler
+from ...direct.environment_regions import regions_of
+from ..spatial_cells import SpatialCells
+from .base import EmitterSample, MetEmitter, Places, irradiance_from_emitters
+
+# Rays to learn by, as a fraction of the camera rays: learning may take a few percent of a render
+_LEARNING_SHARE = 0.25
+# Rays from a cell to each source; largest number of rays of all cells, which bounds memory (some 100 bytes a ray)
+_RAYS_EACH, _MOST_RAYS = 2, 1 << 20
+# Largest number of rays that the neighbours of a cell count as; rays that the prior visibility counts as
+_NEIGHBOURS, _PRIOR = 4.0, 1.0
+# Regions of the environment; columns of the radiance table that they are made from
+_REGIONS, _COLUMNS = 256, 512
+# Fraction of the samples that keep Mitsuba's probabilities: a cell may see emitters that its pilot vertices did not
+_USUAL_SHARE = 0.2
+
+
+def learning_rays(paths: int) -> int:
+    """Number of rays to learn by, for a number of camera rays."""
+    return int(_LEARNING_SHARE * paths)
+
+
+class CellChoice:
+    """Probabilities of sources by spatial cell; before :meth:`learn`, the same everywhere.
+
+    ``usual`` (n,) float64: probabilities where nothing is known, which sum to 1; ``share``: fraction of the samples
+    that use them in every cell; ``ignored``: indices of sources that are not learned.
+    """
+
+    def __init__(self, usual: np.ndarray, share: float, ignored: np.ndarray):
+        self.count, self._stride = len(usual), dr.opaque(mi.UInt32, len(usual) + 1)
+        self._usual, self._share, self._ignored = usual, share, ignored
+        # While it learns, every source has a cell of its own, where only that source is drawn
+        self._learns = dr.opaque(mi.Bool, False)
+        self.forget()
+
+    def _use(self, probability: np.ndarray) -> None:
+        """Use probabilities (cells, sources) float64; rows sum to 1."""
+        self._rows = RowChoice(probability.ravel(), np.full(len(probability), self.count))
+
+    @property
+    def pmf(self) -> np.ndarray:
+        """Probabilities (cells + 1, sources) of drawing each source; row 0 where nothing is known."""
+        return self._rows.pmf.reshape(-1, self.count)
+
+    # ---------------------- Learning ----------------------
+
+    def forget(self) -> None:
+        """Return to the usual probabilities everywhere."""
+        self._cells = SpatialCells.none()
+        # Twice, because Dr.Jit compiles other kernels for arrays of one entry
+        self._use(np.stack([self._usual, self._usual]))
+
+    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int, look: Callable) -> bool:
+        """Learn from vertices (n, 3) with at most about ``rays`` rays; returns whether anything was learned.
+
+        ``look(places, cell)``: :func:`vpl.split.emitters.base.irradiance_from_emitters` with one sample each.
+        """
+        each = _RAYS_EACH * self.count
+        most = min(rays, _MOST_RAYS) // each
+        if most < 1 or len(position) == 0:
+            return False
+        self._cells, cell = SpatialCells.around(position, normal, most)
+        size = np.bincount(cell)[1:]
+        order, cells = np.argsort(cell, kind="stable"), len(size)
+        first = upload(mi.UInt32, np.cumsum(size) - size)
+        lane = dr.arange(mi.UInt32, cells * each)
+        row = lane // dr.opaque(mi.UInt32, each)
+        source = lane // _RAYS_EACH % dr.opaque(mi.UInt32, self.count)
+        sampler = independent_sampler(seed, len(lane))
+        number = mi.UInt32(sampler.next_1d() * mi.Float(dr.gather(mi.UInt32, upload(mi.UInt32, size), row)))
+        vertex = dr.gather(mi.UInt32, first, row) + number
+        position, normal = (upload_vectors(mi.Point3f, x[order]) for x in (position, normal))
+        facing = mi.Normal3f(dr.gather(mi.Point3f, normal, vertex))
+        # Two distinct arrays of normals, as virtual lights have, so that both use the same kernel
+        places = Places(dr.gather(mi.Point3f, position, vertex), facing + dr.opaque(mi.Float, 0.0), facing)
+        dr.eval(places, source)
+        self._learns = dr.opaque(mi.Bool, True)
+        reached, unoccluded = look(places, source)
+        self._learns = dr.opaque(mi.Bool, False)
+        reached, unoccluded = (
+            download(x).astype(np.float64).reshape(cells, self.count, _RAYS_EACH)
+            for x in (channel_mean(reached), unoccluded)
+        )
+        self._use(self._shares(unoccluded, reached > 0))
+        return True
+
+    def _shares(self, unoccluded: np.ndarray, seen: np.ndarray) -> np.ndarray:
+        """Probabilities (cells + 1, sources) from unoccluded irradiance and visibility (cells, sources, rays).
+
+        They are proportional to the root mean square of the light that arrived.  Row 0 is for unknown cells.
+        """
+        possible = np.nan_to_num(unoccluded, posinf=0) ** 2
+        possible[:, self._ignored] = 0
+        found = possible * seen
+        # Prior visibility of a source in a cell: how often the cell sees sources, times how often cells see the source
+        of_cell, of_source, of_all = (_share(found, possible, axes) for axes in ((1, 2), (0, 2), (0, 1, 2)))
+        visible = np.minimum(of_cell * of_source / max(float(of_all.squeeze()), 1e-9), 1)[..., 0]
+        found, possible = found.mean(2), possible.mean(2)
+        # The mean of roots, because a neighbour may be next to an emitter that is far from this cell
+        expected, rays = self._of_neighbours(found**0.5, (visible * possible) ** 0.5)
+        rays = np.minimum(rays, _NEIGHBOURS)
+        power = ((_RAYS_EACH * found + rays * expected**2) / (_RAYS_EACH + rays)) ** 0.5
+        total = power.sum(1, keepdims=True)
+        learned = np.where(total > 0, power / np.maximum(total, np.finfo(np.float64).tiny), self._usual)
+        return np.concatenate([self._usual[None], (1 - self._share) * learned + self._share * self._usual])
+
+    def _of_neighbours(self, power: np.ndarray, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean ``power`` (cells, sources) of the neighbours of each cell, and the number of rays (cells, 1) behind it.
+
+        ``guess``: prior mean, with the weight of ``_PRIOR`` rays.
+        """
+        neighbours, total = self._cells.neighbours(), _PRIOR * guess
+        # Row 0 stands for neighbours that do not exist
+        padded = np.concatenate([np.zeros((1, self.count)), _RAYS_EACH * power])
+        for neighbour in neighbours.T:
+            total += padded[neighbour]
+        rays = _RAYS_EACH * np.count_nonzero(neighbours, 1)[:, None] + _PRIOR
+        return total / rays, rays
+
+    # ---------------------- Sampling ----------------------
+
+    def cell(self, position, facing):
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.cell`."""
+        return self._cells.at(position, facing)
+
+    def draw(self, cell, number, active):
+        """Draw a source for each cell by a uniform number: (source, its probability, a new uniform number)."""
+        known = active & ~self._learns
+        row = self._rows.draw(cell, number, known)
+        source = dr.select(self._learns, cell, row - self._row(cell))
+        probability = dr.select(self._learns, 1, self._rows.probability(row, known))
+        return source, probability, dr.select(self._learns, number, self._rows.rest(row, number, known))
+
+    def probability(self, cell, source, active):
+        """Probability of a source in each cell."""
+        known = self._rows.probability(self._row(cell) + source, active & ~self._learns)
+        return dr.select(self._learns, dr.select(active & (cell == source), mi.Float(1), 0), known)
+
+    def _row(self, cell):
+        """Start of a cell's row in the table of probabilities."""
+        return cell * self._stride
+
+
+def _share(found: np.ndarray, possible: np.ndarray, axes: tuple) -> np.ndarray:
+    """Fraction of the rays with unoccluded light that found light, over some axes, which are kept."""
+    return np.count_nonzero(found, axes, keepdims=True) / np.maximum(np.count_nonzero(possible, axes, keepdims=True), 1)
+
+
+class CellEmitters:
+    """Part that all samplers with a :class:`CellChoice` share; ``_scene``, ``choice``: set by the subclass."""
+
+    choice: CellChoice
+
+    def cell(self, position, facing):
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.cell`."""
+        return self.choice.cell(position, facing)
+
+    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> bool:
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.learn`."""
+
+        def look(places, cell):
+            return irradiance_from_emitters(self._scene, self, places, cell, 1, derived_seed(seed, 1))
+
+        return self.choice.learn(position, normal, rays, derived_seed(seed, 0), look)
+
+    def forget(self) -> None:
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.forget`."""
+        self.choice.forget()
+
+
+class LearnedEmitters(CellEmitters):
+    """Emitters one by one, and regions of the environment.
+
+    Before anything is learned, the probability of an emitter is proportional to its ``sampling_weight``, as in Mitsuba.
+    """
+
+    # No virtual lights stand for emitters
+    lights = None
+
+    def __init__(self, scene):
+        order = _reproducible_order(scene.emitters())
+        emitters = [scene.emitters()[number] for number in order]
+        self._scene, self._count = scene, len(emitters)
+        self._emitters = dr.gather(mi.EmitterPtr, scene.emitters_dr(), upload(mi.UInt32, order))
+        dr.eval(self._emitters)
+        # Emitters with a weight of 0 are never sampled, as in Mitsuba
+        weight = np.array([emitter.sampling_weight() for emitter in emitters])
+        self._environment = scene.environment()
+        of_environment = np.array([emitter.is_environment() for emitter in emitters])
+        self._environment_number = int(of_environment.argmax()) if self._environment is not None else -1
+        self._regions = None
+        if weight[of_environment].any():
+            self._regions = regions_of(self._environment, _REGIONS, _COLUMNS)
+        registry = download(dr.reinterpret_array(mi.UInt32, self._emitters))
+        self._number_of = RegistryTable(registry, np.arange(1, self._count + 1))
+        alike = np.zeros(self._count + (self._regions.count if self._regions else 0))
+        alike[: self._count] = weight / weight.sum()
+        ignored = alike[: self._count] == 0
+        if self._regions:
+            # Regions are learned instead of the whole environment. Where nothing is known, the environment draws for
+            # itself, because its own samples are better spread
+            ignored[self._environment_number] = True
+        self.choice = CellChoice(alike, _USUAL_SHARE, np.flatnonzero(ignored))
+
+    def _draw(self, si, source, member, place, active) -> EmitterSample:
+        """Sample a direction to each source."""
+        of_emitter = active & (source < self._count)
+        emitter = dr.gather(mi.EmitterPtr, self._emitters, dr.minimum(source, self._count - 1))
+        ds, weight = emitter.sample_direction(si, place, of_emitter)
+        weight = finite_or_zero(mi.unpolarized_spectrum(weight)) & of_emitter
+        # A ray without an end for infinite emitters: Mitsuba 3.9.1 places them outside of the scene's bounding box,
+        # which leaves out rectangles
+        far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+        ray = dr.select(far, si.spawn_ray(ds.d), si.spawn_ray_to(ds.p))
+        direction, density, delta = ds.d, ds.pdf, ds.delta & of_emitter
+        if self._regions:
+            of_region = active & ~of_emitter
+            # A branch, because no region is drawn where nothing is known
+            direction, weight, density = dr.if_stmt(
+                (source, member, place, direction, weight, density),
+                of_region,
+                lambda source, member, place, *_: self._regions.sample(
+                    source - self._count, member, place, mi.Bool(True)
+                ),
+                lambda source, member, place, *drawn: drawn,
+            )
+            ray = dr.select(of_region, si.spawn_ray(direction), ray)
+        return EmitterSample(direction, weight, density, delta, ray)
+
+    def sample(self, si, cell, chosen, member, place, active) -> EmitterSample:
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.sample`."""
+        source, probability, _ = self.choice.draw(cell, chosen, active)
+        sample = self._draw(si, source, member, place, active)
+        if not self._regions:
+            return sample.chosen_with(probability)
+        # The environment and its regions may draw the same direction: its density is the sum of both
+        of_region = active & (source >= self._count)
+        of_environment = of_region | (active & (source == self._environment_number))
+        # The density that the emitter returned with its sample: asked for the density of a direction at the edge of the
+        # sun, Mitsuba 3.9.1 returns that of the sky, a hundred thousand times less. Regions that draw such a direction
+        # find the radiance of the sky, too, so the sun loses a thousandth of its light at most
+        own = dr.select(of_region, self._own_density(si, sample.direction, of_region), sample.density)
+        both = self._environment_density(cell, sample.direction, own, of_environment)
+        return sample.chosen_with(dr.select(of_environment, both / sample.density, probability))
+
+    def _own_density(self, origin, direction, active):
+        """Density with which the environment itself draws a direction; Mitsuba's is NaN for a black environment."""
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.d = direction
+        return finite_or_zero(self._environment.pdf_direction(origin, ds, active))
+
+    def _environment_density(self, cell, direction, own, active):
+        """Density of a direction to the environment; ``own``: density with which the environment itself draws it."""
+        # A branch, as in `_draw`: cell 0 draws no region, also while emitters are learned, when it is the first
+        # emitter's
+        by_region = dr.if_stmt(
+            (cell, direction, mi.Float(0)),
+            active & (cell > 0),
+            lambda cell, direction, _: self._region_density(cell, direction),
+            lambda cell, direction, none: none,
+        )
+        return by_region + own * self.choice.probability(cell, mi.UInt32(self._environment_number), active)
+
+    def _region_density(self, cell, direction):
+        """Density with which a direction is drawn through its region."""
+        region, density = self._regions.find(direction, True)
+        return density * self.choice.probability(cell, self._count + region, True)
+
+    def _density_met(self, origin, cell, direction):
+        """Density of a direction in which a ray met the environment."""
+        return self._environment_density(cell, direction, self._own_density(origin, direction, True), True)
+
+    def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.met`."""
+        origin = dr.zeros(mi.Interaction3f)
+        origin.p = vertex
+        ds = mi.DirectionSample3f(self._scene, si, origin)
+        emitter = si.emitter(self._scene, active)
+        emitted = finite_or_zero(mi.unpolarized_spectrum(emitter.eval(si, active))) & active
+        wanted = active & has_density & (emitter != None)  # noqa: E711
+        found = self._number_of.at(emitter, wanted)
+        wanted, number = wanted & (found > 0), found - 1
+        near = wanted & si.is_valid()
+        probability = self.choice.probability(cell, number, near)
+        density = emitter.pdf_direction(origin, ds, near) * probability
+        if self._regions:
+            # A branch, because few packets hold a path that leaves the scene
+            density = dr.if_stmt(
+                (origin, cell, ray.d, density),
+                wanted & ~si.is_valid(),
+                lambda origin, cell, direction, density: self._density_met(origin, cell, direction),
+                lambda origin, cell, direction, density: density,
+            )
+        return MetEmitter(emitted, density)
+
+
+def _reproducible_order(emitters: list) -> np.ndarray:
+    """Sort emitters by class, bounding box and printed properties: (n,) indices.
+
+    Mitsuba 3.9.1 lists the shapes of a scene, and with them their emitters, in an order that differs from one loading
+    of a file to the next.  With the order of the list, the same seed would give another image each time.
+    """
+
+    def key(number: int):
+        box = emitters[number].bbox()
+        return emitters[number].class_name(), *np.array(box.min), *np.array(box.max), str(emitters[number])
+
+    return np.array(sorted(range(len(emitters)), key=key), np.uint32)

@@ -1,0 +1,291 @@
+"""Estimator of ``manylights``: pilot → plan → lights → image.
+
+Each step takes the results of the steps before it and returns its own result; nothing is changed in place but the
+emitter sampler, which learns from the pilot.  The same seed makes the same decisions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import channel_mean, download, upload
+from ..core.clock import Clock
+from ..core.sampling import derived_seed
+from ..core.stages import Stage
+from ..points.camera_paths import SceneTraits
+from ..transport.evaluation import Transport
+from .emitters.learned import learning_rays
+from .gather_vertices import LitVertices
+from .path_tracer import Traced, trace_camera_rays
+from .pilot import Pilot, judged_by, relative_variance
+from .pixel_clusters import PixelClusters, light_clusters
+from .plan import Evidence, Option, Plan, choose, may_pay, price, without_lights
+from .roulette import OutgoingRadiance, best_multiple
+from .surface_lights import KeptLights, surface_lights
+from .view import PathSettings, Stream, View, ViewLights
+
+# Camera rays that are traced at a time: half of them, but at least and at most as many. New memory of a process is slow
+# to fill, which small images feel, and Dr.Jit records the kernels anew for each part
+_WAVEFRONT = 1 << 18, 1 << 20
+# Every surface blocks the light of virtual lights: light that passes a surface is traced
+_OPAQUE = SceneTraits(False, False, True, False, False, (), (), None)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """``radiance`` of each camera ray; ``valid``: whether the ray is opaque in the film's alpha; ``statistics``."""
+
+    radiance: mi.UnpolarizedSpectrum
+    valid: mi.Bool
+    statistics: dict
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A ``plan`` with the ``evidence`` of the ``pilot`` and the ``options`` that were compared."""
+
+    pilot: Pilot
+    evidence: Evidence
+    plan: Plan
+    options: list[Option]
+
+    def expected_light(self, lights: ViewLights) -> np.ndarray:
+        """Radiance that ``lights`` are expected to bring to each pixel of the view, (pixels,)."""
+        kinds = bool(lights.surfaces), bool(lights.emitters)
+        remains = next(x.expected for x in self.options if (x.surfaces, x.emitters) == kinds)
+        return np.maximum(self.pilot.nearby(self.pilot.radiance - remains), 0)
+
+
+def estimate(
+    view: View, virtual_lights: bool, kept: KeptLights | None, stopped: Callable[[], bool], clock: Clock
+) -> Estimate:
+    """Estimate the radiance of a view's camera rays.
+
+    ``virtual_lights``: whether there may be any; ``kept``: lights of earlier images, None where none are kept;
+    ``stopped``: whether to end early.
+    """
+    clock.begin(Stage.PILOT)
+    decision = decide(view, learning_pilot(view), virtual_lights)
+    view, roulette = with_roulette(view, decision)
+    mi.Log(mi.LogLevel.Info, f"manylights: {decision.plan}")
+    lights, of_lights = make_lights(view, decision, kept, clock)
+    radiance, valid, of_image = render_image(view, lights, decision, stopped, clock)
+    statistics = {"balance": decision.plan.reason} | roulette | of_lights | of_image
+    return Estimate(radiance, valid, statistics | {"seconds": clock.seconds})
+
+
+# ---------------------- Pilot ----------------------
+
+
+def learning_pilot(view: View) -> Pilot:
+    """Trace the pilot, let the emitter sampler learn from it, and trace it again where the sampler learned.
+
+    The sampler forgets where the second pilot has the greater variance × cost: small shadows and gloss can mislead it.
+    """
+    pilot = Pilot.trace(view, ViewLights())
+    rays, seed = learning_rays(view.count), derived_seed(view.seed, Stream.LEARNING)
+    if not view.emitters.learn(*pilot.vertices, rays, seed):
+        return pilot
+    again = Pilot.trace(view, ViewLights())
+    before, after = (relative_variance(x.radiance, pilot.brightness, view.model) for x in (pilot, again))
+    if view.model.learned_cost * after < before:
+        return again
+    view.emitters.forget()
+    return pilot
+
+
+# ---------------------- Plan ----------------------
+
+
+def decide(view: View, pilot: Pilot, virtual_lights: bool) -> Decision:
+    """Compare the kinds of virtual lights by the pilot."""
+    emitters = _may_carry_emitters(view)
+    direct = pilot.radiance - pilot.indirect
+    evidence = Evidence(pilot.radiance, direct, pilot.brightness, view.count, view.samples, emitters, view.model)
+    refusal = _refusal(view, virtual_lights)
+    if refusal:
+        return Decision(pilot, evidence, without_lights(refusal), [])
+    options = _options(view, pilot, evidence)
+    return Decision(pilot, evidence, choose(evidence, options), options)
+
+
+def _may_carry_emitters(view: View) -> bool:
+    return view.emitters.lights is not None and view.rules.max_depth > 1
+
+
+def _refusal(view: View, virtual_lights: bool) -> str:
+    """Reason against virtual lights that no pilot can change; empty where there is none."""
+    if not virtual_lights:
+        return "virtual_lights is off"
+    if view.perturbed.everywhere:
+        return "bump or normal maps are in shape groups"
+    if view.rules.max_depth <= 2 and not _may_carry_emitters(view):
+        return "no light is indirect at this max_depth"
+    return ""
+
+
+def _options(view: View, pilot: Pilot, evidence: Evidence) -> list[Option]:
+    """Kinds of lights that may pay; measures the residual of lights on surfaces where it can change the choice."""
+    options, assumed, emitters = [], _with_surfaces(view, pilot, False), None
+    if evidence.emitters:
+        emitters = view.emitter_lights([])
+        traced = Pilot.trace(view, ViewLights(emitters=emitters))
+        options.append(Option(False, True, traced.radiance, traced.indirect))
+        assumed += _with_surfaces(view, traced, True)
+    # A measured residual only raises the price of an option: the most promising option is measured first, and another
+    # one only if it still promises more
+    for option in sorted(assumed, key=partial(price, evidence)):
+        if may_pay(evidence, option, options):
+            # The distance between lights is not known yet. With c = 0 lights carry the most
+            surfaces = view.light_set([], 0.0)
+            residual = Pilot.trace(view, ViewLights(surfaces, emitters if option.emitters else None))
+            option = replace(option, residual=residual.radiance)
+        options.append(option)
+    return options
+
+
+def _with_surfaces(view: View, traced: Pilot, emitters: bool) -> list[Option]:
+    """The option of lights on surfaces, if there is indirect light; ``traced``: pilot without lights on surfaces."""
+    if view.rules.max_depth <= 2 or not traced.indirect.any():
+        return []
+    return [Option(True, emitters, traced.radiance, traced.indirect)]
+
+
+def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
+    """The view with Russian roulette by expected contribution, where that pays, and its multiple as a statistic."""
+    pilot, onward, model = decision.pilot, decision.pilot.onward, view.model
+    if len(onward.path) == 0:
+        return view, {}
+    outgoing, predicted = OutgoingRadiance.learned(onward.position, onward.normal, onward.sent, model)
+    relative = onward.throughput / judged_by(decision.evidence.brightness, model)[onward.path]
+    whole = decision.evidence.variance(pilot.radiance)
+    paths = len(pilot.radiance)
+    multiple = best_multiple(relative * predicted, relative * onward.sent, onward.edges, paths, whole, model)
+    if not np.isfinite(multiple):
+        return view, {}
+    if decision.plan.gathers:
+        # The less variance remains, the more a contribution matters
+        multiple *= (whole / max(decision.plan.variance, 1e-9)) ** 0.5
+    importance = upload(mi.Float, multiple / judged_by(pilot.nearby(pilot.radiance), model))
+    return replace(view, outgoing=outgoing, importance=importance), {"roulette": multiple}
+
+
+# ---------------------- Lights ----------------------
+
+
+def make_lights(view: View, decision: Decision, kept: KeptLights | None, clock: Clock) -> tuple[ViewLights, dict]:
+    """(Virtual lights with their trees, statistics) of a plan."""
+    surfaces, statistics = _surface_lights(view, decision, kept, clock)
+    if not decision.plan.emitters:
+        return ViewLights(surfaces), statistics
+    clock.begin(Stage.TREE)
+    lights = view.emitters.lights
+    groups = lights.groups(lights.points(view.count, view.model), derived_seed(view.seed, Stream.EMITTER_LIGHTS))
+    emitters = view.emitter_lights(groups)
+    counts = statistics.get("lights", {}) | {"emitters": emitters.count}
+    return ViewLights(surfaces, emitters), statistics | {"lights": counts}
+
+
+def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clock: Clock):
+    """(Light set on surfaces, None where there is none; statistics)."""
+    wanted, arrivals = decision.plan.light_paths, decision.pilot.arrivals
+    if not wanted:
+        return None, {}
+    clock.begin(Stage.LIGHTS)
+    drawn = []
+
+    def make():
+        drawn.append(wanted)
+        return surface_lights(view, arrivals, wanted, lambda: clock.begin(Stage.TREE))
+
+    made = kept.find(view.scene, (view.seed, view.rules.max_depth), make) if kept else make()
+    statistics = {"light_paths": sum(drawn), "lights": {"surface": made.lights.count}}
+    if made.group is None:
+        return None, statistics
+    return view.light_set([made.group], made.spacing(arrivals)), statistics
+
+
+# ---------------------- Image ----------------------
+
+
+def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Callable[[], bool], clock: Clock):
+    """(Radiance, valid, statistics) of the camera rays, traced in parts of whole pixels of about the same size."""
+    settings = view.settings(lights)
+    expected = decision.expected_light(lights) if lights.all else None
+    radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
+    parts = max(round(view.count / np.clip(view.count / 2, *_WAVEFRONT)), 1)
+    most = -(-view.pixels // parts) * view.samples
+    statistics: dict[str, int] = {}
+    for first in range(0, view.count, most):
+        if stopped():
+            break
+        lane = dr.arange(mi.UInt32, min(most, view.count - first)) + dr.opaque(mi.UInt32, first)
+        dr.eval(lane)
+        traced, points = _traced_part(view, lane, first, settings, lights, decision.plan, clock)
+        part, opaque = traced.radiance, traced.valid
+        # Frees the memory of gather vertices that are not lit
+        del traced
+        if points is not None:
+            of_pixels = expected[first // view.samples :][: -(-len(lane) // view.samples)]
+            light, counts = _gathered_part(view, lights, decision.plan, points, part, of_pixels, first, clock)
+            part += light
+            statistics = {name: statistics.get(name, 0) + number for name, number in counts.items()}
+        dr.scatter(radiance, part, lane)
+        dr.scatter(valid, opaque, lane)
+        dr.eval(radiance, valid)
+    clock.stop()
+    if view.scene.environment() is not None and not view.rules.hide_emitters:
+        valid |= view.active
+    finite = dr.all(dr.isfinite(radiance))
+    dropped = int(dr.count(~finite)[0])
+    if dropped:
+        mi.Log(mi.LogLevel.Warn, f"{dropped} sample(s) with values that are not finite were dropped.")
+    shown = view.rules.max_depth > 0
+    return dr.select(finite & shown, radiance, 0), valid & shown, statistics | {"dropped": dropped}
+
+
+def _traced_part(
+    view: View, lane: mi.UInt32, first: int, settings: PathSettings, lights: ViewLights, plan: Plan, clock: Clock
+) -> tuple[Traced, LitVertices | None]:
+    """(Traced part of the camera rays ``lane``, from the ray ``first`` on; gather vertices that are lit)."""
+    clock.begin(Stage.TRACED)
+    traced = trace_camera_rays(view, lane, settings, Stream.IMAGE, first)
+    if not lights.all:
+        return traced, None
+    clock.begin(Stage.CLUSTERS)
+    seed = derived_seed(derived_seed(view.seed, Stream.GATHER, first), 0)
+    gathered = traced.gathered
+    return traced, LitVertices.of(gathered.first, gathered.later, view.samples, plan.vertices, seed)
+
+
+def _gathered_part(view: View, lights: ViewLights, plan: Plan, points: LitVertices, found, expected, first, clock):
+    """(Light of virtual lights at the ``points`` of some pixels, per camera ray; counters).
+
+    The error of cuts is relative to the brightness of a pixel: the radiance that paths ``found``, plus the light that
+    virtual lights are ``expected`` to bring.
+    """
+    samples, count = view.samples, dr.width(found)
+    lit = dr.zeros(mi.UnpolarizedSpectrum, count)
+    dr.eval(lit)
+    if points.count == 0:
+        return lit, {}
+    clusters = PixelClusters(points, samples)
+    clock.begin(Stage.CUTS)
+    traced = np.nan_to_num(download(channel_mean(found)), posinf=0, neginf=0)
+    level = np.maximum(traced, 0).reshape(-1, samples).mean(1) + expected
+    level = np.maximum(level, view.model.dark_pixel * level.mean())
+    # Of the sum over the samples of a pixel
+    allowed = plan.error * samples * level[clusters.pixel]
+    shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, first)
+    for number, carrying in enumerate(lights.all):
+        transport, stream = Transport(view.scene, _OPAQUE, carrying), derived_seed(seed, 1, number)
+        shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit)
+    clock.stop()
+    counts = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}
+    return lit, counts | {"later": points.alone}

@@ -1,0 +1,106 @@
+"""Stratified random numbers for vertices that scatter: a lattice over the samples of a pixel at each vertex.
+
+Rank-1 lattices with a random shift of the unit square, so that every single number is uniform [Cranley and Patterson
+1976; Sloan and Joe 1994, "Lattice Methods for Multiple Integration"].  Each dimension, vertex and pixel takes the
+points in a random order of its own: with a common order, products of two dimensions would have up to twice the variance
+of independent numbers.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import upload
+from ..core.sampling import HASH_ROUNDS, derived_seed
+
+# Multipliers of a hash in which every bit depends on all input bits [Wellons 2018, "Prospecting for hash functions"]
+_MIXING = (0x7FEB352D, 0x846CA68B)
+# 2^32 over the golden ratio, made odd: far from any simple fraction
+_STEP = 0x9E3779B9
+# Largest number of orders in the table and of its entries (1 MB), but at least one order: two dimensions share an order
+# and its start with a probability of one over the entries. Multipliers that are tried for a lattice
+_ORDERS, _ENTRIES, _TRIED = 256, 1 << 18, 64
+
+
+def _mixed(bits, stream: int):
+    """Hash ``bits``: 32-bit numbers, independent for each stream."""
+    bits = bits + (stream * _STEP & 0xFFFFFFFF)
+    bits = (bits ^ (bits >> 16)) * _MIXING[0]
+    bits = (bits ^ (bits >> 15)) * _MIXING[1]
+    return bits ^ (bits >> 16)
+
+
+@lru_cache(maxsize=64)
+def lattice_multiplier(count: int) -> int:
+    """Multiplier g of the lattice (i, g i) / ``count`` modulo 1.
+
+    Of the candidates nearest to the golden ratio, the one with the least P_2, the worst-case error over smooth periodic
+    functions [Sloan and Joe 1994, section 4.2].
+    """
+    candidates = np.arange(1, max(count, 2))
+    candidates = candidates[np.gcd(candidates, count) == 1]
+    nearest = np.argsort(np.abs(candidates * (1 + 5**0.5) / 2 - count), kind="stable")[:_TRIED]
+    number = np.arange(count)
+
+    def kernel(numerator):
+        x = numerator / count
+        return 1 + 2 * np.pi**2 * (x * x - x + 1 / 6)
+
+    along = kernel(number)
+    errors = [np.mean(along * kernel(number * g % count)) for g in candidates[nearest]]
+    return int(candidates[nearest][np.argmin(errors)])
+
+
+@lru_cache(maxsize=8)
+def _orders(count: int) -> np.ndarray:
+    """Random permutations of ``count`` points, one after the other; fixed, as a hash function is."""
+    rows = np.tile(np.arange(count, dtype=np.uint32), (max(min(_ORDERS, _ENTRIES // count), 1), 1))
+    return np.random.default_rng(0).permuted(rows, axis=1).reshape(-1)
+
+
+def _fraction(bits):
+    return mi.Float(bits >> 8) * 2**-24
+
+
+class Lattice:
+    """Numbers for paths; ``lane`` (UInt32): of each path, where ``samples`` consecutive lanes belong to a pixel."""
+
+    def __init__(self, lane, samples: int, seed: int):
+        # Evaluated, so that counted and chosen lanes use the same kernel
+        dr.eval(lane)
+        self._samples = dr.opaque(mi.UInt32, samples)
+        self._pixel, self._number = lane // self._samples, lane % self._samples
+        # Derived, because the numbers of vertices are added to it
+        self._seed = dr.opaque(mi.UInt32, derived_seed(seed, 0))
+        orders = _orders(samples)
+        self._orders, self._rows = upload(mi.UInt32, orders), dr.opaque(mi.UInt32, len(orders) // samples)
+        # Steps between points of the lattice, in units of 2^-32
+        steps = (round(times * 2**32 / samples) for times in (1, lattice_multiplier(samples)))
+        self._steps = [dr.opaque(mi.UInt32, step % 2**32) for step in steps]
+
+    def at(self, vertex):
+        """Numbers of a path at its ``vertex`` (UInt32, counted): (number, pair, number, pair) in [0, 1)."""
+        found = []
+        # One good hash; cheap hashes derive the rest from it
+        orders, shifts = mi.sample_tea_32(self._pixel, self._seed + vertex, HASH_ROUNDS)
+        for stream in range(4):
+            point = self._point(_mixed(orders, stream))
+            shift = _mixed(shifts, 2 * stream)
+            numbers = [_fraction(point * self._steps[0] + shift)]
+            if stream % 2:
+                # Mirrored with probability 1/2, because every lattice is coarse in some directions
+                mirrored = dr.select((shift & 1) == 0, point, 0 - point)
+                numbers.append(_fraction(mirrored * self._steps[1] + _mixed(shifts, 2 * stream + 1)))
+            found.append(mi.Point2f(*numbers) if stream % 2 else numbers[0])
+        return tuple(found)
+
+    def _point(self, bits):
+        """Number of the point that a sample takes: random ``bits`` choose an order and its start."""
+        order, begin = dr.mul_hi(bits, self._rows), dr.mul_hi(bits * self._rows, self._samples)
+        place = begin + self._number
+        place = dr.select(place < self._samples, place, place - self._samples)
+        return dr.gather(mi.UInt32, self._orders, order * self._samples + place)

@@ -1,0 +1,350 @@
+"""Traced part of the split: camera paths as Mitsuba's ``path`` traces them, minus the light that virtual lights carry.
+
+Let x1 be the first vertex with a minorant F1, x2 the next vertex, and f the BSDFs.  The radiance that x1 receives from
+x2 has the factor
+
+    f1 f2 = w F1 F2  +  (f1 f2 - w F1 F2),      w = 1 / (1 + c² cosθ1 cosθ2 / d²).
+
+Virtual lights carry the first term: x1 is a *gather vertex*, with the weight β F1 for a path of throughput β.  The path
+carries w β F1 F2 (``path.carried``) to x2 and subtracts it there from β f1 f2, in next-event estimation and in the
+throughput with which the path leaves x2.  The difference may be negative.  What leaves x2 may be gathered at x2 and at
+later vertices in the same way.
+
+Where virtual lights stand for emitters as well, the light that a gather vertex receives straight from an emitter is
+split with the same w, and the path subtracts w β F1 from next-event estimation at x1 and from emission that it meets
+next.
+
+The loop in :func:`trace_paths` has one section per term: hit, emission, subtraction, Russian roulette, gather vertex,
+next-event estimation, BSDF sampling.  The kernel also finds the irradiance of virtual lights, by paths from which
+nothing is subtracted, and the surfaces where virtual lights are placed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import LARGEST_VALUE, channel_mean, select_record
+from ..core.loops import recorded_once
+from ..core.sampling import derived_seed, independent_sampler
+from ..direct.emitter_sampling import power_heuristic
+from ..transport.carried_share import carried_share
+from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
+from .gather_vertices import Gathered, GatherVertices, SecondVertices
+from .lattice import Lattice
+from .minorant import agrees, minorant_of, side_of
+from .roulette import residual_survival, throughput_survival
+from .view import Edge, FirstEdge, Gathering, PathSettings, State, View
+
+# ---------------------- State of the loop ----------------------
+
+
+@dataclass
+class Path(Edge):
+    """Paths on their current edges.
+
+    ``depth``: edges before; ``eta``: as in ``path``; ``scattered``: number of vertices that scattered; ``valid``:
+    whether the path met a surface that counts in the film's alpha; ``carried``: β F1 before x2, w β F1 F2 at x2;
+    ``cosine``: cosθ1.
+    """
+
+    depth: mi.UInt32
+    eta: mi.Float
+    scattered: mi.UInt32
+    valid: mi.Bool
+    carried: mi.UnpolarizedSpectrum
+    cosine: mi.Float
+
+    @classmethod
+    def of(cls, first: FirstEdge) -> Path:
+        """Paths on their first edges: copies, because the loop changes them."""
+        fields = (type(value)(value) for value in vars(first).values())
+        carried = dr.zeros(mi.UnpolarizedSpectrum, dr.width(first.throughput))
+        return cls(*fields, mi.UInt32(0), mi.Float(1), mi.UInt32(0), mi.Bool(False), carried, mi.Float(1))
+
+
+@dataclass
+class Hit:
+    """Surfaces that paths hit.
+
+    ``si``; ``bsdf`` with its ``flags``; ``side``, ``minorant``: see :mod:`vpl.split.minorant`; ``hidden``: whether it
+    is an emitter that the camera must not see; ``goes_on``: whether the path may continue; ``smooth``: whether it
+    continues at a BSDF with a density.
+    """
+
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    flags: mi.UInt32
+    side: mi.Float
+    minorant: mi.UnpolarizedSpectrum
+    hidden: mi.Bool
+    goes_on: mi.Bool
+    smooth: mi.Bool
+
+    @classmethod
+    def of(cls, scene, path: Path, settings: PathSettings) -> Hit:
+        """Intersect the rays with the scene."""
+        si = scene.ray_intersect(path.ray, mi.RayFlags.All, coherent=path.depth == 0, active=path.active)
+        bsdf, hidden = si.bsdf(path.ray), mi.Bool(False)
+        if settings.hide_emitters:
+            from_camera = path.active & (path.depth == 0) & (path.state == State.SEEKING)
+            from_camera &= settings.gathering != Gathering.PLACING
+            hidden = from_camera & (~si.is_valid() | si.shape.is_emitter())
+        goes_on = path.active & si.is_valid() & (path.depth + 1 < settings.max_depth) & ~hidden
+        flags, side = bsdf.flags(), side_of(si)
+        smooth = goes_on & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+        minorant = minorant_of(si, bsdf, side, settings.perturbed, smooth & (settings.gathering >= path.state))
+        return cls(si, bsdf, flags, side, minorant, hidden, goes_on, smooth)
+
+    @property
+    def is_diffuse(self) -> mi.Bool:
+        """Whether the BSDF has no other lobe, so that the minorant describes all directions."""
+        other_lobes = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.DiffuseReflection)
+        return (self.flags & other_lobes) == 0
+
+
+@dataclass
+class Contributions:
+    """Contributions that paths have found.
+
+    ``radiance``: their sum; ``drawn``: one of them, drawn by its share of ``level``, the sum of absolute values;
+    ``length``: edges of the path that brought it.
+    """
+
+    radiance: mi.UnpolarizedSpectrum
+    drawn: mi.UnpolarizedSpectrum
+    length: mi.UInt32
+    level: mi.Float
+
+    @classmethod
+    def none(cls, count: int) -> Contributions:
+        """No contribution yet."""
+        radiance, drawn = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UnpolarizedSpectrum, count)
+        return cls(radiance, drawn, mi.UInt32(0), mi.Float(0))
+
+    def add(self, contribution, length, sample) -> None:
+        """Add the contribution of paths with ``length`` edges; ``sample``: a uniform number."""
+        self.radiance += contribution
+        level = dr.sum(dr.abs(contribution))
+        taken = sample * (self.level + level) < level
+        self.drawn, self.length = dr.select(taken, contribution, self.drawn), dr.select(taken, length, self.length)
+        self.level += level
+
+
+@dataclass
+class Traced:
+    """Result of :func:`trace_paths`, one record per lane, evaluated.
+
+    ``radiance``; ``drawn``: one of its contributions over the probability of drawing it, from a path of ``length``
+    edges; ``valid``: whether a surface counts in the film's alpha; ``edges`` of the path without the last one;
+    ``gathered``: gather vertices.
+    """
+
+    radiance: mi.UnpolarizedSpectrum
+    drawn: mi.UnpolarizedSpectrum
+    length: mi.UInt32
+    valid: mi.Bool
+    edges: mi.UInt32
+    gathered: Gathered
+
+
+# ---------------------- Estimator ----------------------
+
+
+@recorded_once
+@dr.syntax
+def trace_paths(
+    scene, emitters: EmitterSampler, first: FirstEdge, lattice: Lattice, sampler, settings: PathSettings
+) -> Traced:
+    """Trace paths to their ends.
+
+    ``lattice``: numbers that choose an emitter, a point on it, a lobe and a direction at vertices that scatter;
+    ``sampler``: all other random numbers.
+    """
+    context, count = mi.BSDFContext(), dr.width(first.throughput)
+    path, found, gathered = Path.of(first), Contributions.none(count), Gathered.none(count)
+
+    while dr.hint(path.active, exclude=[first, lattice, settings, emitters, context]):
+        # ---------------------- Hit ----------------------
+        hit = Hit.of(scene, path, settings)
+
+        # ---------------------- Emission, by BSDF sampling ----------------------
+        met = emitters.met(path.vertex, path.cell, path.ray, hit.si, ~path.delta, path.active & ~hit.hidden)
+        mis = power_heuristic(path.density, met.density)
+        found.add(_less_carried(path, met, settings) * met.radiance * mis, path.depth + 1, sampler.next_1d())
+
+        # ---------------------- Subtraction: w β F1 F2 of x2 ----------------------
+        connects = _carry(path, hit, settings, found.radiance, gathered)
+
+        # ---------------------- Russian roulette: residual and expected contribution ----------------------
+        _end_at_vertex(path, hit, connects, settings, sampler.next_1d())
+
+        # ---------------------- Gather vertex, with the weight β F1 ----------------------
+        gathers, weight = _gather(path, hit, settings, gathered, sampler.next_1d())
+        hit.goes_on &= settings.gathering != Gathering.PLACING
+        hit.smooth &= hit.goes_on
+
+        # ---------------------- Next-event estimation ----------------------
+        chosen, place, lobe, turn = lattice.at(path.scattered)
+        path.scattered += dr.select(hit.smooth, 1, 0)
+        path.cell, member = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side), sampler.next_1d()
+        sample = emitters.sample(hit.si, path.cell, chosen, member, place, hit.smooth)
+        lobe = dr.select(hit.smooth, lobe, sampler.next_1d())
+        turn = dr.select(hit.smooth, turn, sampler.next_2d())
+        # One call: kernels hold the code of all materials for each
+        toward = hit.si.to_local(sample.direction)
+        value, density, turned, share = hit.bsdf.eval_pdf_sample(
+            context, hit.si, toward, lobe, turn, path.active & ~hit.hidden
+        )  # fmt: skip
+        lit = _lit(path, hit, sample, toward.z, value, density, weight, settings, sampler)
+        arriving = sample.arriving(scene, dr.max(dr.abs(lit)) > 0)
+        found.add(lit * arriving, path.depth + 2, sampler.next_1d())
+
+        # ---------------------- BSDF sampling ----------------------
+        kept = _turn(path, hit, turned, share, gathers, weight)
+
+        # ---------------------- Russian roulette: residual of the direction, and throughput ----------------------
+        _end_at_direction(path, hit, kept, settings, sampler.next_1d())
+        if dr.hint(settings.hide_emitters, mode="scalar"):
+            _pass_hidden(path, hit, first)
+
+    gathered.finish()
+    drawn = found.drawn * dr.select(found.level > 0, found.level / dr.sum(dr.abs(found.drawn)), 0)
+    traced = Traced(found.radiance, drawn, found.length, path.valid, path.depth, gathered)
+    dr.eval(traced)
+    return traced
+
+
+def trace_camera_rays(view: View, lane: mi.UInt32, settings: PathSettings, *stream: int) -> Traced:
+    """Trace the camera rays ``lane`` of a view; ``stream``: of random numbers."""
+    seed, ray = derived_seed(view.seed, *stream), view.ray
+    part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
+    importance = dr.gather(mi.Float, view.importance, lane // dr.opaque(mi.UInt32, view.samples))
+    edge = FirstEdge.of_camera(part, importance, dr.gather(mi.Bool, view.active, lane))
+    lattice = Lattice(lane, view.samples, derived_seed(seed, 0))
+    sampler = independent_sampler(derived_seed(seed, 1), dr.width(lane))
+    return trace_paths(view.scene, view.emitters, edge, lattice, sampler, settings)
+
+
+def _less_carried(path: Path, met: MetEmitter, settings: PathSettings):
+    """β for emission that was met, minus w β F1 where a virtual light stands for the emitter."""
+    if met.nearness is None:
+        return path.throughput
+    w = emitter_share(settings.emitters_squared_c, met.nearness, path.cosine)
+    carried = settings.emitters_carried & (path.state == State.CONNECTING)
+    return path.throughput - dr.select(carried, path.carried * w, 0)
+
+
+def emitter_share(squared_c, nearness, cosine):
+    """w for light straight from an emitter; ``nearness``: see :class:`vpl.split.emitters.base.EmitterSample`."""
+    return carried_share(squared_c, nearness * cosine) & dr.isfinite(nearness)
+
+
+def _carry(path: Path, hit: Hit, settings: PathSettings, radiance, gathered: Gathered):
+    """Turn ``path.carried`` from β F1 into w β F1 F2 at x2, 0 elsewhere; record second vertices; return where x2 is."""
+    si = hit.si
+    cosine = dr.abs(dr.dot(si.n, path.ray.d))
+    w = carried_share(settings.squared_c, path.cosine * cosine / dr.square(si.t))
+    # A virtual light at x2 shines only to the side of its shading normal
+    connects = hit.smooth & (path.state == State.CONNECTING) & agrees(si, hit.side)
+    path.carried = dr.select(connects, path.carried * hit.minorant, 0)
+    outward = si.n * dr.mulsign(mi.Float(1), -dr.dot(si.n, path.ray.d))
+    means = (channel_mean(x) for x in (path.carried, path.throughput, radiance))
+    second = connects | (hit.smooth & (path.scattered == 1))
+    gathered.second = select_record(second, SecondVertices(si.p, outward, *means), gathered.second)
+    path.carried = dr.select(connects, path.carried * w, 0)
+    return connects
+
+
+def _end_at_vertex(path: Path, hit: Hit, connects, settings: PathSettings, sample) -> None:
+    """Russian roulette by the residual that is left to trace and by its expected contribution."""
+    reflected = path.throughput * hit.minorant
+    residual = residual_survival(reflected - path.carried, reflected, connects & hit.is_diffuse)
+    # Not before the path met a surface that counts in alpha: a path that only passed masks has yet to find one
+    judged = hit.smooth & (path.scattered > 0) & path.valid
+    facing = hit.si.sh_frame.n * hit.side
+    expected = settings.outgoing.survival(hit.si.p, facing, path.throughput, path.importance, residual)
+    survival = dr.select(judged, expected, residual)
+    hit.goes_on &= sample < survival
+    hit.smooth &= hit.goes_on
+    path.throughput /= survival
+    path.carried /= survival
+
+
+def _gather(path: Path, hit: Hit, settings: PathSettings, gathered: Gathered, sample):
+    """Record gather vertices: (where there is one, its weight β F1 minus the part that virtual lights carry to it)."""
+    si, seeks = hit.si, hit.smooth & (path.state == State.SEEKING)
+    gathers = seeks | (hit.smooth & (settings.gathering == Gathering.EVERYWHERE))
+    gathers &= agrees(si, hit.side) | (settings.gathering == Gathering.PLACING)
+    gathers &= (dr.max(hit.minorant) > 0) & (settings.emitters_carried | (path.depth + 2 < settings.max_depth))
+    weight = path.throughput * hit.minorant - path.carried
+    gathers &= dr.all(dr.abs(weight) <= LARGEST_VALUE)
+    weight = dr.select(gathers, weight, 0)
+    gathered.add(GatherVertices(si.p, si.sh_frame.n * hit.side, si.n, weight, path.depth + 1), seeks, sample)
+    return gathers, weight
+
+
+def _lit(path: Path, hit: Hit, sample: EmitterSample, height, value, density, weight, settings: PathSettings, sampler):
+    """Factor of the sampled emitters' light: β f, minus the parts that virtual lights carry.
+
+    ``height``: cosine of the direction; ``value``, ``density``: of the BSDF; ``weight`` of the gather vertex.
+    """
+    full = path.throughput * mi.unpolarized_spectrum(value)
+    cosine = dr.select(height * hit.side > 0, dr.abs(height), 0)
+    value = full - path.carried * cosine
+    if sample.nearness is not None:
+        w = emitter_share(settings.emitters_squared_c, sample.nearness, cosine)
+        value -= dr.select(settings.emitters_carried, weight * (w * cosine), 0)
+        # Few shadow rays where little is left
+        survival = residual_survival(value, full, settings.emitters_carried)
+        value = dr.select(sampler.next_1d() < survival, value / survival, 0)
+    mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, density))
+    return dr.select(hit.smooth & (sample.density > 0), value * mis, 0)
+
+
+def _turn(path: Path, hit: Hit, bs, share, gathers, weight):
+    """Continue along a BSDF sample ``bs`` of weight ``share``: the fraction of β that is left in its direction.
+
+    ``gathers``, ``weight``: whether the vertex is a gather vertex, and its weight, which the path carries on.
+    """
+    full = path.throughput * mi.unpolarized_spectrum(share)
+    path.delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    # As in `path`, by the sampled direction, even where the path ends
+    null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+    path.valid |= path.active & hit.si.is_valid() & ~hit.hidden & ~null
+    path.cosine, path.density, path.eta = dr.abs(bs.wo.z), bs.pdf, path.eta * bs.eta
+    # A Lambertian BSDF of value 1, times the cosine, over the density of the direction
+    lambertian = ~path.delta & (bs.wo.z * hit.side > 0) & (path.density > 0)
+    lambertian = dr.select(lambertian, path.cosine / path.density, 0)
+    path.throughput = full - path.carried * lambertian
+    # At diffuse surfaces the residual is the same in all directions, and has ended paths before
+    judged = (dr.max(dr.abs(path.carried)) > 0) & ~hit.is_diffuse
+    kept = residual_survival(path.throughput, full, judged)
+    path.carried = weight * lambertian
+    onward = dr.select(gathers & ~path.delta, mi.UInt32(State.CONNECTING), mi.UInt32(State.PAST))
+    path.state = dr.select((path.state == State.SEEKING) & ~gathers, mi.UInt32(State.SEEKING), onward)
+    path.ray = hit.si.spawn_ray(dr.select(hit.hidden, path.ray.d, hit.si.to_world(bs.wo)))
+    path.vertex = mi.Point3f(hit.si.p)
+    path.depth += dr.select(hit.goes_on, 1, 0)
+    return kept
+
+
+def _end_at_direction(path: Path, hit: Hit, kept, settings: PathSettings, sample) -> None:
+    """Russian roulette by the residual of the direction, ``kept``, and by the throughput, as in ``path``."""
+    # Where the BSDF is 0, its minorant may still have to be subtracted
+    largest = dr.maximum(dr.max(dr.abs(path.throughput)), dr.max(dr.abs(path.carried)))
+    survival = kept * throughput_survival(largest, path.eta, path.depth >= settings.rr_depth)
+    path.active = hit.goes_on & (largest > 0) & (sample < survival)
+    path.throughput /= survival
+    path.carried /= survival
+
+
+def _pass_hidden(path: Path, hit: Hit, first: FirstEdge) -> None:
+    """Let paths continue behind emitters that the camera must not see, as if nothing were there."""
+    passes = hit.hidden & hit.si.is_valid()
+    path.active |= passes
+    path.throughput = dr.select(passes, first.throughput, path.throughput)
+    path.delta, path.eta = path.delta | passes, dr.select(passes, 1, path.eta)
+    path.state = dr.select(passes, mi.UInt32(State.SEEKING), path.state)

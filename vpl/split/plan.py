@@ -1,0 +1,169 @@
+"""Plan: whether virtual lights pay, how many there are, and how finely they are clustered.
+
+An :class:`Option` is a choice of light kinds.  :func:`price` predicts its variance × cost by the cost model;
+:func:`choose` takes the option with the least product, or no lights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .cost_model import CostModel
+from .pilot import relative_variance
+
+_TINY = np.finfo(np.float64).tiny
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Decision for an image.
+
+    ``light_paths``: number of virtual lights on surfaces that are drawn, 0 for none; ``emitters``: whether virtual
+    lights stand for emitters; ``error``: bound of the cuts, as a fraction of the pixel; ``vertices`` of a pixel that
+    are lit; ``variance``: relative variance of a camera path that remains; ``reason`` in words.
+    """
+
+    light_paths: int
+    emitters: bool
+    error: float
+    vertices: int
+    variance: float
+    reason: str
+
+    @property
+    def gathers(self) -> bool:
+        """Whether there are virtual lights."""
+        return self.emitters or self.light_paths > 0
+
+
+@dataclass(frozen=True)
+class Option:
+    """Kinds of virtual lights: on ``surfaces``, for ``emitters``, or both.
+
+    Values (n,) of a pilot's paths: ``traced``: radiance without lights on surfaces; ``indirect``: part of it that
+    lights on surfaces may carry; ``residual``: measured radiance besides the light that lights on surfaces carry, None
+    where it was not measured.
+    """
+
+    surfaces: bool
+    emitters: bool
+    traced: np.ndarray
+    indirect: np.ndarray
+    residual: np.ndarray | None = None
+
+    @property
+    def expected(self) -> np.ndarray:
+        """Expected radiance (n,) besides the light that virtual lights carry."""
+        return self.traced - self.indirect * self.surfaces
+
+    @property
+    def concentration(self) -> float:
+        """Mean square of the indirect light over its squared mean."""
+        total = np.sum(self.indirect)
+        return len(self.indirect) * np.sum(self.indirect**2) / total**2 if total else 0.0
+
+    def variance(self, evidence: Evidence) -> float:
+        """Relative variance of a path that remains: assumed, or measured where it is much larger than assumed."""
+        traced, model = evidence.variance(self.traced), evidence.model
+        if not self.surfaces:
+            return traced
+        assumed = traced - model.carried * (traced - min(evidence.variance(self.expected), traced))
+        measured = assumed if self.residual is None else evidence.variance(self.residual)
+        return measured if measured > model.doubtful * assumed else assumed
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Measurements of a pilot for an image of ``paths`` camera paths, ``samples`` for a pixel.
+
+    ``radiance`` (n,) of the pilot's paths, in pairs; ``direct`` (n,): without the light that lights on surfaces may
+    carry; ``brightness`` (n,) of the image around; ``emitters``: whether lights may stand for many emitters.
+    """
+
+    radiance: np.ndarray
+    direct: np.ndarray
+    brightness: np.ndarray
+    paths: int
+    samples: int
+    emitters: bool
+    model: CostModel
+
+    def variance(self, radiance: np.ndarray) -> float:
+        """Relative variance of a path with ``radiance`` (n,), where the samples of a pixel are stratified."""
+        model = self.model
+        retained = max(model.stratified_many if self.emitters else model.stratified, self.samples**-0.5)
+        whole = relative_variance(radiance, self.brightness, model)
+        return whole - (1 - retained) * min(relative_variance(self.direct, self.brightness, model), whole)
+
+
+def choose(evidence: Evidence, options: list[Option]) -> Plan:
+    """The plan of the option with the least variance × cost; without lights if no option pays."""
+    if not options:
+        return without_lights("no light comes by way of surfaces that virtual lights could stand for")
+    whole = evidence.variance(evidence.radiance)
+    product, cost, best = min((_priced(evidence, option) for option in options), key=lambda option: option[0])
+    remains = best.variance / max(whole, _TINY)
+    if product > evidence.model.pays_below * whole:
+        costs = f"virtual lights would cost {cost - 1:.2g} times as much as the paths"
+        return without_lights(f"{costs} and leave {remains:.0%} of the variance")
+    return replace(best, reason=f"virtual lights remove {1 - remains:.0%} of the variance")
+
+
+def without_lights(reason: str) -> Plan:
+    """The plan of an image without virtual lights."""
+    return Plan(0, False, 0.0, 0, 0.0, reason)
+
+
+def price(evidence: Evidence, option: Option) -> float:
+    """Variance × cost with the lights of an option."""
+    return _priced(evidence, option)[0]
+
+
+def may_pay(evidence: Evidence, option: Option, others: list[Option]) -> bool:
+    """Whether the lights of an option are predicted to pay, and more than those of all ``others``."""
+    least = evidence.model.pays_below * evidence.variance(evidence.radiance)
+    return price(evidence, option) <= min([least, *(price(evidence, other) for other in others)])
+
+
+def _priced(evidence: Evidence, option: Option) -> tuple[float, float, Plan]:
+    """(Variance × cost, cost, best plan) with the lights of an option."""
+    model, paths, samples = evidence.model, evidence.paths, evidence.samples
+    rest = option.variance(evidence)
+    cuts = model.emitter_cuts * option.emitters + option.surfaces
+    rays, error = _cut_rays(rest, samples, model)
+    # Never 0, because cuts leave a variance
+    left, light_paths = rest + cuts * model.cut_variance * samples / rays, 0
+    if option.surfaces:
+        light_paths = _light_paths(evidence, option, left)
+    fixed = (model.fixed_cost + model.light_path_cost * light_paths) / paths
+    cost = 1 + cuts * model.ray_cost * rays / samples + fixed
+    # The least of (left + vertex variance / share) × (cost + vertex cost × share)
+    share = (model.vertex_variance * cost / (model.vertex_cost * left)) ** 0.5
+    vertices = max(round(float(np.clip(share, model.least_vertices, 1)) * samples), 1)
+    return cost * left, cost, Plan(light_paths, option.emitters, error, vertices, left, "")
+
+
+def _cut_rays(rest: float, samples: int, model: CostModel) -> tuple[float, float]:
+    """(Shadow rays of a pixel's cuts, error bound), where paths leave the relative variance ``rest``.
+
+    The least of (rest / samples + cut variance / rays) × (samples + rays × their cost).
+    """
+    wanted = (model.cut_variance / (model.ray_cost * max(rest, 1e-9))) ** 0.5
+    rays = samples * np.clip(wanted, model.least_rays, model.most_rays)
+    error = model.cut_error * (rays / model.rays_at_error) ** -model.error_slope
+    error = float(np.clip(error, model.finest_error, model.coarsest_error))
+    # A cut has some nodes, however few rays are wanted
+    return model.rays_at_error * (error / model.cut_error) ** (-1 / model.error_slope), error
+
+
+def _light_paths(evidence: Evidence, option: Option, left: float) -> int:
+    """Number of light paths: the least of (left / samples + light variance / light paths) × cost, within limits."""
+    model, paths = evidence.model, evidence.paths
+    indirect = relative_variance(option.indirect, evidence.brightness, model)
+    of_lights = model.shared * model.light_variance * indirect
+    balanced = (of_lights * evidence.samples * paths / (model.light_path_cost * left)) ** 0.5
+    wanted = max(balanced, option.concentration / model.set_error**2)
+    wanted = np.clip(wanted, model.least_light_share * paths, model.most_light_share * paths)
+    return int(np.clip(wanted, model.fewest_light_paths, model.most_light_paths))

@@ -1,0 +1,110 @@
+"""Russian roulette: which paths go on, with what probability, and how the pilot chooses the probability.
+
+Three rules end paths.  A path that goes on is divided by its probability, so no rule biases the image.
+
+1. **Residual.**  Where virtual lights carry most of the throughput, little is left to trace: a path goes on with the
+   fraction that is left (:func:`residual_survival`).
+2. **Expected contribution.**  A path goes on with the probability m E, where E is its expected contribution relative to
+   the brightness of its pixel.  The multiple m has the least variance × cost (:func:`best_multiple`).  [Vorba and
+   Křivánek 2016, "Adjoint-driven Russian roulette"; Rath et al.  2022, "EARS: efficiency-aware Russian roulette", eq.
+   14: the best probability is proportional to the root of variance over cost.]
+3. **Throughput.**  The rule of Mitsuba's ``path`` from ``rr_depth`` on (:func:`throughput_survival`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import channel_mean, upload
+from .cost_model import CostModel
+from .spatial_cells import SpatialCells
+
+# Least probability of rule 1: the minorant and w describe the residual of a single direction only roughly
+_LEAST_RESIDUAL = 0.02
+# Multiples that are tried, powers of two at half steps: from 1/8, below which every path would end early, to 32
+_MULTIPLES = 2.0 ** np.arange(-3, 5.5, 0.5)
+
+
+@dataclass
+class OutgoingRadiance:
+    """Radiance that surfaces send back to paths, learned from a pilot without regard to direction.
+
+    ``cells``; ``radiance``: root mean square of each cell, mean over channels; ``known``: whether anything was learned;
+    ``least_survival``: see :class:`vpl.split.cost_model.CostModel`.  All opaque, so that one kernel serves all values.
+    """
+
+    cells: SpatialCells
+    radiance: mi.Float
+    known: mi.Bool
+    least_survival: mi.Float
+
+    @classmethod
+    def unknown(cls) -> OutgoingRadiance:
+        """Nothing is known: rule 2 ends no path."""
+        return cls(
+            SpatialCells.none(), upload(mi.Float, np.ones(2)), dr.opaque(mi.Bool, False), dr.opaque(mi.Float, 1.0)
+        )
+
+    @classmethod
+    def learned(
+        cls, position: np.ndarray, normal: np.ndarray, radiance: np.ndarray, model: CostModel
+    ) -> tuple[OutgoingRadiance, np.ndarray]:
+        """Learn from vertices (n, 3) that sent back ``radiance`` (n,).
+
+        Returns also the root mean square (n,) that the other vertices of its cell predict for each vertex: a prediction
+        that includes the vertex itself would be too good.
+        """
+        cells, cell = SpatialCells.around(position, normal, model.roulette_cells)
+        size = int(cell.max()) + 1
+        squared, number = np.bincount(cell, radiance**2, size), np.bincount(cell, minlength=size)
+        prior = model.roulette_prior * np.mean(radiance**2)
+        others = np.maximum(squared[cell] - radiance**2, 0) + prior
+        predicted = np.sqrt(others / (number[cell] - 1 + model.roulette_prior))
+        rms = np.sqrt((squared + prior) / (number + model.roulette_prior))
+        least = dr.opaque(mi.Float, model.least_survival)
+        return cls(cells, upload(mi.Float, rms), dr.opaque(mi.Bool, True), least), predicted
+
+    def survival(self, position, normal, throughput, importance, residual):
+        """Probability by rule 2 of going on from vertices; by rule 1, ``residual``, where nothing is known.
+
+        ``throughput`` with which the path arrives; ``importance``: m over the brightness of the pixel; ``residual``:
+        fraction of the throughput that is left to trace.
+        """
+        radiance = dr.gather(mi.Float, self.radiance, self.cells.at(position, normal))
+        expected = residual * channel_mean(dr.abs(throughput)) * radiance * importance
+        return dr.select(self.known, dr.clip(expected, self.least_survival, 1), residual)
+
+
+def residual_survival(residual, full, applies):
+    """Probability by rule 1: the fraction of the spectrum ``full`` that is ``residual``; 1 where it does not apply."""
+    left = dr.max(dr.abs(residual)) / dr.max(dr.abs(full))
+    return dr.select(applies & dr.isfinite(left), dr.clip(left, _LEAST_RESIDUAL, 1), 1)
+
+
+def throughput_survival(largest, eta, applies):
+    """Probability by rule 3, as Mitsuba's ``path``; ``largest``: component of the throughput; 1 where it does not
+    apply."""
+    return dr.select(applies, dr.minimum(largest * dr.square(eta), 0.95), 1)
+
+
+def best_multiple(
+    expected: np.ndarray, brought: np.ndarray, edges: np.ndarray, paths: int, variance: float, model: CostModel
+) -> float:
+    """The multiple m of rule 2 with the least variance × cost at second vertices; infinite where none pays.
+
+    ``expected`` (n,): expected contributions with m = 1 of the paths that reach a second vertex; ``brought`` (n,):
+    their actual contributions, both relative to the image; ``edges`` (n,): edges beyond the second vertex; ``paths``:
+    number of all paths; ``variance``: relative variance of a path without rule 2.
+    """
+    best, least = np.inf, model.roulette_gain * variance * (model.first_edges + edges.sum() / paths)
+    for multiple in _MULTIPLES:
+        survival = np.clip(multiple * expected, model.least_survival, 1)
+        of_multiple = variance + np.sum(brought**2 * (1 / survival - 1)) / paths
+        product = of_multiple * (model.first_edges + np.sum(edges * survival) / paths)
+        if product < least:
+            best, least = multiple, product
+    return float(best)
