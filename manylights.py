@@ -1,31 +1,31 @@
-"""Render a scene with any integrator, Mitsuba's or this project's: what the `mitsuba` command cannot do, as it finds no
-plugins written in Python. Options that both have mean the same.
+"""Render scenes with any integrator, including plugins in Python, which the `mitsuba` command cannot load.
+Options that the two commands share have the same meaning.
 
     manylights scenes/hall.xml --time 60 -o hall.exr
     manylights scenes/hall.xml --integrator lightcuts --param error=0.02 --spp 16 -o hall.exr
 
-Unless one is chosen, the integrator is `manylights`, in place of the scene's where that estimates the same image as
-`path`; a scene that names another integrator, such as one of this project's, keeps it. So does one that contains a
-participating medium. `-i scene` keeps the scene's integrator in any case.
+The default integrator is `manylights`, in place of a scene's `path` or of an integrator with the same expectation. A
+scene with another integrator, or with a participating medium, keeps its integrator; `-i scene` keeps it in any case.
+Variants that the integrator does not support are refused.
 
-An image ends by itself: with --spp samples per pixel, after --time seconds, or when the relative standard error of 95%
-of the pixels is below --error, whichever comes first. It is rendered in passes of about two seconds, or of about ten
-where starting one takes long, whose average is written at the end, about every ten seconds, and after Ctrl-C. The first
-pass has the seed that was given, pass k a hash of that and k; see comparison/rendering.py. An EXR file gets all
-channels, and how it was made as metadata; a PNG file is tone-mapped. With --denoise an EXR file FILE.exr gets a
-denoised one, FILE.denoised.exr, beside it; a PNG file shows the denoised image.
+The first limit that is reached ends an image: --spp samples per pixel, --time seconds, or a relative standard error of
+at most --error in 95% of the pixels. The command prints the limit, and warns if an --error was not reached. Passes take
+about two seconds, or about ten if starting a pass is slow. Their average is written about every ten seconds, at the
+end, and after Ctrl-C. The first pass has the seed --seed, pass k a hash of the seed and k. An EXR file has all
+channels, and metadata about the render; a PNG file is tone-mapped. With --denoise, FILE.exr is joined by
+FILE.denoised.exr, and a PNG file shows the denoised image.
 
-With --workers passes are rendered by several processes or machines, see docs/cluster.md. Several scenes, --frames with
-{frame} in the values of -D, and --sensor all make many images, one after the other; what fails is told, the others are
-rendered. --resume goes on from the checkpoint of an image that was not finished.
-With `-p keep_lights=true` frames and sensors of a scene that stays as it is share their virtual lights.
+--workers renders passes on several processes or machines (docs/cluster.md). Several scenes, --frames with {frame} in
+the values of -D, and --sensor all make several images in turn; a failure is reported and does not stop the rest.
+--resume continues from the checkpoint of an unfinished image. With `-p keep_lights=true`, frames and sensors of an
+unchanged scene share virtual lights.
 
-In Python, `manylights.render(scene, error=0.02)` does the same, and `import manylights` registers the plugins, for the
-variant that is set and each that will be.
+In Python: `manylights.render(scene, error=0.02)`. `import manylights` registers the plugins for the current variant and
+all later ones.
 
-Exit status: 0; 1 if rendering failed; 2 for a command that makes no sense; 130 after Ctrl-C.
+Exit status: 0 for success; 1 if rendering failed; 2 for an invalid command line; 130 after Ctrl-C.
 """
-# ruff: noqa: E402 (what is imported is found to be this project's before)
+# ruff: noqa: E402 (the check of the packages comes before their import)
 
 import argparse
 import sys
@@ -36,8 +36,7 @@ from pathlib import Path
 
 
 def require_own(*packages):
-    """Raise ImportError where Python finds something else, such as a module beside a user's script, by the name of a
-    package of this project."""
+    """Raise ImportError if another module, such as a file beside the user's script, hides a package of this project."""
     for package in packages:
         own, found = Path(__file__).resolve().parent / package, find_spec(package)
         if found and found.origin and Path(found.origin).resolve().parent != own:
@@ -56,66 +55,76 @@ from comparison import batch, command_line
 from comparison.cluster.connection import connected, workers
 from comparison.command_line import UsageError, parameter, positive
 from comparison.denoising import import_oidn
+from comparison.images import check_extension, write
 from comparison.one_image import INTERRUPTED, Failed, Image, LazyScene
 from comparison.render import Took, render
 from comparison.scene_files import SceneFile
+from comparison.threads import avoid_single_thread
 
-__all__ = ["Took", "main", "render"]
-DEFAULT, OWN = "manylights", "scene"  # the integrator to render with, and what stands for the scene's own
-SAME_IMAGE = ("path", "prb", "volpath", "volpathmis")  # without participating media, all of them estimate what it does
+avoid_single_thread()
+
+__all__ = ["Took", "main", "render", "write"]
+DEFAULT, OWN = "manylights", "scene"  # the default of --integrator, and the value that keeps the scene's integrator
+SAME_IMAGE = ("path", "prb", "volpath", "volpathmis")  # have the expectation of DEFAULT, without participating media
 
 
 def parse(arguments):
-    """Parse the command line; return its options. Exits with status 2 and a message if it makes no sense."""
+    """Parse the command line and return the options. Exits with status 2 and a message if it is invalid."""
     parser = argparse.ArgumentParser(
         prog="manylights", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
     add("scenes", metavar="SCENE", nargs="+", type=Path, help="scene files (XML)")
     add("-o", "--output", type=Path, metavar="FILE",
-        help=".exr or .png, in which {scene}, {frame} and {sensor} are replaced where there are several images, or a "
-             "folder (default: the scene's name, with .exr)")  # fmt: skip
+        help=".exr or .png file, or a folder; {scene}, {frame} and {sensor} are replaced for several images (default: "
+             "the scene's name with .exr)")  # fmt: skip
     add("--sensor", type=batch.sensor, default=0, metavar="INDEX", help="sensor to render with, or 'all' (default: 0)")
     add("--frames", type=batch.frames, metavar="FIRST..LAST",
-        help="render an image for each number, which replaces {frame} in the values of -D and in --output")  # fmt: skip
+        help="render an image for each number; it replaces {frame} in the values of -D and in --output")  # fmt: skip
     add("-i", "--integrator", metavar="NAME",
-        help="integrator that replaces the scene's, keeping its max_depth, rr_depth and hide_emitters; 'scene' is the "
-             "scene's own (default: manylights where the scene has path, or one that estimates the same, or none; "
-             "else the scene's own)")  # fmt: skip
+        help="integrator in place of the scene's, with its max_depth, rr_depth and hide_emitters; 'scene' keeps the "
+             "scene's (default: manylights for a scene with path, an integrator of the same expectation, or none; "
+             "otherwise the scene's)")  # fmt: skip
     add("-p", "--param", action="append", type=parameter, default=[], metavar="KEY=VALUE",
         help="parameter of the integrator, such as error=0.02; repeat for more")  # fmt: skip
     add("--spp", type=positive(int), metavar="N",
-        help="samples per pixel, at most (default: the scene's, unless --time or --error is given)")  # fmt: skip
+        help="maximum samples per pixel (default: the scene's unless --time or --error is given)")  # fmt: skip
     add(
-        "--time", type=positive(float), metavar="SECONDS", help="seconds of rendering, at most; one pass is always made"
+        "--time",
+        type=positive(float),
+        metavar="SECONDS",
+        help="maximum seconds; there is at least one pass",
     )
     add("--error", type=positive(float), metavar="FRACTION",
-        help="end when 95%% of the pixels have a relative standard error, estimated from the spread of the passes, "
-             "below this, such as 0.02")  # fmt: skip
+        help="end when 95%% of the pixels have at most this relative standard error, such as 0.02, estimated from the "
+             "variance between passes")  # fmt: skip
     add("--denoise", action="store_true", help="denoise by Open Image Denoise (pip install 'manylights[denoise]')")
     add("-s", "--seed", type=command_line.seed, default=0, metavar="N", help="seed (default: 0)")
     add("--pass-spp", type=positive(int), metavar="N",
-        help="samples per pixel of one pass (default: as many as take two to ten seconds; with --workers, what the "
-             "image alone decides)")  # fmt: skip
+        help="samples per pixel of a pass (default: for passes of two to ten seconds; with --workers, by the size of "
+             "the image)")  # fmt: skip
     add("--workers", type=workers, metavar="N|ADDRESS",
-        help="render passes on N processes, or on the workers of the Dask scheduler at an address such as "
-             "tcp://HOST:8786 (pip install 'manylights[cluster]'; docs/cluster.md)")  # fmt: skip
+        help="render passes on N local processes, or on the workers of a Dask scheduler such as tcp://HOST:8786 (pip "
+             "install 'manylights[cluster]'; docs/cluster.md)")  # fmt: skip
     add("--resume", action="store_true",
-        help="go on from FILE.checkpoint.npz, if it is there, which this option and --workers leave beside an image "
-             "that is not finished")  # fmt: skip
+        help="continue from FILE.checkpoint.npz if it exists; this option and --workers leave it beside an unfinished "
+             "image")  # fmt: skip
     add("--exposure", type=float, metavar="STOPS",
         help="scale PNG images by 2^STOPS (default: bring the 95th percentile of the brightness to 0.8)")  # fmt: skip
     command_line.add_common_options(parser)
     options = parser.parse_args(arguments)
-    if options.output and not options.output.is_dir() and options.output.suffix not in (".exr", ".png"):
-        parser.error(f"cannot write '{options.output}': the output must be an .exr or a .png file")
+    if options.output and not options.output.is_dir():
+        try:
+            check_extension(options.output)
+        except ValueError as error:
+            parser.error(str(error))
     return options
 
 
 def parse_scene(options):
-    """Return the `SceneFile`, and which integrator it is rendered with, for metadata: its name, its parameters, and the
-    name of the one of the scene that it replaces by default (None if it does not). Raises UsageError for what does not
-    exist."""
+    """Return the `SceneFile` with its integrator, and a description for metadata: "integrator", "parameters", and
+    "replaced", the name of the scene's integrator if the default replaces it, otherwise None. Raises UsageError for a
+    missing scene, folder, variant, integrator or sensor."""
     command_line.check_scene(options.scene)
     folder = batch.output(options, 0).absolute().parent
     if not folder.is_dir():
@@ -137,13 +146,13 @@ def parse_scene(options):
 
 
 def chosen_integrator(asked, file):
-    """Return the name of the integrator to render a `SceneFile` with. `asked`: what `--integrator` says, None without.
-    Raises UsageError where there is none."""
+    """Return the name of the integrator to render a `SceneFile` with. `asked`: the value of `--integrator`, or None.
+    Raises UsageError if the scene has no integrator and none is given."""
     own = file.integrator[0]
     if asked not in (None, OWN):
         return asked
     replaceable = own is None or (own in SAME_IMAGE and not file.has_media)
-    if asked is None and replaceable and command_line.is_supported(mi.variant()):
+    if asked is None and replaceable:
         return DEFAULT
     if own is None:
         raise UsageError(f"{file.path} has no integrator; choose one with --integrator")
@@ -151,15 +160,15 @@ def chosen_integrator(asked, file):
 
 
 def run(options):
-    """Render and write all images; return the worst of their exit statuses. Of several, one that fails is told, and the
-    others are rendered."""
+    """Render and write all images; return the highest exit status. The failure of an image among several is printed,
+    and the remaining images are rendered."""
     if options.denoise:
         import_oidn()
     wanted = batch.images(options)
     several, status = len(wanted) > 1 or options.sensor == batch.ALL, 0
     with ExitStack() as stack:
         images = _images(wanted, options, stack)
-        # A time is that of one image after the other
+        # With a time limit, images are rendered in sequence
         for image in batch.ahead(images) if options.workers and not options.time else images:
             try:
                 found = image.run()
@@ -177,8 +186,8 @@ def run(options):
 
 
 def _images(wanted, options, stack):
-    """Yield the `Image` of each sensor of the scenes of `wanted`, a list of options; workers are let go with the
-    `stack`. Raises UsageError where there is no scheduler: no image could be rendered."""
+    """Yield an `Image` for each sensor of each scene in `wanted`, a list of options. The `stack` releases the workers.
+    Raises UsageError if no scheduler answers."""
     pool = scene = None
     for one in wanted:
         try:
@@ -188,7 +197,7 @@ def _images(wanted, options, stack):
             continue
         if options.verbose:
             mi.set_log_level(mi.LogLevel.Info)
-        if options.workers and pool is None:  # not before it is known that there is something to render
+        if options.workers and pool is None:  # after the first scene is parsed
             pool = stack.enter_context(connected(options.workers, options.threads))
         scene = LazyScene(file, options.threads, scene)
         for sensor in range(file.sensors) if options.sensor == batch.ALL else [options.sensor]:

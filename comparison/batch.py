@@ -1,4 +1,4 @@
-"""Many images by one command: several scenes, frames of an animation, all sensors; and what their files are called."""
+"""Several images by one command: scenes, frames of an animation, all sensors; and the names of their files."""
 
 import argparse
 import copy
@@ -9,7 +9,7 @@ from pathlib import Path
 from .command_line import UsageError
 
 ALL = "all"  # sensors
-MOST_AHEAD = 64  # images that are prepared before it is their turn
+MOST_AHEAD = 64  # images that are prepared in advance
 
 
 def frames(text):
@@ -31,8 +31,8 @@ def sensor(text):
 
 
 def images(options):
-    """Return the options of each scene and frame, with one `scene`, its `frame` (None without frames), and `{frame}` in
-    `define` replaced. Raises UsageError where a file would be that of several images."""
+    """Return the options of each scene and frame, with a single `scene`, its `frame` (None without frames), and
+    `{frame}` replaced in `define`. Raises UsageError if images would share a file."""
     found = []
     for scene in options.scenes:
         for frame in options.frames or [None]:
@@ -55,8 +55,8 @@ def images(options):
 
 
 def output(options, sensor):
-    """Return the file (Path) of the image of a sensor, of the options that `images` returns: as `output` says, or the
-    scene's name, with frame and sensor where there may be several, beside it or in the folder that `output` is."""
+    """Return the file (Path) of the image of a sensor, for options from `images`. Without an `output` file the name is
+    the scene's, with frame and sensor if there may be several; the folder is `output`, or the scene's."""
     if options.output and not options.output.is_dir():
         names = {"scene": options.scene.stem, "frame": options.frame, "sensor": sensor}
         several = len(options.scenes) > 1 or options.frames or options.sensor == ALL
@@ -70,8 +70,8 @@ def output(options, sensor):
 
 
 def ahead(images):
-    """Yield images (of `one_image.Image`, from an iterator) one after the other; so many are taken from the iterator
-    before their turn that workers have no gap between them."""
+    """Yield images (`one_image.Image`) from an iterator in sequence, and prepare enough later images that workers are
+    never idle."""
     waiting = deque()
     for image in images:
         waiting.append(image)

@@ -1,10 +1,12 @@
-"""Checkpoints: the passes of a render that is not finished, in a file that another process goes on from.
+"""Checkpoints: files with the passes of an unfinished render, from which another process continues.
 
-They hold sums in double precision, so that a render which was interrupted ends with the image of one that was not.
+Sums are in double precision: an interruption does not change the final image.
 """
 
+import hashlib
 import json
 import zipfile
+import zlib
 from dataclasses import asdict
 from pathlib import Path
 
@@ -18,6 +20,10 @@ from .rendering import Pass
 SUFFIX = ".checkpoint.npz"
 CHECKPOINT_SECONDS = 10.0
 _ESTIMATE = "estimate."
+# Exceptions of NumPy, zipfile and zlib for a file that is damaged, or is no archive of arrays
+_UNREADABLE = (
+    OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 
 
 def file_of(image):
@@ -26,9 +32,8 @@ def file_of(image):
 
 
 class Checkpoint:
-    """The file that a render goes on from, if `resume`, and that it keeps for another one to go on from. `made_by` is
-    all that the image depends on besides number and sizes of its passes (a dict for JSON): the file of another render
-    is refused."""
+    """Checkpoint file of a render, which continues from it if `resume`. `made_by`: everything that the image depends on
+    except the number and sizes of passes, a dict for JSON. The checkpoint of another render is refused."""
 
     def __init__(self, path, made_by, resume=True):
         self.path, self._made_by, self._resume = Path(path), made_by, resume
@@ -36,22 +41,15 @@ class Checkpoint:
         self._writer = OccasionalWriter("The checkpoint", self.save, CHECKPOINT_SECONDS)
 
     def restore(self, passes):
-        """Give the passes of the file, if there is one, to `Passes`, which have none; return the seconds that they
-        took. Raises ValueError for a file that is no checkpoint, and for one of another render."""
+        """Add the passes of the file, if it exists, to the empty `Passes`; return their seconds. Raises ValueError with
+        the name of the file for a damaged or altered checkpoint, and for the checkpoint of another render."""
         self._passes = passes
         if not self.path.is_file():
             return 0.0
         if not self._resume:
-            mi.Log(mi.LogLevel.Warn, f"'{self.path}', which --resume would go on from, is going to be replaced.")
+            mi.Log(mi.LogLevel.Warn, f"'{self.path}', which --resume continues from, will be replaced.")
             return 0.0
-        try:
-            with open(self.path, "rb") as opened, np.load(opened) as file:
-                arrays = {name: file[name] if file[name].ndim else file[name].item() for name in file.files}
-            described = json.loads(arrays["described"])
-        except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(
-                f"'{self.path}' is no checkpoint that can be read ({error}); delete it to begin anew"
-            ) from None
+        described, arrays = self._read()
         other = [name for name in self._made_by if described["made_by"].get(name) != self._made_by[name]]
         if other:
             raise ValueError(f"'{self.path}' is of a render with another {other[0]}; delete it to begin anew")
@@ -61,10 +59,25 @@ class Checkpoint:
         passes.estimate.state = {name.removeprefix(_ESTIMATE): arrays[name] for name in estimate}
         return described["seconds"]
 
+    def _read(self):
+        """Return the description and the arrays of the file."""
+        try:
+            with open(self.path, "rb") as opened, np.load(opened) as file:
+                arrays = {name: file[name] for name in file.files}
+            text, digest = arrays.pop("described").item(), arrays.pop("digest").item()
+            if digest != _digest(text, arrays):
+                raise ValueError("its content has been altered")
+            return json.loads(text), {name: array if array.ndim else array.item() for name, array in arrays.items()}
+        except _UNREADABLE as error:
+            reason = f"it has no entry {error}" if isinstance(error, KeyError) else error
+            raise ValueError(
+                f"'{self.path}' is no checkpoint that can be read ({reason}); delete it to begin anew"
+            ) from None
+
     def keep(self, seconds):
-        """There is a pass more, after `seconds` in all: write the file now and then."""
+        """Take the state after a pass, `seconds` after the start; write the file from time to time."""
         passes = self._passes
-        # All of it now: another thread may save it while the next pass is added
+        # A snapshot, as another thread may save it while a pass is added
         described = {
             "made_by": self._made_by,
             "seconds": seconds,
@@ -76,30 +89,39 @@ class Checkpoint:
         self._writer.offer()
 
     def save(self):
-        """Write the file, unless there is no pass more. Raises OSError with its name if it cannot be written; the one
-        that was there before is then as it was."""
+        """Write the file if there are new passes. Raises OSError with the name of the file if that fails; an earlier
+        file is then unchanged."""
         kept = self._kept
         if kept is self._saved:
             return
         described, arrays = kept
         text = json.dumps(described, default=_plain)
         with images.replacing(self.path) as temporary:
-            np.savez(temporary, described=np.array(text), **arrays)
+            np.savez(temporary, described=np.array(text), digest=np.array(_digest(text, arrays)), **arrays)
         self._saved = kept
 
     def leave(self):
-        """Write the file for another render to go on from; return whether that was possible. The image of this one is
-        not lost where it is not."""
+        """Write the file at the end of an unfinished render; return whether that succeeded. A failure is logged, as the
+        image is not lost."""
         return self._writer.write()
 
     def remove(self):
-        """Remove the file: the render is finished, and its image is not lost where that is not possible."""
+        """Remove the file of a finished render. A failure is logged, as the image is not lost."""
         try:
             self.path.unlink(missing_ok=True)
         except OSError as error:
             mi.Log(mi.LogLevel.Warn, f"The checkpoint could not be removed: {error}")
 
 
+def _digest(text, arrays):
+    """Return the SHA-256 (hexadecimal) of the description, and of names, types, shapes and values of the arrays."""
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
+
+
 def _plain(value):
-    """Return what JSON knows of a `Pass`, or of a number of NumPy's."""
+    """Return a `Pass` or a number of NumPy in a type that JSON has."""
     return asdict(value) if isinstance(value, Pass) else value.item()

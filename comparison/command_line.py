@@ -1,4 +1,4 @@
-"""Parts of both commands: options of the form key=value, variants and integrators by name, errors in one line."""
+"""Parts of both commands: key=value options, variants and integrators by name, one-line error messages."""
 
 import re
 import sys
@@ -12,11 +12,11 @@ import mitsuba as mi
 
 
 class UsageError(Exception):
-    """The command cannot do what it was asked; its message says why. Exit status 2."""
+    """Invalid use of the command, with a message for the user. Exit status 2."""
 
 
 def value(text):
-    """Turn the text of a parameter into a bool (`true`, `false`), an int, a float, or leave it as it is."""
+    """Convert the text of a parameter to a bool (`true`, `false`), an int or a float, if possible."""
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
     for kind in (int, float):
@@ -36,7 +36,7 @@ def definition(text):
 
 
 def parameter(text):
-    """Split `key=value` and give the value its type; an argparse type."""
+    """Split `key=value` and convert the value (see `value`); an argparse type."""
     key, content = definition(text)
     return key, value(content)
 
@@ -64,10 +64,10 @@ def seed(text):
 
 
 def add_common_options(parser):
-    """Add the options that both commands have."""
+    """Add the options of both commands."""
     parser.add_argument(
         "-D", "--define", action="append", type=definition, default=[], metavar="KEY=VALUE",
-        help="define a constant that the scene refers to as $KEY; repeat for more",
+        help="define the parameter $KEY of the scene; repeatable",
     )  # fmt: skip
     parser.add_argument("-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="variant (default: llvm_ad_rgb)")
     parser.add_argument("-t", "--threads", type=positive(int), metavar="N", help="number of threads (default: all)")
@@ -75,10 +75,18 @@ def add_common_options(parser):
 
 
 def set_variant(name):
-    """Select a variant and register this project's integrators for it."""
+    """Set a variant, for which this project's integrators are registered. Raises UsageError if it is not available."""
     if name not in mi.variants():
         raise UsageError(f"unknown variant '{name}'; there are {', '.join(mi.variants())}")
-    mi.set_variant(name)
+    try:
+        mi.set_variant(name)
+    except ImportError as error:  # Dr.Jit finds no driver
+        if not name.startswith("cuda_"):
+            raise
+        raise UsageError(
+            f"the variant '{name}' needs an NVIDIA GPU and its driver, which Dr.Jit does not find; without them choose "
+            f"a variant llvm_*, such as llvm_ad_rgb ({error})"
+        ) from None
     import integrators  # noqa: F401 (registers plugins; needs a variant)
 
 
@@ -89,20 +97,13 @@ def own_integrators():
     return integrators.PLUGINS
 
 
-def is_supported(variant):
-    """Return whether this project's integrators exist for a variant."""
-    import integrators
-
-    return variant in integrators.VARIANTS
-
-
 def check_integrator(name):
-    """Raise UsageError, naming what exists, if there is no integrator of that name."""
+    """Raise UsageError with the list of integrators if none has the given name."""
     try:
         mi.PluginManager.instance().create_object(mi.Properties(name))
     except RuntimeError as error:
         if "not found" not in str(error):
-            return  # it exists, and needs parameters
+            return  # the integrator exists, and requires parameters
         manager, folder = mi.PluginManager.instance(), Path(mi.__file__).parent / "plugins"
         names = {file.stem for file in folder.iterdir()}
         builtin = sorted(name for name in names if manager.plugin_type(name) == mi.ObjectType.Integrator)
@@ -112,8 +113,8 @@ def check_integrator(name):
 
 
 def check_parameters(title, name, parameters):
-    """Raise UsageError if an integrator refuses parameters, or knows nothing of them; `title` is what it is called.
-    Nothing is said of integrators that cannot be created alone, as they need parts that only a scene gives them."""
+    """Raise UsageError for parameters that an integrator refuses or does not have; `title` names it in the message.
+    Integrators that need parts from a scene, and so cannot be created alone, are not checked."""
     properties = mi.Properties(name)
     for key, content in parameters.items():
         properties[key] = content
@@ -137,7 +138,7 @@ def _can_be_created(name):
 
 
 def make_folder(path):
-    """Make a folder, with those above it, and see whether it can be written to; raises UsageError if not."""
+    """Make a folder and its parents; raises UsageError if it is not writable."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
@@ -147,12 +148,13 @@ def make_folder(path):
 
 
 def integrators_with_aovs():
-    """Return the names of those of this project's integrators that have AOVs."""
+    """Return the names of this project's integrators with AOVs."""
     return tuple(name for name in own_integrators() if not aov_refusal(name, ""))
 
 
 def aov_refusal(integrator, aov):
-    """Return why one of this project's integrators refuses an AOV (it says which it allows), None if it knows it."""
+    """Return the message, with the allowed AOVs, by which an integrator of this project refuses an AOV; otherwise
+    None."""
     properties = mi.Properties(integrator)
     properties["aovs"] = aov
     try:
@@ -163,14 +165,14 @@ def aov_refusal(integrator, aov):
 
 
 def check_scene(path):
-    """Raise UsageError if there is no such file."""
+    """Raise UsageError if the scene file does not exist."""
     if not Path(path).is_file():
         raise UsageError(f"no scene file '{path}'")
 
 
 def explain(error):
-    """Return the message of an error in one line: that of its first cause (Dr.Jit wraps what integrators raise),
-    without the place in Mitsuba's sources."""
+    """Return the message of the first cause of an error in one line, without locations in Mitsuba's sources. (Dr.Jit
+    wraps the exceptions of integrators.)"""
     while error.__cause__ is not None:
         error = error.__cause__
     message = re.sub(r"\[\w+\.cpp:\d+\] ", "", str(error))
@@ -178,14 +180,14 @@ def explain(error):
 
 
 def failure(error):
-    """Return what results say of an error that is being handled: its message in one line, and its traceback."""
+    """Return the entries of results for the current exception: its one-line message, and its traceback."""
     return {"error": explain(error), "traceback": traceback.format_exc()}
 
 
 def exit_status(program, run, interrupted, verbose):
-    """Run a command and return its exit status; what it raises becomes one line on the standard error.
+    """Run a command and return its exit status; an exception becomes one line on the standard error.
 
-    `run` returns the status; `interrupted` says what Ctrl-C leaves behind; with `verbose` errors are raised on.
+    `run`: returns the status; `interrupted`: message about the state after Ctrl-C; `verbose`: raise exceptions.
     """
     try:
         return run()
@@ -200,12 +202,12 @@ def exit_status(program, run, interrupted, verbose):
 
 
 def versions():
-    """Return the versions (text) of what made an image."""
+    """Return the versions (text) of the software that an image depends on."""
     return {name: metadata.version(name) for name in ("mitsuba", "drjit", "numpy")} | {"manylights": own_version()}
 
 
 def own_version():
     try:
         return metadata.version("manylights")
-    except metadata.PackageNotFoundError:  # run from a source tree that is not installed
+    except metadata.PackageNotFoundError:  # run from a source tree without installation
         return "unknown"

@@ -1,29 +1,30 @@
-"""The standard error of an image, estimated from its passes, and when to look at it.
+"""Standard error of an image, estimated from its passes, and the schedule of estimates.
 
-The passes of a render are independent images of the same expectation, whatever the integrator, the sampler or the
-film's filter are (a filter wider than a pixel makes neighbours alike, but not passes), so the spread of a pixel over
-them says how far their average is from that expectation.
+Passes are independent images of the same expectation, for every integrator, sampler and film filter (a filter wider
+than a pixel correlates neighbours, but not passes). So the variance of a pixel between passes gives the standard error
+of their average.
 """
 
 from itertools import accumulate
 
+import mitsuba as mi
 import numpy as np
 
-SHARE = 0.95  # of the pixels whose error is to be below the one that is asked for
-DARK = 0.1  # of the mean of the image: darker pixels have their error relative to about that, as in relMSE
-NEIGHBOURS = 2  # pixels in either direction over which variances are averaged
-LEAST_PASSES = 8  # before the first look
-GROWTH = 1.25  # of the samples from one look to the next
+SHARE = 0.95  # fraction of the pixels that must not exceed the error
+DARK = 0.1  # of the mean of the image: lower bound of the scale of relative errors, about as in relMSE
+NEIGHBOURS = 2  # pixels in each direction over which variances are averaged
+LEAST_PASSES = 8  # before the first estimate
+GROWTH = 1.25  # of the samples between estimates
 
 
 class ErrorEstimate:
-    """The spread of weighted passes about their average, in double precision, of the mean over colour channels.
+    """Weighted variance between passes of the mean over colour channels, in double precision.
 
-    With x_k the value of a pixel in pass k of w_k samples per pixel, W = Σ w_k and m = Σ w_k x_k / W, the variance of m
-    is estimated by Σ w_k² (x_k − m)² / (W² − Σ w_k²). Its expectation is the variance of m where that of x_k is
-    inverse to w_k, and for passes of one size whatever it depends on; it is close to it where all passes have the same
-    variance in spite of their sizes, as when each has virtual lights of its own. Memory: three images of one channel,
-    and the first pass, which is subtracted from all so that nothing cancels.
+    With x_k the value of a pixel in pass k of w_k samples per pixel, W = Σ w_k and m = Σ w_k x_k / W, the estimate of
+    the variance of m is Σ w_k² (x_k − m)² / (W² − Σ w_k²). The estimate is unbiased if the variance of x_k is
+    proportional to 1 / w_k, and for passes of equal size. It is nearly unbiased if passes of different sizes have equal
+    variance, as by virtual lights of each pass. Memory: three images of one channel, and the first pass, which is
+    subtracted from all passes against cancellation.
     """
 
     def __init__(self):
@@ -31,7 +32,7 @@ class ErrorEstimate:
         self._origin, self._sum, self._first_moment, self._second_moment = 0.0, 0.0, 0.0, 0.0
 
     def add(self, image, weight):
-        """Add a pass: its colour, (height, width, 3), and its samples per pixel."""
+        """Add a pass: colour (height, width, 3) and samples per pixel."""
         level = np.asarray(image, np.float64).mean(axis=-1)
         if self._count == 0:
             self._origin = level
@@ -45,7 +46,7 @@ class ErrorEstimate:
 
     @property
     def state(self):
-        """What it holds, name -> number or array: all that another one needs to go on (settable)."""
+        """Complete state, a dict from name to number or array (settable)."""
         return dict(vars(self))
 
     @state.setter
@@ -54,17 +55,18 @@ class ErrorEstimate:
 
     @property
     def standard_error(self):
-        """Of the average of the passes, (height, width) float64; needs two passes. Not finite where a pass is not."""
+        """Standard error of the average, (height, width) float64; requires two passes. Not finite where a pass is
+        not."""
         mean = self._sum / self._weight
         spread = self._second_moment - 2 * mean * self._first_moment + mean**2 * self._weight_squared
         return np.sqrt(np.maximum(spread, 0) / (self._weight**2 - self._weight_squared))
 
     def relative(self):
-        """Return the relative standard error that 95% of the pixels do not exceed, None before there are two passes.
+        """Return the relative standard error that 95% of the pixels do not exceed, None for fewer than two passes.
 
-        Of a pixel with the value m in an image with the mean a it is relative to √(m² + (0.1 a)²), the scale of relMSE.
-        Few passes leave the variance of single pixels uncertain, and a high percentile of uncertain values is too high:
-        5 × 5 pixels share their mean. Pixels that are not finite are left out.
+        The error of a pixel of value m, in an image of mean a, is relative to √(m² + (0.1 a)²), the scale of relMSE.
+        With few passes the variance of a single pixel is uncertain, and the percentile would be too high; therefore
+        variances are averaged over 5 × 5 pixels. Pixels that are not finite are ignored.
         """
         if self._count < 2:
             return None
@@ -82,7 +84,7 @@ class ErrorEstimate:
 
 
 def _box_sum(plane):
-    """Return the sums over the neighbours of each pixel that are in the image, (height, width)."""
+    """Return the sums over the neighbours of each pixel inside the image, (height, width)."""
     for axis in (0, 1):
         widths = [(NEIGHBOURS + 1, NEIGHBOURS) if along == axis else (0, 0) for along in (0, 1)]
         total = np.cumsum(np.pad(plane, widths), axis=axis)
@@ -92,26 +94,26 @@ def _box_sum(plane):
 
 
 class ErrorGoal:
-    """When to look at the error of a render, and whether it is as low as `error`.
+    """The `error` that ends a render, and the schedule of its estimates.
 
-    Who stops as soon as an estimate falls below a bound stops, on average, when it happens to be too low. So the
-    estimate is looked at only now and then: after at least 8 passes, and then whenever there are a quarter more samples
-    than at the look before. How many samples there are at a look depends on what passes cost, not on what they show.
-    Tests simulate it: what is reported at the end is 0 to 20% above the truth for noise that is each pixel's own, and
-    right on average where it is the whole image's. It is a fifth too low at worst: where each pass, however large,
-    shifts the whole image by the same amount and some ten passes are enough. (There a brighter image, whose relative
-    error is less, also ends earlier: it is too bright by half of its standard error.)
+    A render that stops at the first estimate below a bound is biased towards low estimates. Therefore the error is
+    estimated rarely: after at least 8 passes, and then after each increase of the samples by a quarter. The number of
+    samples at an estimate depends on the cost of passes, not on their content. In simulations (tests), the reported
+    error is 0 to 20% too high for noise that is independent between pixels, and unbiased for noise common to the whole
+    image. It is 20% too low at worst: if each pass of any size shifts the whole image equally, and about ten passes are
+    enough. (Then brighter images, of lower relative error, also end earlier: the image is too bright by half of its
+    standard error.)
     """
 
     def __init__(self, error):
         self.error, self._next = error, 0
 
     def is_due(self, progressive):
-        """Is it time to look at the passes of a `Progressive`?"""
+        """Return whether an estimate is due for the passes of a `Progressive`."""
         return self._is_due(len(progressive.passes), progressive.spp)
 
     def resume(self, passes):
-        """Leave out the looks that were taken at a list of passes (`Pass`) which a render goes on from."""
+        """Skip the estimates that were made for a list of passes (`Pass`) from a checkpoint."""
         for count, spp in enumerate(accumulate(one.spp for one in passes), 1):
             self._is_due(count, spp)
 
@@ -122,10 +124,18 @@ class ErrorGoal:
         return True
 
     def samples(self, found, spp):
-        """Return about how many samples per pixel there will be at the look that ends the render, if there are `spp` at
-        the last one, with an error `found`."""
+        """Return the expected samples per pixel at the end of the render, from the last estimate: the error `found` of
+        `spp` samples per pixel."""
         return max(self._next, spp * (found / self.error) ** 2)
 
+    def warn_if_missed(self, found, limit):
+        """Log a warning if the `limit` ("spp" or "time") ended the render above the error, or at an unknown one."""
+        if not self.is_reached(found):
+            ended = "an unknown error, as there is one pass" if found is None else f"an error of {found:.2%}"
+            mi.Log(
+                mi.LogLevel.Warn, f"The error of {self.error:.2%} was not reached: {limit} ended the render at {ended}."
+            )
+
     def is_reached(self, found):
-        """Is an estimated error (None: it is not known) low enough?"""
+        """Return whether an estimated error (None: unknown) is low enough."""
         return found is not None and found <= self.error

@@ -1,31 +1,38 @@
 """Images: EXR files with metadata, tone mapping, PNG files, false colours.
 
-EXR files are OpenEXR's matter rather than Mitsuba's, whose writer waits for ever where Dr.Jit has a single thread.
+EXR files are read and written by OpenEXR, as Mitsuba waits for ever with a single thread (threads.py).
 """
+
+from __future__ import annotations
 
 import json
 import math
 import os
 import re
 import threading
+from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import OpenEXR
+from numpy.typing import ArrayLike
 
-# Lightness (CIE L*) rises by about 20 from each to the next: black, indigo, magenta, orange, yellow, pale yellow.
+# Lightness (CIE L*) increases in steps of about 20: black, indigo, magenta, orange, yellow, pale yellow
 FALSE_COLOURS = np.array([(0, 0, 4), (60, 15, 112), (158, 44, 120), (236, 105, 60), (252, 190, 60), (252, 253, 200)])
-ERROR_RANGE = (0.01, 1.0)  # relative errors at the two ends of the false colours, which are logarithmic
-# Of the positive values of an AOV: pixels that the film's filter just grazes must not add decades to its scale.
+ERROR_RANGE = (0.01, 1.0)  # relative errors at the ends of the logarithmic scale of false colours
+# Of the positive values of an AOV; the rest are pixels at the margin of the film's filter, of tiny values
 AOV_PERCENTILES = (1, 99.9)
+EXTENSIONS = (".exr", ".png")  # of files from `write`
+CHANNELS = {1: "Y", 2: "YA", 3: "RGB", 4: "RGBA"}  # by their number
 
 
 @contextmanager
 def replacing(path):
-    """Give a temporary path beside `path`, one for each thread, that takes its place when the block ends without an
-    error. An OSError names `path`, which those of a full disk do not."""
+    """Yield a temporary path beside `path`, unique to the thread; the file replaces `path` after the block, unless an
+    exception leaves it. Each OSError names `path`, also for a full disk."""
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{threading.get_native_id()}{path.suffix}")
     try:
@@ -38,8 +45,8 @@ def replacing(path):
 
 
 def remove_abandoned(folder, stem=None):
-    """Remove temporary files that killed processes left in a folder, of the files called `stem` if it is given; nobody
-    may be writing there, or those files."""
+    """Remove temporary files of killed processes in a folder, only for files with the given `stem` unless it is None.
+    No process may be writing these files."""
     name = ".+" if stem is None else re.escape(stem)
     for file in Path(folder).iterdir():
         if re.fullmatch(rf"\.{name}\.\d+\.(exr|png|json|html)", file.name):
@@ -47,9 +54,9 @@ def remove_abandoned(folder, stem=None):
 
 
 def write_exr(path, image, channels, metadata=None, half=False):
-    """Write an image, (height, width, channels), with the names of its channels; metadata that EXR attributes cannot
-    hold (lists, dicts, None, integers of more than 32 bits) become JSON text. `half` stores 16-bit numbers; raises
-    ValueError if the image has some that are too large for that."""
+    """Write an image (height, width, channels) and the names of the channels. Metadata of types without an EXR
+    attribute (lists, dicts, None, integers of more than 32 bits) become JSON text. `half` stores 16-bit numbers, and
+    raises ValueError for larger values."""
     if half and np.abs(image).max() > np.finfo(np.float16).max:
         raise ValueError(f"{path}: brighter than the 65504 that half precision holds")
     header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
@@ -69,8 +76,8 @@ def _fits_attribute(value):
 
 
 def read_exr(path):
-    """Return the image (height, width, channels) float32, the names of its channels (sorted), and its metadata: a dict
-    of finite numbers and strings. Raises ValueError, besides what OpenEXR raises, for text that is not UTF-8."""
+    """Return the image (height, width, channels) float32, the sorted names of its channels, and its metadata, a dict of
+    finite numbers and strings. Raises OpenEXR's exceptions, and ValueError for text that is not UTF-8."""
     with _opened(path, separate_channels=True) as file:
         channels = sorted(file.channels())
         image = np.stack([file.channels()[name].pixels.astype(np.float32) for name in channels], axis=-1)
@@ -92,14 +99,14 @@ def _opened(path, **how):
 
 
 def _plain(header):
-    # Reports are JSON, which has no number that is not finite
+    # JSON, the format of reports, has only finite numbers
     kept = {key: value for key, value in header.items() if isinstance(value, int | float | str)}
     return {key: value for key, value in kept.items() if isinstance(value, str) or math.isfinite(value)}
 
 
 def colour(image, channels, layer=""):
-    """Return the colour of an image, (height, width, 3): its channels R, G, B (of a layer such as "se."), or Y for all
-    three. Raises ValueError if it has neither."""
+    """Return the colour (height, width, 3) of an image: channels R, G and B (of a layer such as "se."), or three times
+    Y. Raises ValueError if the image has neither."""
     for names in (("R", "G", "B"), ("Y", "Y", "Y")):
         wanted = [layer + name for name in names]
         if set(wanted) <= set(channels):
@@ -108,8 +115,8 @@ def colour(image, channels, layer=""):
 
 
 def automatic_exposure(rgb):
-    """Return the factor that brings the 95th percentile of the brightness to 0.8, or 1 for a black image. A
-    percentile, unlike a mean, ignores emitters in view; unlike a log average, it ignores a black background."""
+    """Return the factor that scales the 95th percentile of the brightness to 0.8, or 1 for a black image. A percentile
+    ignores visible emitters, unlike a mean, and a black background, unlike a log average."""
     brightness = np.nan_to_num(rgb, posinf=0, neginf=0).mean(axis=-1)
     level = np.percentile(brightness, 95) or brightness.max()
     return 0.8 / level if level > 0 else 1.0
@@ -123,30 +130,29 @@ def tone_map(rgb, exposure):
 
 
 def logarithmic_position(values, ends):
-    """Return where values, (height, width), are on a logarithmic scale with the given ends: 0 to 1. What is below it,
-    such as zero, is at 0, what is above it or not a number at 1."""
+    """Return the positions, 0 to 1, of values (height, width) on a logarithmic scale with the given ends. Values below
+    the scale, such as zero, are at 0; values above it and NaN are at 1."""
     low, high = np.log(ends)
     position = (np.log(np.maximum(np.nan_to_num(values, nan=np.inf), ends[0])) - low) / (high - low)
     return np.clip(position, 0, 1)
 
 
 def false_colours(values, ends=ERROR_RANGE):
-    """Return the colours, (height, width, 3) uint8, of values, (height, width), on a logarithmic scale with the given
-    ends, by default that of relative errors. What is below it, such as zero, has the lowest colour, what is above it or
-    not a number the highest."""
+    """Return the false colours (height, width, 3) uint8 of values (height, width) on a logarithmic scale, by default
+    the scale of relative errors. Values outside the scale are handled as in `logarithmic_position`."""
     return palette(logarithmic_position(values, ends))
 
 
 def palette(position):
-    """Return the colours (..., 3) uint8 of positions (...) between 0 and 1 on the scale of false colours."""
+    """Return the colours (..., 3) uint8 of positions (...), 0 to 1, on the scale of false colours."""
     stops = np.linspace(0, 1, len(FALSE_COLOURS))
     return np.stack([np.interp(position, stops, FALSE_COLOURS[:, i]) for i in range(3)], axis=-1).astype(np.uint8)
 
 
 def logarithmic_ends(planes):
-    """Return the ends (low, high) of one logarithmic scale for several images, (height, width) each: the least and the
-    greatest of their `AOV_PERCENTILES`, in two digits so that they can be told in full. They are a factor of two apart
-    at least, and 1 and 2 where nothing is positive."""
+    """Return the ends (low, high) of a common logarithmic scale for images (height, width): the least and greatest of
+    the images' `AOV_PERCENTILES`, rounded to two digits for display. The ratio is at least two; without positive values
+    the ends are 1 and 2."""
     positive = [plane[(plane > 0) & np.isfinite(plane)] for plane in planes]
     found = [np.percentile(values, AOV_PERCENTILES) for values in positive if values.size]
     if not found:
@@ -155,13 +161,47 @@ def logarithmic_ends(planes):
     return min(low, high / 2), high
 
 
+def write(
+    path: str | os.PathLike[str],
+    image: ArrayLike | mi.TensorXf,
+    channels: Sequence[str] | None = None,
+    metadata: dict[str, Any] | None = None,
+    exposure: float | None = None,
+) -> None:
+    """Write an image (height, width, channels) to an .exr file with all channels, or tone-mapped to a .png file.
+
+    `image`: linear values, as from `mi.render` and `manylights.render`. `channels`: names; by default Y, YA, RGB or
+    RGBA by the number of channels. `metadata`: attributes of an .exr file. `exposure`: a .png file is scaled by
+    2^exposure, by default so that the 95th percentile of the brightness is 0.8. Works with a single thread, unlike
+    `mi.util.write_bitmap`. Raises ValueError for another extension, and for a wrong number of names.
+    """
+    planes = np.atleast_3d(np.asarray(image, np.float32))
+    names = list(channels or CHANNELS.get(planes.shape[-1], ()))
+    check_extension(path)
+    if planes.ndim != 3 or len(names) != planes.shape[-1]:
+        raise ValueError(
+            f"channels must name the channels of an image of shape {planes.shape}, got {', '.join(names) or 'none'}"
+        )
+    if Path(path).suffix == ".exr":
+        write_exr(path, planes, names, metadata)
+        return
+    rgb = colour(planes, names)
+    write_png(path, tone_map(rgb, automatic_exposure(rgb) if exposure is None else 2.0**exposure))
+
+
+def check_extension(path):
+    """Raise ValueError for a path without one of the `EXTENSIONS`."""
+    if Path(path).suffix not in EXTENSIONS:
+        raise ValueError(f"cannot write '{path}': the output must be an .exr or a .png file")
+
+
 def read_png(path):
-    """Return the pixels, (height, width, 3) uint8, of a PNG file of colours."""
+    """Return the pixels (height, width, 3) uint8 of a colour PNG file."""
     return np.array(mi.Bitmap(str(path)))
 
 
 def write_png(path, pixels, metadata=None):
-    """Write (height, width, 3) uint8 sRGB values, and metadata: a dict of text."""
+    """Write sRGB values (height, width, 3) uint8, and metadata, a dict of text."""
     bitmap = mi.Bitmap(np.ascontiguousarray(pixels))
     for key, value in (metadata or {}).items():
         bitmap.metadata()[key] = value

@@ -1,4 +1,4 @@
-"""Ctrl-C during a render: what is finished is kept, and nobody waits for what is not."""
+"""Ctrl-C during a render: finished passes are kept, and the process does not wait for an unfinished one."""
 
 import os
 import signal
@@ -11,9 +11,9 @@ PATIENCE = 4.0  # seconds
 
 
 class Interruption:
-    """While in force, a first Ctrl-C sets `asked`, for the loop over the passes to end; a second one acts at once.
+    """Within the block, a first Ctrl-C sets `asked`, which ends the loop over the passes; a second one acts at once.
 
-    Outside of the main thread, where nobody can hear Ctrl-C, it does nothing.
+    Only the main thread receives Ctrl-C; in another thread the block has no effect.
     """
 
     def __init__(self):
@@ -36,11 +36,11 @@ class Interruption:
 
 
 class Deadline:
-    """While in force, ends this process when `PATIENCE` seconds after Ctrl-C it is still in force: `save` is called, in
-    another thread, and returns the exit status; if it raises, that is told, and the status is 1.
+    """Ends the process if the block is still running `PATIENCE` seconds after Ctrl-C. Another thread calls `save`,
+    which returns the exit status; an exception of `save` is printed, and the status is 1.
 
-    No kernel can be stopped, and Python hears of a signal only after it. But the wake-up pipe hears it at once. For the
-    main thread of a command.
+    A running kernel cannot be stopped, and delays signal handlers of Python, but not the wake-up pipe. For the main
+    thread of a command.
     """
 
     def __init__(self, save):
@@ -66,7 +66,7 @@ class Deadline:
             if signal.SIGINT in signals and not self._over.wait(PATIENCE):
                 try:
                     status = self._save()
-                except Exception as error:  # whatever it is: nobody else would end this process
+                except Exception as error:  # of any kind, as the process must end
                     print(f"manylights: {error}", file=sys.stderr)
                     status = 1
                 sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""One image of the command `manylights`: rendered here or by workers, and written now and then."""
+"""An image of the command `manylights`: rendered by this process or by workers, and written from time to time."""
 
 import sys
 import time
@@ -14,13 +14,13 @@ from .progress import ImageBar
 from .render import render
 from .scene_files import SceneFile
 
-WRITE_SECONDS = 10.0  # from one time that the image so far is written to the next
+WRITE_SECONDS = 10.0  # between writes of the unfinished image
 INTERRUPTED = 130  # exit status
 
 
 class LazyScene:
-    """The scene of a `SceneFile`, loaded when it is asked for, once; the file can still be looked at afterwards.
-    `before`, if given, is the `LazyScene` of the frame before."""
+    """Scene of a `SceneFile`, loaded at first access; the `SceneFile` stays usable. `before`: the `LazyScene` of the
+    previous frame, or None."""
 
     def __init__(self, file, threads=None, before=None):
         self.file, self.seconds, self._threads, self._scene = file, 0.0, threads, None
@@ -29,15 +29,15 @@ class LazyScene:
 
     @property
     def keeps_lights(self):
-        """Is the integrator to keep its lights for other images of this scene?"""
+        """Whether the integrator keeps the lights for later images of the scene."""
         return self.file.integrator[1].get("keep_lights", False)
 
     def get(self):
-        """Return the `mi.Scene`; `seconds` is then what loading it took, and `integrator` what it is rendered with: its
-        own, or that of the frame before, which has lights, if nothing but the camera is another one."""
+        """Return the `mi.Scene`, and set `seconds`, the time of loading, and `integrator`. The integrator, with its
+        kept lights, is that of the previous frame if only the camera differs, otherwise the scene's."""
         if self._scene is None:
             begin = time.perf_counter()
-            before, self._before = self._before, None  # whose scene is not needed any more
+            before, self._before = self._before, None  # frees the scene of that frame
             if before and before.file.fingerprint(camera=False) == self.file.fingerprint(camera=False):
                 self.integrator = before.integrator
             del before
@@ -48,15 +48,15 @@ class LazyScene:
 
 
 class Image:
-    """Image to render of the sensor `sensor` (index) of a `LazyScene`, as `options` say: by the workers of a `pool`,
-    or, if that is None, by this process. `described` is the integrator: "integrator", "parameters", "replaced"."""
+    """Image to render from the sensor of index `sensor` of a `LazyScene`, with the options of the command: by the
+    workers of a `pool`, or by this process if it is None. `described`: "integrator", "parameters" and "replaced"."""
 
     def __init__(self, options, scene, described, sensor, pool):
         self._options, self._scene, self._sensor = options, scene, sensor
         self._name = described["integrator"]
         if described["replaced"]:
             self._name += f" in place of {described['replaced']}"
-            mi.Log(mi.LogLevel.Info, f"The integrator is {self._name}; with -i scene it would be the scene's.")
+            mi.Log(mi.LogLevel.Info, f"The integrator is {self._name}; -i scene would keep the scene's.")
         self._described = {"scene": str(options.scene), **described, "variant": options.mode, "seed": options.seed}
         self.path, self._checkpoint, self._remote = batch.output(options, sensor), None, None
         if pool or options.resume:
@@ -69,7 +69,7 @@ class Image:
 
     @property
     def fills_pool(self):
-        """Are there passes enough to keep all workers busy while images before it are finished?"""
+        """Whether the image has enough passes for all workers while earlier images finish."""
         return self._remote.fills_pool
 
     def run(self):
@@ -88,15 +88,23 @@ class Image:
         if took.ended_by == "interruption":
             return output.end_early()
         output.write()
-        error = "" if took.error is None else f", error {took.error:.2%}"
-        print(f"{self.path}: {self._name}, {took.spp} samples per pixel, {took.seconds:.2f} s{error}")
+        print(
+            f"{self.path}: {self._name}, {took.spp} samples per pixel, {took.seconds:.2f} s{self._error(took)}, ended "
+            f"by {took.ended_by}"
+        )
         return 0
+
+    def _error(self, took):
+        """Return the words for the estimated error, none if it is neither known nor asked for."""
+        if took.error is None:
+            return ", error unknown (one pass)" if self._options.error else ""
+        return f", error {took.error:.2%}"
 
     def _limits(self):
         return {name: getattr(self._options, name) for name in ("error", "time", "spp", "seed", "pass_spp")}
 
     def _render(self, output):
-        """Render with a bar, and write now and then."""
+        """Render with a progress bar, and write from time to time."""
         with ImageBar() as bar, Deadline(output.end_early):
 
             def progress(took, image):
@@ -114,7 +122,7 @@ class Image:
 
 
 class Failed:
-    """In the place of an image that could not even be begun, for an error."""
+    """Placeholder for an image whose preparation raised an error."""
 
     fills_pool = False
 
@@ -127,7 +135,7 @@ class Failed:
 
 
 class Output:
-    """The file that an image is written to; `metadata` (a dict) is what is known of it before it is rendered."""
+    """Output file of an image; `metadata` is a dict of properties that are known before the render."""
 
     def __init__(self, path, exposure=None, checkpoint=None):
         self.path, self.metadata, self._exposure, self._checkpoint = path, {}, exposure, checkpoint
@@ -135,12 +143,12 @@ class Output:
         self._writer = OccasionalWriter("The image so far", self.write, WRITE_SECONDS)
 
     def keep(self, took, image):
-        """Take an image, and write it now and then."""
+        """Take an image, and write it from time to time."""
         self._image, self._took = np.array(image), took
         self._writer.offer()
 
     def end_early(self):
-        """Write the last image that was taken, say so, and return the exit status."""
+        """Write the last image, report that on the standard error, and return the exit status."""
         if self._took is None:
             print("manylights: interrupted before the first pass was finished; nothing was written", file=sys.stderr)
         else:
@@ -153,12 +161,10 @@ class Output:
         return INTERRUPTED
 
     def write(self):
-        """Write the last image that was taken."""
+        """Write the last image."""
         took, image = self._took, self._image
         if self.path.suffix == ".png":
-            rgb = images.colour(image, took.channels)
-            exposure = images.automatic_exposure(rgb) if self._exposure is None else 2.0**self._exposure
-            images.write_png(self.path, images.tone_map(rgb, exposure))
+            images.write(self.path, image, took.channels, exposure=self._exposure)
             return
         metadata = self.metadata | {
             "spp": took.spp,
@@ -170,6 +176,6 @@ class Output:
         }
         if took.raw is not None:
             described = metadata | {"denoise_seconds": took.denoise_seconds}
-            images.write_exr(self.path.with_suffix(".denoised.exr"), image, took.channels, described)
+            images.write(self.path.with_suffix(".denoised.exr"), image, took.channels, described)
             image = np.array(took.raw)
-        images.write_exr(self.path, image, took.channels, metadata)
+        images.write(self.path, image, took.channels, metadata)

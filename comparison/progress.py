@@ -1,5 +1,4 @@
-"""How far a comparison or an image is, and how long it still takes: a bar where somebody watches, nothing where output
-is piped."""
+"""Progress bars of comparisons and images, with the time left; hidden if the output is no terminal."""
 
 import time
 from contextlib import contextmanager
@@ -11,8 +10,8 @@ IMAGE_BAR = "{desc}|{bar}| {percentage:.0f}%{postfix}"
 
 
 class ImageBar:
-    """A bar of an image: the part of the time that has gone, as far as the end can be foreseen; the stage of the pass;
-    samples per pixel, shadow rays and error so far."""
+    """Progress bar of an image: fraction of the expected time, stage of the pass, samples per pixel, shadow rays and
+    error."""
 
     def __init__(self):
         self._bar = tqdm(total=1.0, disable=None, bar_format=IMAGE_BAR)
@@ -24,7 +23,7 @@ class ImageBar:
         self._bar.close()
 
     def show(self, took, *more):
-        """Show a `render.Took` of a render that goes on, and `more`, in words."""
+        """Show the `render.Took` of a running render, and the texts `more`."""
         left = took.seconds_left
         if left is not None:
             self._bar.n = took.seconds / max(took.seconds + left, 1e-9)
@@ -41,10 +40,10 @@ class ImageBar:
 
 
 class Progress:
-    """A bar of the runs of several scenes (paths), each of which has the same ones, (setting, seed).
+    """Progress bar of a comparison: each of several scenes (paths) has the same runs, (setting, seed).
 
-    Time left is what the same settings took with other seeds; for settings that were not yet made it is the mean of
-    what the label took on the scene, or of all.
+    The expected time of a run is that of the same setting with other seeds; for a new setting, the mean time of its
+    label on the scene, or of all runs.
     """
 
     def __init__(self, scenes, runs):
@@ -53,14 +52,14 @@ class Progress:
         self._took, self._running, self._began = {}, None, 0.0
 
     def begin(self, scene, setting):
-        """A run begins."""
+        """Start a run."""
         self._running, self._began = (str(scene), setting.label, setting.name), time.monotonic()
         self._planned.remove(self._running)
         self._bar.set_description_str(setting.title, refresh=False)
         self.tick()
 
     def end(self, kept):
-        """The run has ended; `kept`, if its result was there already."""
+        """End the run; `kept`: its result was already there."""
         if not kept:
             self._took.setdefault(self._running, []).append(time.monotonic() - self._began)
         self._running = None
@@ -68,19 +67,19 @@ class Progress:
         self.tick()
 
     def skip(self, scene):
-        """Drop the runs that were planned for a scene and are not done."""
+        """Drop the remaining runs of a scene."""
         left = [run for run in self._planned if run[0] != str(scene)]
         self._bar.update(len(self._planned) - len(left))
         self._planned = left
 
     def tick(self):
-        """Show the time left as it is now."""
+        """Update the time left."""
         left = self.seconds_left()
         self._bar.set_postfix_str("" if left is None else f"{tqdm.format_interval(left)} left", refresh=False)
         self._bar.refresh()
 
     def seconds_left(self):
-        """Return the seconds that the planned runs and the running one will take, None if that is not known."""
+        """Return the expected seconds of the planned and the current runs, None if unknown."""
         if not self._took:
             return None
         left = sum(self._expected(run) for run in self._planned)
@@ -97,7 +96,7 @@ class Progress:
 
     @contextmanager
     def paused(self):
-        """Something else, with a bar of its own, goes on in the block."""
+        """Hide the bar within the block, in favour of another bar."""
         self._bar.clear()
         try:
             yield

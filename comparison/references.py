@@ -1,8 +1,8 @@
-"""References: images that others are compared with, and the standard errors of their pixels.
+"""Reference images of comparisons, and the standard errors of their pixels.
 
-A path-traced reference is the mean of batches of different seeds, whose spread gives its standard error. It is kept in
-a cache folder under the fingerprint of its scene, and continued when more samples are asked for later. To make one that
-can be given away (in half precision):
+A path-traced reference is the mean of batches with different seeds; the variance between batches gives its standard
+error. A cache folder keeps references by the fingerprint of the scene, and a request for more samples continues them.
+To make a reference for distribution, in half precision:
 
     python -m comparison.references scenes/hall.xml --width 192 --spp 32768 --output scenes/hall_reference.exr
 """
@@ -25,15 +25,16 @@ from .runs import locked
 from .scene_files import SceneFile
 
 LAYERS = ["R", "G", "B", "se.R", "se.G", "se.B"]
-BATCHES = 32  # at least, for a standard error that is itself known to some 13%
-SEED = 2_718_281_828  # unlike any that people choose: a reference must not share its noise with what it judges
-SAVE_SECONDS = 20.0  # how much work an interruption may lose
+BATCHES = 32  # minimum, for a standard error with a relative error of some 13%
+SEED = 2_718_281_828  # an unlikely choice of users, as a reference must not share noise with the images it judges
+SAVE_SECONDS = 20.0  # of work that an interruption may lose
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """The reference that somebody asks for: of `kind` "path" with `spp` samples per pixel, or, if that is None, with as
-    many as bring its noise to `fraction` of the smallest error; of kind "file" with a `file` or folder; or "vpl"."""
+    """Requested reference, of a `kind`. "path": path-traced with `spp` samples per pixel, or, if `spp` is None, with
+    enough samples that its standard error is `fraction` of the smallest error. "file": a `file`, or a folder of files.
+    "vpl": rendered by `vpl`."""
 
     kind: str
     spp: int | None = None
@@ -45,11 +46,11 @@ class Wanted:
         return self.file / f"{name}.exr" if self.file and self.file.is_dir() else self.file
 
 
-AUTOMATIC_FRACTION = 0.2  # of which the square, 4%, is what the noise adds to a squared error before it is taken off
+AUTOMATIC_FRACTION = 0.2  # its square, 4%, is the noise in a squared error before correction
 
 
 def wanted(text):
-    """Read the text of --reference; an argparse type."""
+    """Convert the text of --reference to a `Wanted`; an argparse type."""
     form = f"'{text}' is not of the form path:SPP, path:auto or path:auto:FRACTION"
     kind, _, detail = text.partition(":")
     if text == "vpl":
@@ -78,8 +79,8 @@ def _fraction(text, form):
 
 @dataclass
 class Reference:
-    """`image` and `standard_error`, (height, width, 3) linear colour (the error None if it is not known), and
-    `description`, a dict that says how it was made ("integrator", "spp", ... as far as known)."""
+    """Reference: `image` and `standard_error`, (height, width, 3) linear colour (the error None if unknown), and
+    `description`, a dict of known properties of the render ("integrator", "spp", ...)."""
 
     image: np.ndarray
     standard_error: np.ndarray | None
@@ -92,8 +93,8 @@ class Reference:
 
 
 def read(path):
-    """Read a reference from an EXR file: colour channels and, where there are, layers `se.*` with its standard error.
-    Raises OSError or RuntimeError if it cannot be read, ValueError if it has no colour or if that is not finite."""
+    """Read a reference from an EXR file: colour channels, and optional layers `se.*` of the standard error. Raises
+    OSError or RuntimeError for an unreadable file, ValueError for missing colour and for pixels that are not finite."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"no reference '{path}'")
     image, channels, metadata = images.read_exr(path)
@@ -107,7 +108,7 @@ def read(path):
 
 
 def write(path, image, standard_error, description, half=False):
-    """Write a reference that `read` reads."""
+    """Write a reference for `read`."""
     images.write_exr(path, np.concatenate((image, standard_error), axis=-1), LAYERS, description, half)
 
 
@@ -116,11 +117,11 @@ def default_cache():
 
 
 def path_traced(scene_file, spp, cache):
-    """Return the path-traced reference of a `SceneFile` (which this consumes, and whose `max_depth` it keeps) with at
-    least `spp` samples per pixel: from the folder `cache` if it is there, begun or continued there if not.
+    """Return the path-traced reference of a `SceneFile`, with its `max_depth` and at least `spp` samples per pixel,
+    from the folder `cache`, where it is started or continued if needed. The `SceneFile` is consumed.
 
-    It is found by all that it depends on: the scene with its parameters and files, and the version of Mitsuba. Who
-    comes while another process works on it waits for that. Raises ValueError for a file there that cannot be read.
+    The key is a hash of all dependencies: the scene with its parameters and files, and the version of Mitsuba. Only one
+    process works on a reference at a time. Raises ValueError for an unreadable or altered file in the cache.
     """
     scene_file.set_integrator("path")
     _, parameters = scene_file.integrator
@@ -129,7 +130,7 @@ def path_traced(scene_file, spp, cache):
     file.parent.mkdir(parents=True, exist_ok=True)
     with locked(file.with_suffix(".lock")):
         images.remove_abandoned(file.parent, file.stem)
-        batches = _read_batches(file)
+        batches = _read_batches(file, scene_file.sampling(0)[0])
         if batches.spp < spp or batches.count < 2:
             described = {"integrator": "path", "scene": scene_file.name, "seed": SEED, **parameters}
             described["mitsuba"] = mi.__version__
@@ -137,18 +138,22 @@ def path_traced(scene_file, spp, cache):
     return read(file)
 
 
-def _read_batches(file):
+def _read_batches(file, pixels):
+    """Return the batches of a kept reference with the given number of pixels, empty if there is no file."""
     if not file.is_file():
         return Batches()
     try:
-        return Batches.read(file)
+        batches = Batches.read(file)
+        if batches.mean[..., 0].size != pixels:
+            raise ValueError(f"it has {batches.mean[..., 0].size} pixels instead of {pixels}")
+        return batches
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"the kept reference '{file}' cannot be read ({error}); delete it to make it anew") from error
 
 
 def _continue(batches, progressive, spp, file, described):
-    """Render batches until there are `spp` samples per pixel (and at least two batches), saving them now and then, and
-    when interrupted."""
+    """Render batches up to `spp` samples per pixel, and at least two batches. Save them from time to time, and after an
+    interruption."""
     saved = time.monotonic()
     batch_spp = max(1, min(-(-(spp - batches.spp) // BATCHES), largest_pass(progressive.pixels)))
     try:
@@ -167,16 +172,17 @@ def _continue(batches, progressive, spp, file, described):
 
 @dataclass(frozen=True)
 class Batches:
-    """The mean of batches of samples, (height, width, 3), and what its standard error follows from. Batches may differ
-    in size: each counts by its samples per pixel, to which its variance is inverse. (Welford's sums.)"""
+    """Mean of batches of samples, (height, width, 3), and the weighted variance between batches by Welford's sums. The
+    weight of a batch is its samples per pixel, to which its variance is inversely proportional."""
 
     spp: int = 0
     count: int = 0
     mean: np.ndarray | float = 0.0
-    squares: np.ndarray | float = 0.0  # sum of squared deviations, times the samples per pixel of each
+    squares: np.ndarray | float = 0.0  # sum of squared deviations, weighted by samples per pixel
 
     def with_batch(self, image, spp):
-        """Return these and one more batch of `spp` samples per pixel; pixels that are not finite count as black."""
+        """Return the batches with another one of `spp` samples per pixel, in which pixels that are not finite are
+        black."""
         image = np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0)
         difference, total = image - self.mean, self.spp + spp
         mean = self.mean + difference * (spp / total)
@@ -184,11 +190,11 @@ class Batches:
 
     @property
     def standard_error(self):
-        """Of the mean, (height, width, 3); needs two batches."""
+        """Standard error of the mean, (height, width, 3); requires two batches."""
         return np.sqrt(self.squares / (self.spp * (self.count - 1)))
 
     def write(self, path, described):
-        """Write mean and standard error to an EXR file that `read` reads; needs two batches."""
+        """Write mean and standard error to an EXR file for `read`; does nothing for fewer than two batches."""
         if self.count < 2:
             return
         write(path, self.mean, self.standard_error, {**described, "spp": self.spp, "batches": self.count})
@@ -198,6 +204,10 @@ class Batches:
         image, channels, metadata = images.read_exr(path)
         mean, error = images.colour(image, channels), images.colour(image, channels, "se.")
         spp, count = metadata["spp"], metadata["batches"]
+        if not (isinstance(spp, int) and isinstance(count, int) and spp >= count >= 2):
+            raise ValueError(f"spp must be a whole number of at least batches, and batches of 2, got {spp} and {count}")
+        if not (np.isfinite(mean).all() and np.isfinite(error).all() and (error >= 0).all()):
+            raise ValueError("its mean and its standard error must be finite, and the latter at least 0")
         return cls(spp, count, mean.astype(np.float64), np.square(error, dtype=np.float64) * spp * (count - 1))
 
 

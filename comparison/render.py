@@ -1,7 +1,8 @@
-"""`manylights.render`: an image that ends by itself, when it has the samples, the seconds or the error asked for."""
+"""`manylights.render`: renders in passes until a limit of samples, seconds or error is reached."""
 
 from __future__ import annotations
 
+import os
 import time as clock
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -22,22 +23,25 @@ from .ending import Ending
 from .interruption import Interruption
 from .pass_sizes import PassSizes
 from .rendering import Progressive, TotalStatistics
+from .scene_files import SceneFile
+
+LIMITS = ("spp", "time")  # end a render regardless of its error
 
 
 @dataclass
 class Took:
     """Cost of an image.
 
-    `spp`: samples per pixel; `passes`: how many, each with a seed of its own; `seconds`: wall-clock time of the call,
-    with compilation and denoising; `error`: the relative standard error that 95% of the pixels do not exceed, as
-    estimated (see convergence.py), of the image before it was denoised, None if there were fewer than two passes;
-    `statistics`: the integrator's counters, added up over passes; `ended_by`: "spp", "time" or "error", whichever was
-    reached, "interruption" (Ctrl-C, or the integrator's `cancel`) or "progress"; None while it goes on; `channels`:
-    names of the image's channels; `denoise_seconds`: those of `seconds` that denoising took; `raw`: the image before it
-    was denoised (`mi.TensorXf`), None if it was not.
+    `spp`: samples per pixel; `passes`: number of passes, each with its own seed; `seconds`: wall-clock time of the
+    call, including compilation and denoising; `error`: estimated relative standard error that 95% of the pixels do not
+    exceed (see convergence.py), before denoising, None for fewer than two passes; `statistics`: counters of the
+    integrator, summed over passes; `ended_by`: the limit that was reached ("spp", "time" or "error"), "interruption"
+    (Ctrl-C, or `cancel` of the integrator) or "progress", None during the render; `channels`: names of the channels;
+    `denoise_seconds`: the part of `seconds` for denoising; `raw`: the image before denoising (`mi.TensorXf`), None
+    without denoising.
 
-    Of a render that goes on: `stage`, that which a pass is in, as `statistics["seconds"]` has it, None between passes;
-    `seconds_left` until the end, as expected of the passes so far, None where that is not known.
+    During a render: `stage`: current stage of the pass, a key of `statistics["seconds"]`, None between passes;
+    `seconds_left`: expected seconds until the end, None if unknown.
     """
 
     spp: int
@@ -54,7 +58,7 @@ class Took:
 
 
 def render(
-    scene: mi.Scene,
+    scene: mi.Scene | str | os.PathLike[str],
     integrator: mi.Integrator | str | None = None,
     sensor: int | str = 0,
     *,
@@ -68,26 +72,28 @@ def render(
     checkpoint: Checkpoint | None = None,
 ) -> tuple[mi.TensorXf, Took]:
     """Render a scene in passes of about two seconds, or ten with `manylights`; return the image, a `mi.TensorXf` of
-    shape (height, width, channels) as of `mi.render`, and what it took (`Took`).
+    shape (height, width, channels) as of `mi.render`, and the cost (`Took`).
 
-    `integrator`: a `mi.Integrator` or the name of one, by default the scene's; `sensor`: its index, or "all" for a list
-    of what is returned for each sensor, one after the other. The render ends as soon as one of these is reached, of
-    which any may be given: `error`, the relative standard error that 95% of the pixels are to be below; `time`, in
-    seconds, compilation included; `spp`, samples per pixel (if none is given, the scene's). There is always one pass.
-    `seed`: of the first pass; the others have hashes of it. `denoise`: return the denoised image, see denoising.py.
-    `progress`: called after each pass with what it took so far and the image so far, and, by the integrators of this
-    project, whenever a stage of a pass begins, with None for an image; if it returns False, no other pass begins, and
-    what it raises ends the render at once. `pass_spp`: samples per pixel of a pass, instead of some seconds.
-    `checkpoint`: a `checkpoint.Checkpoint` that the render of one sensor goes on from, counting its samples and
-    seconds; it is kept for another one to go on from, unless this one ends by what was asked for.
+    `scene`: a `mi.Scene`, or the path of a scene file. `integrator`: a `mi.Integrator` or the name of a plugin, by
+    default the scene's. `sensor`: an index, or "all" for a list of (image, cost) over all sensors. The first limit that
+    is reached ends the render: `error`, the relative standard error that 95% of the pixels do not exceed; `time`, in
+    seconds, compilation included; `spp`, samples per pixel. The default is the scene's samples per pixel. There
+    is at least one pass. The log has a warning if `spp` or `time` ends a render above its `error`. `seed`: of the first
+    pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py).
+    `progress`: called after each pass with the cost and the image so far; integrators of this project also call it at
+    the start of each stage of a pass, with None for the image. If it returns False, no other pass begins; an exception
+    ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a `checkpoint.Checkpoint` of the
+    same render with one sensor, whose samples and seconds count; it is kept unless a limit ends the render.
 
-    After Ctrl-C, or `cancel()` of the integrator, the image of the finished passes is returned. Where there are none,
-    KeyboardInterrupt is raised, or RuntimeError after `cancel()`; and KeyboardInterrupt by a second Ctrl-C.
+    Ctrl-C, or `cancel()` of the integrator, returns the image of the finished passes. Without a finished pass Ctrl-C
+    raises KeyboardInterrupt and `cancel()` RuntimeError. A second Ctrl-C raises KeyboardInterrupt.
 
-    Raises ValueError for values that are not positive, for a sensor that does not exist, and for a scene without an
-    integrator if none is given; ModuleNotFoundError for `denoise` without the package that it needs; RuntimeError where
-    another thread renders with the same sensor.
+    Raises ValueError for limits that are not positive, for a sensor that does not exist, for a scene without an
+    integrator, and for a participating medium that the integrator does not support; FileNotFoundError for a missing
+    scene file; ModuleNotFoundError if the package for `denoise` is missing; RuntimeError if another thread renders with
+    the same sensor, or if no variant is set.
     """
+    scene = _scene(scene)
     integrator = _integrator(scene, integrator)
     if sensor == ALL:
         if checkpoint:
@@ -117,7 +123,7 @@ def render(
 
 
 def _render_all(scene, integrator, **limits):
-    """Return what `render` returns for each sensor; none follows one that somebody ended early."""
+    """Return a list of the results of `render` for each sensor, up to the first that was ended early."""
     found = []
     for sensor in range(len(scene.sensors())):
         found.append(render(scene, integrator, sensor, **limits))
@@ -127,11 +133,11 @@ def _render_all(scene, integrator, **limits):
 
 
 def render_passes(progressive, sizes, ending, begin, progress=None, denoiser=None, checkpoint=None):
-    """Render passes until something ends it; return the image and what it took, as `render`.
+    """Render passes until the end of the render; return the image and the cost, as `render` does.
 
-    `progressive` makes and adds up the passes (`rendering.Progressive`, or `cluster.passes.DistributedPasses`), and may
-    have some from the checkpoint; `sizes` says how large they are (`PassSizes`), `ending` what ends them (`Ending`);
-    `begin` is when the render began (of `perf_counter`), earlier by what the passes of the checkpoint took.
+    `progressive`: renders and adds passes (`rendering.Progressive` or `cluster.passes.DistributedPasses`), and may have
+    passes of the checkpoint; `sizes`: the `PassSizes`; `ending`: the limits (`Ending`); `begin`: start of the render by
+    `perf_counter`, less the seconds of the checkpoint.
     """
     running = _Render(progressive, ending, begin, progress, checkpoint)
     with Interruption() as interruption:
@@ -142,7 +148,7 @@ def render_passes(progressive, sizes, ending, begin, progress=None, denoiser=Non
 
 
 def check(**values):
-    """Raise ValueError for limits of a render, given by name (None: not given), that are not positive."""
+    """Raise ValueError for limits of a render, by name, that are neither positive nor None."""
     for name, value in values.items():
         if value is None:
             continue
@@ -151,20 +157,36 @@ def check(**values):
             raise ValueError(f"{name} must be a positive {'whole ' if whole else ''}number, got {value!r}")
 
 
+def _scene(scene):
+    """Return a `mi.Scene`, which is loaded if `scene` is the path of a scene file."""
+    if mi.variant() is None:
+        raise RuntimeError('no variant is set: call mi.set_variant("llvm_ad_rgb"), or with another variant, first')
+    if isinstance(scene, mi.Scene):
+        return scene
+    if not isinstance(scene, str | os.PathLike):
+        raise TypeError(f"scene must be a mi.Scene or the path of a scene file, got {scene!r}")
+    if not os.path.isfile(scene):
+        raise FileNotFoundError(f"no scene file '{os.fspath(scene)}'")
+    return SceneFile(scene).load()
+
+
 def _integrator(scene, integrator):
-    """Return the integrator of that name, or the one given, or the scene's."""
+    """Return the given integrator, the plugin of the given name, or by default the scene's integrator. Raises
+    ValueError if there is none, and for a scene that the integrator does not support."""
     if isinstance(integrator, str):
         import integrators  # noqa: F401 (registers plugins; needs a variant)
 
-        return mi.load_dict({"type": integrator})
+        integrator = mi.load_dict({"type": integrator})
     integrator = integrator or scene.integrator()
     if integrator is None:
         raise ValueError("the scene has no integrator; give one")
+    if hasattr(integrator, "check_scene"):
+        integrator.check_scene(scene)
     return integrator
 
 
 class _Render:
-    """A render that began at a time (of `perf_counter`): its passes, and what ended it."""
+    """A render that began at the time `begin` (of `perf_counter`): passes, and the reason for the end."""
 
     def __init__(self, progressive, ending, begin, progress, checkpoint):
         self.progressive, self._ending, self._begin, self._progress = progressive, ending, begin, progress
@@ -175,11 +197,11 @@ class _Render:
             ending.goal.resume(progressive.passes)
 
     def run(self, sizes, interruption):
-        """Render passes until something ends it; leave a checkpoint unless nothing is missing."""
+        """Render passes until the end; leave a checkpoint of an unfinished render."""
         try:
             self._run(sizes, interruption)
         finally:
-            if self._checkpoint and self._ended_by in ("spp", "time", "error"):
+            if self._checkpoint and self._ended_by in (*LIMITS, "error"):
                 self._checkpoint.remove()
             elif self._checkpoint:
                 self._checkpoint.leave()
@@ -202,20 +224,20 @@ class _Render:
                 self._ended_by = "time" if self.progressive.is_late() else "interruption"
 
     def _pass(self, size, interrupted):
-        """Render a pass and return it, None if it is not to be counted."""
+        """Render a pass and return it, None after an interruption."""
         try:
             with listening(self._listener()) if self._progress else nullcontext():
-                # Mitsuba, too, hears Ctrl-C, and stops: then the pass may be unfinished.
+                # Ctrl-C also stops Mitsuba, so that the pass may be unfinished
                 return self.progressive.render(size, accept=lambda: not interrupted())
         except BaseException as error:
-            # Mitsuba and Dr.Jit make other errors of what is raised below them
+            # Mitsuba and Dr.Jit replace exceptions that they pass on
             if self._raised is not None:
                 raise self._raised from None
             if not isinstance(error, KeyboardInterrupt):
                 raise
 
     def _listener(self):
-        """Return what is to be called with the stages of the next pass."""
+        """Return the listener for the stages of the next pass."""
         before = self._took()
 
         def begins(stage):
@@ -230,12 +252,12 @@ class _Render:
         return begins
 
     def _tell(self, took, image):
-        """Tell how far it is."""
+        """Call `progress`, which may end the render."""
         if self._progress(took, image) is False:
             self._ended_by = self._ended_by or "progress"
 
     def _look(self):
-        """See whether the last pass was enough, and tell how far it is."""
+        """Estimate the error after a pass if an estimate is due, and call `progress`."""
         spp, goal = self.progressive.spp, self._ending.goal
         self._ending.mark(spp, self._elapsed())
         if self._checkpoint:
@@ -249,9 +271,11 @@ class _Render:
             self._tell(self._took(), self._image())
 
     def result(self, denoiser):
-        """Return the image and what it took."""
+        """Return the image and the cost; warn if the error was not reached."""
         if self._ended_by != "error":
             self._error = self.progressive.estimate.relative()
+        if self._ended_by in LIMITS and self._ending.goal:
+            self._ending.goal.warn_if_missed(self._error, self._ended_by)
         image, took = self._image(), self._took()
         if denoiser:
             image, took.raw = denoiser.denoise(image, took.channels), image
@@ -275,4 +299,4 @@ class _Render:
 
 
 class _Refused(BaseException):
-    """Goes in the place of what a callback raised, past all that tells of an `Exception` on its way."""
+    """Replaces the exception of a callback on the way through code that would log an `Exception`."""

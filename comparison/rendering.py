@@ -1,4 +1,4 @@
-"""Progressive rendering: passes of different seeds and their average."""
+"""Progressive rendering: passes with different seeds, and their average."""
 
 import time
 from contextlib import contextmanager
@@ -12,13 +12,13 @@ import numpy as np
 from .convergence import ErrorEstimate
 from .images import colour
 
-MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of one pass: it bounds memory, and the wait for the first image
-MORE_IN_PARTS = 4  # times as many has a pass that is rendered in parts
+MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the time to the first image
+MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
 
 
 def pass_seed(seed, index):
-    """Return the seed of pass `index` of a render with seed `seed`: the seed itself for pass 0, so that a render of one
-    pass is `mi.render(scene, seed=seed)`, and otherwise a hash of both (32 bits)."""
+    """Return the seed of pass `index` of a render: `seed` for pass 0, so that a single pass is equal to
+    `mi.render(scene, seed=seed)`, and a 32-bit hash of `seed` and `index` for later passes."""
     if index == 0:
         return seed
     return int(np.random.SeedSequence((seed, index)).generate_state(1)[0])
@@ -31,14 +31,14 @@ def pass_sizes(spp, size):
 
 
 def largest_pass(pixels, in_parts=False):
-    """Return how many samples per pixel, at least one, make up to `MAXIMUM_PASS_SAMPLES` samples in all pixels, or
-    `MORE_IN_PARTS` times as many."""
+    """Return the maximum samples per pixel of a pass, at least 1: up to `MAXIMUM_PASS_SAMPLES` samples over all pixels,
+    or `MORE_IN_PARTS` times as many for a pass in parts."""
     return max(1, (MORE_IN_PARTS if in_parts else 1) * MAXIMUM_PASS_SAMPLES // pixels)
 
 
 @dataclass
 class Pass:
-    """One finished pass: its seed, samples per pixel, wall-clock seconds, and what the integrator counted."""
+    """A finished pass: seed, samples per pixel, wall-clock seconds, and counters of the integrator."""
 
     seed: int
     spp: int
@@ -48,8 +48,8 @@ class Pass:
 
 @dataclass
 class PassImage:
-    """Image of one pass: `planes`, (height, width, channels) float32, the average of its samples; the names of its
-    `channels`; and the `Pass` itself, `taken`."""
+    """Image of a pass. `planes`: average of the samples, (height, width, channels) float32; `channels`: names; `taken`:
+    the `Pass`."""
 
     planes: np.ndarray
     channels: list
@@ -57,17 +57,17 @@ class PassImage:
 
 
 def render_pass(scene, sensor, integrator, spp, seed):
-    """Render a pass of `spp` samples per pixel (samplers with strata round them up) and return it, a `PassImage`.
-    `sensor` is its index."""
+    """Render a pass of `spp` samples per pixel, which stratified samplers round up; return a `PassImage`. `sensor` is
+    an index."""
     sensor = scene.sensors()[sensor]
-    # Asked before the render: some integrators, such as `prb`, sample with a clone
+    # Set before the render, as integrators such as `prb` clone the sampler
     with _sample_count(sensor.sampler(), spp) as spp:
         begin = time.perf_counter()
         image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
         dr.eval(image)
         dr.sync_thread()
         seconds = time.perf_counter() - begin
-    # Not the image that `mi.render` returned: it lacks channels of nested integrators, and names.
+    # The film, as the image of `mi.render` lacks names, and channels of nested integrators
     bitmap = sensor.film().bitmap()
     channels = [entry.name for entry in bitmap.struct_()]
     planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
@@ -76,10 +76,10 @@ def render_pass(scene, sensor, integrator, spp, seed):
 
 
 class Passes:
-    """The running average of passes with a common seed, weighted by their samples per pixel.
+    """Running average of the passes of a render, weighted by samples per pixel.
 
-    It depends on the passes and their order alone. `channels` are the names of the image's channels ("R", "G", "B", and
-    those of AOVs), known after the first pass; `passes` is the list of them (`Pass`), `estimate` their `ErrorEstimate`.
+    The average depends only on the passes and their order. `channels`: names of the channels ("R", "G", "B", AOVs),
+    empty before the first pass; `passes`: a list of `Pass`; `estimate`: the `ErrorEstimate` of the passes.
     """
 
     def __init__(self, seed):
@@ -87,12 +87,12 @@ class Passes:
         self.restart()
 
     def restart(self):
-        """Forget all passes."""
+        """Remove all passes."""
         self.passes, self.channels, self.sum, self.estimate = [], [], 0.0, ErrorEstimate()
 
     def add(self, image):
         """Add a `PassImage`, and return its `Pass`."""
-        # In double precision, as a long sum of floats would drift.
+        # In double precision, as long sums of single-precision numbers drift
         planes, one = image.planes.astype(np.float64), image.taken
         self.channels = image.channels
         self.sum = self.sum + one.spp * planes
@@ -107,7 +107,7 @@ class Passes:
 
     @property
     def seconds(self):
-        """Wall-clock seconds of all passes, each by itself."""
+        """Sum of the wall-clock seconds of all passes."""
         return sum(one.seconds for one in self.passes)
 
     @property
@@ -117,8 +117,7 @@ class Passes:
 
 
 class Progressive(Passes):
-    """The running average of passes of one scene that this process renders. `integrator` is the scene's unless another
-    one is given."""
+    """Running average of passes in this process. `integrator` is by default the scene's."""
 
     def __init__(self, scene, seed, sensor=0, integrator=None):
         super().__init__(seed)
@@ -126,31 +125,31 @@ class Progressive(Passes):
         self.integrator = integrator or scene.integrator()
 
     def render(self, spp, seed=None, accept=lambda: True):
-        """Render one more pass of `spp` samples per pixel and return it (a `Pass`).
+        """Render and add a pass of `spp` samples per pixel; return the `Pass`.
 
-        Its seed is `pass_seed(seed of the render, number of the pass)` unless `seed` is given. A pass that raises
-        leaves the average as it was, and so does one that `accept` refuses when it is finished (None is returned).
+        The default `seed` is `pass_seed(seed of the render, index of the pass)`. If the pass raises an exception, or
+        `accept` returns False afterwards (the result is then None), the average does not change.
         """
         seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
         image = render_pass(self._scene, self._sensor, self.integrator, spp, seed)
         return self.add(image) if accept() else None
 
     def should_stop(self):
-        """Was the integrator's `cancel` called?"""
+        """Return whether the integrator's `cancel` was called."""
         return self.integrator.should_stop()
 
     def is_late(self):
-        """Was there no time for a pass? It is not for this one to know."""
+        """Return False: passes in this process are never refused for lack of time."""
         return False
 
     @property
     def in_parts(self):
-        """Is a pass rendered in parts, between which it can be stopped, and with little memory for each sample?"""
+        """Whether passes are rendered in parts: a pass can stop between parts, and needs little memory per sample."""
         return getattr(self.integrator, "renders_in_parts", False)
 
     @property
     def largest_pass(self):
-        """Most samples per pixel of a pass."""
+        """Maximum samples per pixel of a pass."""
         return largest_pass(self.pixels, self.in_parts)
 
     @property
@@ -161,7 +160,7 @@ class Progressive(Passes):
 
 @contextmanager
 def _sample_count(sampler, spp):
-    """Set the samples per pixel of a sampler for the time of the block, which is given what it rounds them up to."""
+    """Set the samples per pixel of a sampler within the block; yield the number after rounding by the sampler."""
     own = sampler.sample_count()
     sampler.set_sample_count(spp)
     try:
@@ -171,7 +170,7 @@ def _sample_count(sampler, spp):
 
 
 def _shown(planes, channels):
-    """Return the colour of an image, or all of it where its film has other channels."""
+    """Return the colour of an image, or all channels if the film has no colour."""
     try:
         return colour(planes, channels)
     except ValueError:
@@ -179,22 +178,22 @@ def _shown(planes, channels):
 
 
 def total_statistics(passes):
-    """Add up the integrators' counters over passes: see `TotalStatistics`."""
+    """Return the sum of the integrators' counters over passes (see `TotalStatistics`)."""
     return TotalStatistics().of(passes)
 
 
 class TotalStatistics:
-    """The integrators' counters, added up over passes as these come.
+    """Sum of the integrators' counters over passes.
 
-    Numbers are summed, nested dicts (such as "seconds") likewise. What describes a pass, as text (such as "balance")
-    and "lights" do, is that of the pass with the most samples, the last of these if there are several.
+    Numbers are summed, also in nested dicts ("seconds"). Descriptions, such as the text "balance" and the dict
+    "lights", come from the pass with the most samples, the last of equal passes.
     """
 
     def __init__(self):
         self._total, self._count, self._most = {}, 0, 0
 
     def of(self, passes):
-        """Return the total of a list of passes, {} if they counted nothing. It begins with those of the last call."""
+        """Return the total of a list of passes that begins with the list of the last call; {} without counters."""
         for one in passes[self._count :]:
             _add(self._total, one.statistics, describe=one.spp >= self._most)
             self._most = max(self._most, one.spp)

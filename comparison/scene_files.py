@@ -15,6 +15,10 @@ import mitsuba as mi
 _OF_CAMERA = ("Sensor", "Film", "Sampler", "ReconstructionFilter")
 # Parameters that a new integrator inherits: they select light paths, not an algorithm
 KEPT_PARAMETERS = ("max_depth", "rr_depth", "hide_emitters")
+# Names of string properties that plugins of Mitsuba 3.9 open as files: bitmap, envmap, gridvolume, measured,
+# measured_polarized, obj, ply, serialized, sdfgrid, bsplinecurve, linearcurve, ellipsoids and ellipsoidsmesh. None has
+# another such property; those of sunsky are part of Mitsuba.
+FILE_PROPERTIES = ("filename",)
 GIVEN_TO_RENDER = ("sample_count", "seed")  # sampler parameters overridden by each render
 
 
@@ -35,6 +39,8 @@ class SceneFile:
         self.path, self.defines, self.changes = Path(path), dict(defines or {}), []
         self._configuration = mi.parser.ParserConfig(mi.variant())
         self._state = mi.parser.parse_file(self._configuration, str(path), **self.defines)
+        self._resolver = mi.FileResolver(mi.file_resolver())  # which has the folders of <path> elements now
+        self._resolver.prepend(str(self.path.parent))
         if not self._nodes(mi.ObjectType.Sensor):
             raise ValueError(f"{path}: the scene has no sensor")
         for method, arguments in changes:
@@ -129,20 +135,17 @@ class SceneFile:
                     if name in properties:
                         del properties[name]
             digest.update(repr(properties).encode())
-            for _, file in self._named(node):
+            for file in self._named(node):
                 digest.update(hashlib.sha256(file.read_bytes()).digest())
         return digest.hexdigest()
 
-    def files(self):
-        """Return the files referenced by objects: path text (absolute or relative to the scene's folder) -> path."""
-        return {name: file for node in self._state.nodes for name, file in self._named(node)}
-
     def _named(self, node):
-        """Yield (path text, path) of the files referenced by an object."""
-        for _, value in mi.Properties(node.props).items():
-            file = self.path.parent / value if isinstance(value, str) and value else None
-            if file is not None and file.is_file():
-                yield value, file
+        """Yield the paths of the files that an object names."""
+        properties = mi.Properties(node.props)
+        for name in FILE_PROPERTIES:
+            file = Path(str(self._resolver.resolve(properties[name]))) if name in properties else None
+            if file and file.is_file():
+                yield file
 
     def sampling(self, sensor):
         """Return the number of pixels and the `mi.Sampler` of a sensor (by index) without creating the scene. Raises

@@ -1,4 +1,4 @@
-"""The base class of all integrators: camera rays in, radiance out; what lights the gather points is left open."""
+"""Base class of all integrators: radiance of camera rays, with the lighting of gather points left to subclasses."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from vpl.points.camera_paths import CameraPaths, PixelGrid, SceneTraits, follow_
 from . import VARIANTS
 from .knobs import PATH_KNOBS, Integer, read_knobs, show_knobs
 
-# Of Mitsuba, whose own constructor does not show what it has read
+# A property of Mitsuba's integrators, whose value Mitsuba does not expose
 _SAMPLES_PER_PASS = Integer("samples_per_pass", 2**32 - 1, "Most samples of a pixel in a pass.", minimum=1)
 
 
 def whole_sum(values) -> int:
-    """Sum of a counter over all points (None: nothing was counted); shares of a count add up to whole numbers."""
+    """Sum of a counter over all points, rounded, as points may hold fractions of a count; 0 for None."""
     return 0 if values is None else round(float(download(values).sum(dtype="float64")))
 
 
 def add_statistics(totals: dict, more: dict) -> None:
-    """Add counters to counters of the same name, and dictionaries of them."""
+    """Add the counters in ``more`` to those in ``totals`` by name, recursively for dictionaries."""
     for name, value in more.items():
         if isinstance(value, dict):
             add_statistics(totals.setdefault(name, {}), value)
@@ -40,10 +40,11 @@ def add_statistics(totals: dict, more: dict) -> None:
 
 
 def _hear_interruptions() -> None:
-    """Give Ctrl-C back to Python, before Mitsuba's own ``render`` takes it for its time.
+    """Restore Python's handler of Ctrl-C before Mitsuba's ``render`` installs its own.
 
-    It calls the ``render`` that is overridden here once more, which calls it once more.  Without this, that second call
-    would find the handler of the first and leave it behind: the next Ctrl-C would call an integrator that is gone.
+    Mitsuba's ``render`` calls the Python override, which calls Mitsuba's ``render`` a second time.  The second call
+    would take the handler of the first for Python's and leave it installed: the next Ctrl-C would then call an
+    integrator that no longer exists.
     """
     handler = signal.getsignal(signal.SIGINT)
     if handler is not None and threading.current_thread() is threading.main_thread():
@@ -52,66 +53,70 @@ def _hear_interruptions() -> None:
 
 @dataclass
 class CameraPass:
-    """Result of following the camera rays of one pass, with which every render begins.
+    """Camera rays of a pass, followed to their gather points: the first step of a render.
 
     ``seed``: drawn from the sampler; ``emitters``, ``traits``: of the scene; ``paths``: of the camera rays;
-    ``valid``: rays that are opaque in the film's alpha, where an environment counts, as in ``path``.
+    ``valid``: whether a ray is opaque in the film's alpha, where an environment counts, as in ``path``.
     """
 
     seed: int
     emitters: Emitters
     traits: SceneTraits
     paths: CameraPaths
-    valid: object
+    valid: mi.Bool
     clock: Clock
 
     @property
     def dark(self) -> bool:
-        """Whether there is nothing to light, or nothing to light it with."""
+        """Whether the pass has no gather points, or the scene no emitters."""
         return self.paths.points.count == 0 or self.emitters.count == 0
 
 
 class GatheringIntegrator(mi.SamplingIntegrator):
-    """Base class: follows camera rays to gather points, asks ``light`` for their radiance, and sums up.
+    """Base class: follows camera rays to gather points, and sums the radiance that ``light`` returns for them.
 
-    Lights belong to one call of ``sample``, unless ``manylights`` is told to keep them: a scene that was edited in
-    between is never lit by the lights of the old one, and each pass of a render with several passes gets new ones.
-    Seeds are drawn from the sampler, so that wrappers such as ``moment`` and ``aov``, which only call ``sample``, work
-    like ``mi.render``.
+    Each call of ``sample`` makes new virtual lights, except with ``keep_lights`` of ``manylights``: an edited scene
+    never has the lights of its earlier state, and every pass of a render has its own lights.  Seeds are drawn from the
+    sampler, for the benefit of wrappers that only call ``sample`` (``moment``, ``aov``).
     """
 
-    aovs: tuple[str, ...] = ()  # channels that are asked for, where derived classes have a knob of that name
-    along_curve = True  # whether gather points are sorted by their place
-    # Whether images are rendered in parts, stop in between, and take little memory for more samples (50 bytes each)
+    aovs: tuple[str, ...] = ()  # requested channels, for subclasses with a property of that name
+    along_curve = True  # whether gather points are sorted along a space-filling curve
+    # Whether a pass is rendered in parts: it can stop between them, and needs little memory (50 bytes a sample)
     renders_in_parts = False
     knobs = PATH_KNOBS
 
     def __init__(self, props):
         if mi.variant() not in VARIANTS:
+            available = ", ".join(variant for variant in VARIANTS if variant in mi.variants())
             raise RuntimeError(
                 f'the integrator "{props.plugin_name()}" does not support the variant "{mi.variant()}": choose one of '
-                f"{', '.join(VARIANTS)}"
+                f"{available}, or an integrator of Mitsuba, such as path"
             )
         super().__init__(props)
         read_knobs(self, props)
         self.samples_per_pass = _SAMPLES_PER_PASS.read(self, props)
         self.statistics: dict = {}
-        # Whose rays `sample` gets, while this integrator and no wrapper renders
+        # The sensor of the rays in `sample`; None below a wrapper
         self._sensor = None
 
     def light(self, scene, sampler, camera: CameraPass):
-        """Light the gather points of ``camera.paths``: (radiance, {channel: values}, {name: statistic}).
+        """Radiance of the gather points of ``camera.paths``: (radiance, {channel: values}, {name: statistic}).
 
-        All per gather point; a channel that nobody offers is not shown.
+        Radiance and channels have a value per gather point.  Channels that were not requested are ignored.
         """
         raise NotImplementedError
 
+    def check_scene(self, scene):
+        """Raise ValueError for a scene with a participating medium."""
+        refuse_media(scene)
+
     def aov_names(self):
-        """Channels that ``sample`` returns besides the radiance."""
+        """Names of the channels that ``sample`` returns in addition to the radiance."""
         return list(self.aovs)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        """Render as Mitsuba does; a RuntimeError where another thread uses the sensor, its film and its sampler."""
+        """Render as Mitsuba does.  Raises RuntimeError while another thread renders with the same sensor."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         _hear_interruptions()
         with exclusive(sensor=sensor, integrator=self):
@@ -122,27 +127,32 @@ class GatheringIntegrator(mi.SamplingIntegrator):
                 self._sensor = outer
 
     def _render(self, *arguments):
-        """What ``render`` does with its arguments."""
+        """Render, with exclusive use of the sensor and the integrator."""
         return super().render(*arguments)
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """Radiance along camera rays; see ``mi.SamplingIntegrator.sample`` for this interface."""
+        """Radiance along camera rays; the interface is that of ``mi.SamplingIntegrator.sample``."""
         with exclusive(sampler=sampler, integrator=self), dr.suspend_grad():
             try:
                 if medium is not None:
                     raise ValueError(
                         "the camera is inside a participating medium; many-light integrators support surfaces only"
                     )
-                refuse_media(scene)
+                if dr.flag(dr.JitFlag.FreezingScope):
+                    raise RuntimeError(
+                        f"{type(self).__name__} cannot be recorded by dr.freeze, as it reads results of kernels while "
+                        "it renders: call mi.render outside of frozen functions"
+                    )
+                self.check_scene(scene)
                 share_code(scene)
                 return self._sample(scene, sampler, mi.Ray3f(ray), active)
             except Exception as error:
-                # Out of `mi.render` comes another one, which only says that something went wrong
+                # Logged, as `mi.render` raises a general error with this error as the cause
                 mi.Log(mi.LogLevel.Warn, f"{type(self).__name__}: {error}")
                 raise
 
     def _sample(self, scene, sampler, ray, active):
-        """What ``sample`` returns."""
+        """Result of ``sample``, with exclusive use of the sampler and the integrator."""
         camera = self.begin(scene, sampler, ray, active)
         radiance, channels, found = self.light(scene, sampler, camera)
         image, counters = self._assemble(camera, radiance, channels, found)
@@ -150,7 +160,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         return dr.select(finite, mi.Spectrum(image), 0), camera.valid, counters
 
     def begin(self, scene, sampler, ray, active=True) -> CameraPass:
-        """Emitters and camera paths."""
+        """Read the emitters, and follow the camera rays."""
         clock = Clock(Stage.SCENE)
         seed = int(dr.reinterpret_array(mi.UInt32, dr.detach(sampler.next_1d()))[0])
         emitters, traits = read_emitters(scene), scene_traits(scene)
@@ -168,9 +178,8 @@ class GatheringIntegrator(mi.SamplingIntegrator):
     def pixel_grid(self, scene, sampler) -> PixelGrid:
         """Layout of the camera rays of this pass in the image.
 
-        Mitsuba puts the rays of a pixel next to each other. Whose they are is not known below a wrapper, which may
-        render in passes of its own, too: where no sensor of the scene has as many pixels as there would have to be,
-        every ray counts as a pixel, eight to a row.
+        Mitsuba stores the rays of a pixel in sequence.  Below a wrapper, which may also render in passes, the sensor is
+        unknown.  If no sensor of the scene fits the number of rays, every ray counts as a pixel, in rows of eight.
         """
         samples = min(sampler.sample_count(), self.samples_per_pass)
         for sensor in [self._sensor] if self._sensor else scene.sensors():
@@ -182,7 +191,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         return PixelGrid(8, 1, known=samples == 1)
 
     def _assemble(self, camera: CameraPass, radiance, channels: dict, found: dict):
-        """Bring what gather points found to their camera rays: (radiance, requested channels); fills ``statistics``."""
+        """Sum values of gather points to camera rays: (radiance, requested channels).  Sets ``statistics``."""
         points = camera.paths.points
         image, bad_samples = mi.UnpolarizedSpectrum(camera.paths.emission), 0
         counters = [dr.zeros(mi.Float, dr.width(camera.paths.valid)) for _ in self.aovs]
@@ -206,9 +215,9 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         return show_knobs(self)
 
     def render_forward(self, *args, **kwargs):
-        """Not supported: what is sampled is chosen by what was seen, which is not continuous."""
+        """Not supported: the choice of samples depends on earlier results, discontinuously."""
         raise NotImplementedError(f"{type(self).__name__} cannot be differentiated: use Mitsuba's prb integrators.")
 
     def render_backward(self, *args, **kwargs):
-        """Not supported: what is sampled is chosen by what was seen, which is not continuous."""
+        """Not supported: the choice of samples depends on earlier results, discontinuously."""
         raise NotImplementedError(f"{type(self).__name__} cannot be differentiated: use Mitsuba's prb integrators.")

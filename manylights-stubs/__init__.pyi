@@ -1,5 +1,6 @@
 from collections.abc import Sequence
 
+from comparison.images import write as write
 from comparison.render import Took as Took
 from comparison.render import render as render
 

@@ -1,10 +1,12 @@
-"""Passes of one image, many images and comparisons on several processes or machines, by `dask.distributed`.
+"""Passes of images, and runs of comparisons, on several processes or machines, by `dask.distributed`.
 
-``compatibility``   which workers may take part: what must be the same as here, and what is only noted
-``scene_travel``    scenes as files with their hashes, and how a worker gets those that it lacks
-``worker``          what runs on a worker, which keeps scenes and compiled kernels between passes
-``pool``            the workers that there are, two tasks for each, and what becomes of the tasks of one that dies
-``passes``          the passes of an image, added up in the order of their seeds
+``compatibility``   admission of workers: properties that must be equal, and properties with a warning
+``scene_names``     files that a scene names
+``scene_travel``    scenes as files with hashes, and their transfer to workers
+``worker``          code on a worker, which keeps scenes and compiled kernels between passes
+``pool``            available workers, two tasks for each, and the reassignment of lost tasks
+``passes``          the passes of an image, summed in the order of their seeds
+``render``          an image in passes on workers
 ``runs``            the runs of a comparison
-``connection``      worker processes of our own, or a scheduler on the network
+``connection``      local worker processes, or a scheduler on the network
 """

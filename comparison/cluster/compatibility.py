@@ -1,9 +1,9 @@
-"""Which workers may take part in a render.
+"""Admission of workers to a render.
 
-A pass must be the pass that any other worker would have made, but for the rounding of its sums. Python sources of this
-project, Mitsuba and Dr.Jit decide what is computed, and dask.distributed what is understood: a worker with others is
-refused. NumPy, Python, LLVM and the processor (whose vectors may be longer) decide in which order numbers are added: a
-worker with others takes part, with a note.
+A pass must be equal on all workers except for rounding. The sources of this project, Mitsuba and Dr.Jit determine the
+computation, and dask.distributed the protocol: a worker with a different version is refused. NumPy, Python, LLVM and
+the processor, with its vector width, determine the order of summation: a worker with a different version takes part,
+with a warning.
 """
 
 import platform
@@ -19,7 +19,7 @@ ARE_NOTED = ("numpy", "python", "llvm", "processor")
 
 
 def identity():
-    """Return what is compared, name -> text, of this process."""
+    """Return the compared properties of this process, a dict from name to text."""
     found = machine.versions() | {
         "sources": machine.sources(SOURCES),
         "distributed": metadata.version("distributed"),
@@ -31,8 +31,8 @@ def identity():
 
 
 def judge(own, other):
-    """Compare the identity of a worker, `other`, with this process's. Return why it is refused (None if it is not) and
-    what is noted (None if there is nothing)."""
+    """Compare the identity of a worker, `other`, with that of this process. Return the reason for a refusal and the
+    text of a warning, each None if there is none."""
     refused, noted = (_differences(names, own, other) for names in (MUST_BE_EQUAL, ARE_NOTED))
     return refused, noted
 

@@ -1,4 +1,4 @@
-"""Workers: processes of our own on this machine, or those of a scheduler on the network."""
+"""Workers: local processes, or the workers of a scheduler on the network."""
 
 import argparse
 import logging
@@ -14,7 +14,7 @@ MOST_LOCAL = 256
 
 
 def workers(text):
-    """Convert what `--workers` is given: a number of local processes (int), or the address of a scheduler (text); an
+    """Convert the value of `--workers` to a number of local processes (int) or the address of a scheduler (str); an
     argparse type."""
     if re.fullmatch(r"(tcp|tls|ws|wss|ucx)://.+:\d+", text):
         return text
@@ -27,7 +27,7 @@ def workers(text):
 
 
 def import_dask():
-    """Import and return `distributed`; raises UsageError where it is missing."""
+    """Import and return `distributed`; raises UsageError if it is missing."""
     try:
         import distributed
     except ModuleNotFoundError as error:
@@ -39,13 +39,13 @@ def import_dask():
 
 @contextmanager
 def connected(wanted, threads=None):
-    """Give a `Pool` of workers in the block: `wanted` is what `workers` returned. Local processes share `threads`, by
-    default all cores, and end with the block; those of a scheduler have `threads` each, by default all of their cores.
-    Raises UsageError where there is no scheduler of that address."""
+    """Yield a `Pool` of workers; `wanted` is a result of `workers`. Local processes share `threads` (default: all
+    cores) and end with the block. Workers of a scheduler have `threads` each (default: all cores of their machine).
+    Raises UsageError if no scheduler answers."""
     distributed = import_dask()
     from .pool import Pool
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # of what becomes of workers, we tell
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # `Pool` logs the fate of workers
     with ExitStack() as stack:
         address = wanted
         if isinstance(wanted, int):
@@ -54,14 +54,14 @@ def connected(wanted, threads=None):
             pool = Pool(lambda: distributed.Client(address, timeout=CONNECT_SECONDS), threads)
         except OSError as error:
             raise UsageError(f"--workers: no scheduler answers at {address} ({error})") from None
-        except TypeError as error:  # of Dask's, where its settings name no certificate
+        except TypeError as error:  # Dask's settings name no certificate
             raise UsageError(f"--workers: {address} needs Dask's settings for TLS ({error})") from None
         yield stack.enter_context(closing(pool))
 
 
 @contextmanager
 def _processes(distributed, count):
-    """Give the address of a scheduler in this process, on the loopback, with worker processes."""
+    """Yield the address of a scheduler in this process with worker processes, all on the loopback interface."""
     cluster = distributed.LocalCluster(
         n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0", memory_limit=0,
         silence_logs=logging.CRITICAL,

@@ -1,18 +1,23 @@
-"""The workers of a scheduler, and which tasks they have.
+"""Workers of a scheduler, and their tasks.
 
-Tasks are given to workers by name, never more than two to each: one that it works on, and one that it goes on with
-without waiting for us. So it is known which tasks a worker that dies takes with it: they are given to others. Dask's
-own distribution would neither hold its queues that short nor keep tasks from workers that are refused.
+Each worker has at most two tasks, assigned to the worker by name: the current task and the next, without a gap between
+them. So the tasks of a lost worker are known, and are reassigned. Dask's own scheduling has longer queues, and
+would assign tasks to refused workers.
 """
+
+from __future__ import annotations
 
 import asyncio
 import itertools
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
+from typing import Any, Protocol
 from uuid import uuid4
 
+import distributed
 import mitsuba as mi
 
 from . import worker
@@ -20,43 +25,52 @@ from .compatibility import identity, judge
 from .scene_travel import FilesMissing, read
 
 TASKS_PER_WORKER = 2
-MOST_LOSSES = 3  # of one task: whoever ends as many workers is not tried again
-LOOK_SECONDS = 0.5  # from one look at which workers there are to the next
-PATIENCE = 60.0  # seconds without a single worker, or without the scheduler, after which the render ends
+MOST_LOSSES = 3  # of workers by a single task, which then fails
+LOOK_SECONDS = 0.5  # between updates of the list of workers
+PATIENCE = 60.0  # seconds without workers or scheduler, after which the render ends
 
 
 class ClusterError(Exception):
-    """The render cannot go on; its message says why."""
+    """The render cannot continue, for the reason in the message."""
+
+
+class TaskSource(Protocol):
+    """Source of tasks. Its methods return a `Task` for a worker with `queued` tasks, or None; take the result of a
+    task; and take the ClusterError of a failed task."""
+
+    def next_task(self, queued: int) -> Task | None: ...
+
+    def done(self, name: int | str | None, result: Any, address: str) -> None: ...
+
+    def failed(self, name: int | str | None, error: ClusterError) -> None: ...
 
 
 @dataclass(eq=False)
 class Task:
-    """A call of a `function` of worker.py with `arguments`, of which the first is the `SceneBundle`; `name` is what its
-    `source` knows it by."""
+    """Call of a `function` of worker.py with `arguments`, the first of which is the `SceneBundle`; `name` identifies
+    the task to its `source`."""
 
-    source: object
-    name: object
-    function: object
+    source: TaskSource
+    name: int | str | None
+    function: Callable[..., Any]
     arguments: tuple
     losses: int = 0
-    sent: set = field(default_factory=set)  # (address, hash) of files that were sent for it
+    sent: set = field(default_factory=set)  # (address, hash) of transferred files
 
 
 @dataclass(eq=False)
 class _Run:
-    """A task on a worker, a future of Dask's."""
+    """A task on a worker, with its future."""
 
     task: Task
     address: str
-    future: object
+    future: distributed.Future
 
 
 class Pool:
-    """The workers of a scheduler, and the sources of their tasks.
+    """Workers of a scheduler, and the `sources` of their tasks (`TaskSource`), with priority to the first.
 
-    `connect` returns a `distributed.Client`, also when the scheduler was started anew. A source has `next_task(queued)`
-    that returns a `Task` for a worker which has so many, or None; `done(name, result, address)`; and `failed(name,
-    error)` for a ClusterError. Sources are asked in their order: later ones have what earlier ones leave. For one
+    `connect` returns a `distributed.Client`, and is called again after a restart of the scheduler. For use by a single
     thread.
     """
 
@@ -75,8 +89,8 @@ class Pool:
             raise
 
     def wait(self, seconds):
-        """Give tasks to workers, and wait for a result, up to some seconds. Raises ClusterError where there are no
-        workers, or no scheduler, for a minute."""
+        """Assign tasks to workers, and wait for a result, up to `seconds`. Raises ClusterError after a minute without
+        workers or scheduler."""
         if time.monotonic() - self._looked > max(LOOK_SECONDS, len(self.workers) / 100):
             self._look()
         self._give()
@@ -88,7 +102,7 @@ class Pool:
         self._finish([run for run in ended if self._is_ours(run)])
 
     def forget(self, source):
-        """Drop a source, and the tasks that workers have of it. One that is being worked on goes on, for nothing."""
+        """Drop a source and its tasks. The result of a running task is ignored."""
         if source in self.sources:
             self.sources.remove(source)
         self._again = [task for task in self._again if task.source is not source]
@@ -98,17 +112,17 @@ class Pool:
                 run.future.cancel()
 
     def close(self):
-        """Let go of all tasks and of the scheduler."""
+        """Cancel all tasks, and disconnect from the scheduler."""
         for runs in self.workers.values():
             for run in runs:
-                with suppress(Exception):  # of a scheduler that is gone
+                with suppress(Exception):  # the scheduler may be gone
                     run.future.cancel()
         self._client.close(timeout=2)
 
     # --- Workers that come and go ---
 
     def _look(self):
-        """See which workers there are."""
+        """Update the list of workers."""
         try:
             present = self._client.nthreads()
             self._drop([address for address in self.workers if address not in present])
@@ -124,10 +138,10 @@ class Pool:
             raise ClusterError(f"the scheduler {self._client.scheduler.address} has no workers{refused}")
 
     def _take(self, addresses):
-        """Let workers take part, if they are compatible."""
+        """Admit workers that are compatible."""
         found = self._client.run(worker.begin, self._threads, workers=addresses, on_error="return") if addresses else {}
         for address, other in found.items():
-            if isinstance(other, OSError):  # it has just gone, or is not reached yet
+            if isinstance(other, OSError):  # the worker is just gone, or not reachable yet
                 continue
             refused, noted = (str(other), None) if isinstance(other, Exception) else judge(self._own, other)
             if refused:
@@ -141,14 +155,14 @@ class Pool:
             raise ClusterError(f"no worker may take part: {next(iter(self._refused.values()))}")
 
     def _drop(self, addresses):
-        """Workers are gone; others get their tasks."""
+        """Remove lost workers, and reassign the tasks of each."""
         for address in addresses:
             mi.Log(mi.LogLevel.Warn, f"The worker {address} is gone; others get its passes.")
             for run in self.workers.pop(address):
                 self._lose(run)
 
     def _lose(self, run):
-        """A task has gone with its worker."""
+        """Reassign a task of a lost worker, or let it fail after several losses."""
         task = run.task
         run.future.cancel()
         task.losses += 1
@@ -159,7 +173,7 @@ class Pool:
             task.source.failed(task.name, ClusterError(said))
 
     def _reconnect(self, error):
-        """The scheduler does not answer: wait for it to come back, and give out all tasks anew."""
+        """Wait for a scheduler that does not answer, and reassign all tasks."""
         mi.Log(mi.LogLevel.Warn, f"The scheduler is gone ({error}); waiting for it.")
         for runs in self.workers.values():
             self._again += [run.task for run in runs]
@@ -180,7 +194,7 @@ class Pool:
     # --- Tasks ---
 
     def _give(self):
-        """Give each worker a task that has none, and then one more."""
+        """Assign a task to each worker without any, and then a second one to each."""
         for queued in range(TASKS_PER_WORKER):
             for address, runs in self.workers.items():
                 if len(runs) == queued and (task := self._next(queued)):
@@ -199,12 +213,12 @@ class Pool:
         future.add_done_callback(lambda _: self._events.put(run))
 
     def _finish(self, runs):
-        """Futures have come to their end, if only because they were cancelled, or lost with their workers."""
+        """Handle futures that are finished, failed, cancelled or lost."""
         results = self._gather([run for run in runs if run.future.status == "finished"])
         runs = [run for run in runs if self._is_ours(run)]
         for run in runs:
             self.workers[run.address].remove(run)
-        self._give()  # first: what sources do with results takes time
+        self._give()  # first, as sources take time for results
         for run in runs:
             if run in results:
                 run.task.source.done(run.task.name, results[run], run.address)
@@ -212,8 +226,8 @@ class Pool:
                 self._fail(run, run.future.exception(timeout=PATIENCE) if run.future.status == "error" else None)
 
     def _gather(self, runs):
-        """Return the results of finished runs, but for those whose worker is lost before it hands them over. They come
-        directly from the workers, all at once: each way takes milliseconds."""
+        """Return the results of finished runs, except results that were lost with their worker. The workers send them
+        directly and at the same time, as each request takes milliseconds."""
         if not runs:
             return {}
         coroutine = self._client.gather([run.future for run in runs], direct=True, asynchronous=True)
@@ -222,7 +236,7 @@ class Pool:
             try:
                 return dict(zip(runs, gathering.result(timeout=LOOK_SECONDS), strict=True))
             except TimeoutError:
-                self._look()  # what a worker that is gone has not handed over is waited for in vain
+                self._look()  # a lost worker sends no result
             except (Exception, asyncio.CancelledError):
                 break
         gathering.cancel()
@@ -231,11 +245,11 @@ class Pool:
         return {run: result for one in runs for run, result in self._gather([one]).items()}
 
     def _is_ours(self, run):
-        """Is a worker, which is there, still to have a run?"""
+        """Return whether a run is still assigned to a present worker."""
         return run in self.workers.get(run.address, [])
 
     def _fail(self, run, error):
-        """A run has no result: because of an error, or, if that is None, as it is lost."""
+        """Handle a run without a result: because of an error, or, if `error` is None, as it is lost."""
         if isinstance(error, FilesMissing):
             self._send(run, error.args[0])
         elif isinstance(error, worker.Interrupted | None) or type(error).__module__.startswith("distributed."):
@@ -244,7 +258,7 @@ class Pool:
             run.task.source.failed(run.task.name, ClusterError(f"{run.address}: {error}"))
 
     def _send(self, run, hashes):
-        """Send a worker the files that it lacks, one by one, and let it try again."""
+        """Send missing files to a worker, in sequence, and repeat the task."""
         bundle, task = run.task.arguments[0], run.task
         try:
             if any((run.address, hash) in task.sent for hash in hashes):

@@ -1,4 +1,4 @@
-"""Images rendered by the workers of a pool, as `comparison.render.render` does by itself."""
+"""Images in passes on the workers of a pool; the counterpart of `comparison.render.render`."""
 
 import math
 import time as clock
@@ -13,11 +13,11 @@ from .scene_travel import bundle
 
 
 class DistributedRender:
-    """An image that workers begin with before it is its turn, wherever others leave them without work.
+    """Image whose passes idle workers begin while earlier images finish.
 
-    `scene` is a `LazyScene`; the others are those of `comparison.render.render`, but that passes have a fixed
-    number of samples: `pass_spp`, or what `samples_of_a_pass` says. Raises ValueError for a sensor that does not exist,
-    and for a checkpoint of another render.
+    `scene`: a `LazyScene`. The other parameters are those of `comparison.render.render`, but passes have a fixed size:
+    `pass_spp`, or the result of `samples_of_a_pass`. Raises ValueError for a sensor that does not exist, and for a
+    checkpoint of another render.
     """
 
     def __init__(
@@ -37,18 +37,18 @@ class DistributedRender:
 
     @property
     def fills_pool(self):
-        """Are there tasks enough to keep all workers busy while images before it are finished?"""
+        """Whether the image has enough passes for all workers while earlier images finish."""
         wanted = TASKS_PER_WORKER * len(self._pool.workers)
         return self.spp is None or math.ceil(self.spp / self._pass_spp) >= wanted
 
     @property
     def workers(self):
-        """How many passes each worker has rendered, by address."""
+        """Number of passes of each worker, by address."""
         return dict(self.passes.workers)
 
     def render(self, denoise=False, progress=None):
-        """Render; return the image and what it took, as `comparison.render.render`. Raises ClusterError where the
-        workers cannot."""
+        """Render; return the image and the cost, as `comparison.render.render` does. Raises ClusterError if the workers
+        fail."""
         begin = clock.perf_counter() - self._seconds
         try:
             denoiser = Denoiser(self._scene.get(), self._sensor, self._seed) if denoise else None
@@ -62,5 +62,5 @@ class DistributedRender:
             self.close()
 
     def close(self):
-        """Leave the workers to others."""
+        """Drop the passes that are not finished."""
         self.passes.close()

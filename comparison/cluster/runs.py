@@ -1,6 +1,6 @@
-"""The runs of a comparison on the workers of a pool, in the place of `comparison.worker`.
+"""Runs of a comparison on the workers of a pool; the counterpart of `comparison.worker`.
 
-A worker makes one run at a time, in a process of its own, as this machine would. Images come back as files.
+A worker makes one run at a time, in a new process, as `comparison.worker` does. Images are returned as files.
 """
 
 from collections import defaultdict
@@ -13,27 +13,27 @@ from . import worker
 from .pool import Task
 from .scene_travel import bundle
 
-# Of the result of a run: where things are for us, not for the worker
+# Entries of a result with paths and settings of this machine, not of the worker
 OWN = ("label", "scene", "output", "denoised_output", "vpl_folder", "kernel_cache", "run", "threads")
 
 
 class DistributedRuns:
-    """Runs that workers begin with as soon as they are expected, and that are asked for one by one."""
+    """Runs that workers begin in advance, and whose results are then requested in sequence."""
 
     def __init__(self, pool):
         self._pool, self._waiting = pool, []
-        self._results = defaultdict(list)  # of each run: two labels may have the same
+        self._results = defaultdict(list)  # a list for each run, as two labels may share a run
         pool.sources.append(self)
 
     def expect(self, job, scene_file):
-        """A `worker.Job` on a `SceneFile` (as it is in its file) is going to be asked for."""
+        """Begin a `worker.Job` on an unchanged `SceneFile` in advance."""
         kernels = f"{scene_file.name}.{job.label}"
         arguments = (bundle(scene_file), job, None if job.cold else kernels)
         self._waiting.append(Task(self, job.run, worker.run_job, arguments))
 
     def run(self, job, tick=lambda: None):
-        """Return the result of an expected job, as `comparison.worker.run`, with `machine`: a dict that names the one
-        that made it. Raises ClusterError where there are no workers."""
+        """Return the result of an expected job, as `comparison.worker.run` does, with the dict `machine`, which names
+        the worker. Raises ClusterError without workers."""
         while not self._results[job.run]:
             self._pool.wait(TICK)
             tick()
@@ -53,13 +53,13 @@ class DistributedRuns:
     # --- For the pool ---
 
     def next_task(self, queued):
-        """Return the next run, None if there is none left."""
+        """Return the next run, None after the last one."""
         return self._waiting.pop(0) if self._waiting else None
 
     def done(self, run, result, address):
-        """A run has been made."""
+        """Take the result of a run."""
         self._results[run].append(result)
 
     def failed(self, run, error):
-        """A run could not be made."""
+        """Take the error of a failed run."""
         self._results[run].append(error)

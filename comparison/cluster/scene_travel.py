@@ -1,33 +1,32 @@
-"""Scenes on their way to a worker: files with their hashes.
+"""Transfer of scenes to workers, as files with hashes.
 
-A worker takes the files from where they are for the client if they have the same content there (a common file system,
-or a worker on the same machine), or else from its store, by hash. What that lacks it is sent, once. Files with a path
-relative to the scene are laid out as they are for the client; those with an absolute one must be where they are.
+A worker uses files in their original place if they have the same content there (a shared file system, or the same
+machine), otherwise files from its store, by hash. Files that the store lacks are sent once. Files with a path relative
+to the scene keep their relative places; files with an absolute path must exist on the worker.
 """
 
 import hashlib
 import os
-import re
 import shutil
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from xml.etree import ElementTree
 
 import mitsuba as mi
 
 from ..images import replacing
 from ..scene_files import SceneFile
+from .scene_names import named_files
 
 
 class FilesMissing(Exception):
-    """A worker lacks files; the argument is the list of their hashes."""
+    """Files are missing on a worker; the argument is the list of their hashes."""
 
 
 @dataclass(frozen=True)
 class TravellingFile:
-    """File of a scene: its absolute `path` for the client, where it is below the folder that travels (`relative`, None
-    if the scene has its absolute path), and the hash of its content."""
+    """File of a scene: absolute `path` on the client; `relative` path below the common folder, None for a file that the
+    scene names by an absolute path; `hash` of the content."""
 
     path: str
     relative: str | None
@@ -36,8 +35,8 @@ class TravellingFile:
 
 @dataclass(frozen=True)
 class SceneBundle:
-    """All that a scene is made from: its `files`, the scene file first, and, of the `SceneFile`, `defines` and
-    `changes`; the `variant`."""
+    """Everything that a scene depends on: its `files`, the scene file first; `defines` and `changes` of the
+    `SceneFile`; and the `variant`."""
 
     files: tuple
     defines: dict
@@ -46,7 +45,7 @@ class SceneBundle:
 
     @property
     def key(self):
-        """What it is recognised by: two of a key are the same scene."""
+        """Hash (hexadecimal) that identifies the scene."""
         content = [(file.relative or file.path, file.hash) for file in self.files]
         return hashlib.sha256(repr((content, self.defines, self.changes, self.variant)).encode()).hexdigest()[:32]
 
@@ -57,51 +56,33 @@ class SceneBundle:
 
 def bundle(scene_file):
     """Return the `SceneBundle` of a `SceneFile`."""
-    main = scene_file.path.absolute()
-    named = scene_file.files() | _included(main, scene_file.defines)
-    relative = {os.path.normpath(main.parent / name) for name in named if not os.path.isabs(name)} | {str(main)}
-    absolute = {os.path.normpath(name) for name in named if os.path.isabs(name)}
-    folder = os.path.commonpath([os.path.dirname(file) for file in relative])
-    files = [TravellingFile(file, os.path.relpath(file, folder), _hash(file)) for file in sorted(relative)]
-    files += [TravellingFile(file, None, _hash(file)) for file in sorted(absolute)]
-    files.sort(key=lambda file: file.path != str(main))
+    main = os.path.abspath(scene_file.path)
+    named = named_files(main, scene_file.defines) | {main: True}
+    folder = os.path.commonpath([os.path.dirname(file) for file, is_relative in named.items() if is_relative])
+    files = [
+        TravellingFile(file, os.path.relpath(file, folder) if is_relative else None, _hash(file))
+        for file, is_relative in named.items()
+    ]
+    files.sort(key=lambda file: (file.path != main, file.relative is None, file.path))
     return SceneBundle(tuple(files), scene_file.defines, tuple(scene_file.changes), mi.variant())
 
 
-def _included(xml, defines):
-    """Return the files that attributes of an XML file name, as `SceneFile.files`: what the parser reads itself, such as
-    other XML files, whose own are among them, and spectra."""
-    found, known, waiting = {}, dict(defines), [xml]
-    while waiting:
-        # Mitsuba reads comments with two hyphens, which XML does not allow
-        text = re.sub(rb"<!--.*?-->", b"", waiting.pop().read_bytes(), flags=re.DOTALL)
-        for element in ElementTree.fromstring(text).iter():
-            if element.tag == "default":
-                known.setdefault(element.get("name"), element.get("value"))
-            for value in element.attrib.values():
-                name = re.sub(r"\$(\w+)", lambda match: known.get(match[1], match[0]), value)
-                file = xml.parent / name
-                if name and name not in found and len(name) < 1024 and file.is_file():
-                    found[name] = file
-                    waiting += [file] if element.tag == "include" else []
-    return found
-
-
 class Store:
-    """The files of a worker, in a folder of its own."""
+    """Store of files in the folder of a worker."""
 
     def __init__(self, folder):
         self._files, self._scenes = Path(folder) / "files", Path(folder) / "scenes"
 
     def add(self, hash, content):
-        """Add a file (bytes). Raises OSError where there is no room."""
+        """Add a file with the given content (bytes). Raises OSError on a full disk."""
         self._files.mkdir(parents=True, exist_ok=True)
         with replacing(self._files / hash) as temporary:
             temporary.write_bytes(content)
 
     def place(self, bundle):
-        """Return the path of the scene file of a bundle, beside which all of its files are. Raises FilesMissing for
-        those that are neither in their place nor here, and FileNotFoundError for those that cannot travel."""
+        """Return the path of the scene file of a bundle, with all other files in place. Raises FilesMissing for files
+        that are neither in their original place nor in the store, and FileNotFoundError for files by an absolute
+        path."""
         lacking = [file for file in bundle.files if not is_there(file.path, file.hash)]
         if not lacking:
             return bundle.files[0].path
@@ -127,12 +108,12 @@ class Store:
 def _link(file, place):
     try:
         os.link(file, place)
-    except OSError:  # a file system without links
+    except OSError:  # the file system has no links
         shutil.copyfile(file, place)
 
 
 def read(bundle, hash):
-    """Return the content of a file of a bundle (bytes). Raises ValueError if it is not what it was."""
+    """Return the content (bytes) of a file of a bundle. Raises ValueError if the file has changed."""
     path = next(file.path for file in bundle.files if file.hash == hash)
     content = Path(path).read_bytes()
     if hashlib.sha256(content).hexdigest() != hash:
@@ -141,7 +122,7 @@ def read(bundle, hash):
 
 
 def is_there(path, hash):
-    """Is there a file of that content?"""
+    """Return whether a path is a file with the given hash."""
     try:
         return _hash(path) == hash
     except OSError:

@@ -1,6 +1,6 @@
-"""What runs on a worker. It keeps scenes, and with them compiled kernels, between passes.
+"""Code of a worker. Between passes a worker keeps scenes and compiled kernels.
 
-A worker renders one pass at a time, whatever the number of its threads in Dask is: Mitsuba uses all cores for one.
+A worker renders one pass at a time, for any number of Dask threads, as Mitsuba uses all cores for a pass.
 """
 
 import platform
@@ -19,40 +19,40 @@ from .scene_travel import Store
 
 KEPT_SCENES = 2
 _LOCK = threading.Lock()
-_SCENES = OrderedDict()  # of keys of bundles, used last: last
+_SCENES = OrderedDict()  # by key of the bundle, most recently used last
 _THREADS = None
 
 
 class RenderError(Exception):
-    """A pass failed on a worker; the message is one line."""
+    """A pass failed on a worker, for the reason in the one-line message."""
 
 
 class Interrupted(Exception):
-    """A pass was not finished, as the worker heard Ctrl-C or is to end."""
+    """A pass was not finished, because of Ctrl-C or the end of the worker."""
 
 
 def begin(threads=None):
-    """Get ready for tasks, which shall use as many threads (None: all cores); return this worker's identity."""
+    """Set the number of threads of tasks (None: all cores); return the identity of this worker."""
     global _THREADS
     _THREADS = threads
     return identity()
 
 
 def add_file(hash, content, dask_worker):
-    """Put a file into the store of a worker, which is given by `Client.run`."""
+    """Add a file to the store of a worker, which `Client.run` passes."""
     Store(dask_worker.local_directory).add(hash, content)
 
 
 def render_pass(bundle, sensor, spp, seed):
-    """Render a pass of the scene of a `SceneBundle`; return a `PassImage`. Raises FilesMissing for files that this
-    worker lacks, Interrupted for a pass that is not whole, RenderError for anything else."""
+    """Render a pass of the scene of a `SceneBundle`; return a `PassImage`. Raises FilesMissing for missing files,
+    Interrupted for an unfinished pass, and RenderError for other errors."""
     with _LOCK:
         path = Store(get_worker().local_directory).place(bundle)
         try:
             scene = _scene(bundle, path)
             image = rendering.render_pass(scene, sensor, scene.integrator(), spp, seed)
         except Exception as error:
-            # Mitsuba's and Dr.Jit's need not be known, nor survive the journey, where they are told.
+            # Exceptions of Mitsuba and Dr.Jit may be impossible to unpickle on the client
             raise RenderError(explain(error)) from None
         if scene.integrator().should_stop():
             raise Interrupted
@@ -70,8 +70,8 @@ def _scene(bundle, path):
 
 
 def run_job(bundle, job, kernels):
-    """Make a run of a comparison, a `comparison.worker.Job`, with kernels compiled in a folder of that name (None: a
-    fresh one); return its result and its files, a dict from "output" and "denoised_output" to their content."""
+    """Make a run of a comparison, a `comparison.worker.Job`, with the kernel cache in the folder `kernels` (None: an
+    empty one). Return the result, and a dict from "output" and "denoised_output" to the content of the files."""
     with _LOCK:
         folder = Path(get_worker().local_directory)
         scene = Store(folder).place(bundle)

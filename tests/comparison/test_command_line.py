@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -144,21 +145,56 @@ def test_manylights_renders_what_path_would(tmp_path, capsys, integrator, argume
     assert ("in place of" in capsys.readouterr().out) == (replaced is not None)
 
 
-def test_media_and_variants_that_manylights_does_not_have_keep_the_scenes_integrator(tmp_path):
-    path = '<integrator type="volpath"/>'
+def test_a_medium_keeps_the_scenes_integrator(tmp_path):
     fog = '<bsdf type="null"/><medium name="interior" type="homogeneous"/>'
-    assert run(scene_with(tmp_path, path, fog), "-o", tmp_path / "a.exr", "--spp", 1) == 0
+    scene = scene_with(tmp_path, '<integrator type="volpath"/>', fog)
+    assert run(scene, "-o", tmp_path / "a.exr", "--spp", 1) == 0
     assert images.read_exr(tmp_path / "a.exr")[2]["integrator"] == "volpath"
-    with process(scene_with(tmp_path, path), "-o", tmp_path / "b.exr", "--spp", 1, "-m", "scalar_rgb") as scalar:
-        assert scalar.wait(PATIENCE) == 0, scalar.stderr.read()
-    assert images.read_exr(tmp_path / "b.exr")[2]["integrator"] == "volpath"
+
+
+def test_a_medium_is_refused_before_the_first_pass(tmp_path, capfd):
+    scene = scene_with(tmp_path, "", '<bsdf type="null"/><medium name="interior" type="homogeneous"/>')
+    assert run(scene, "-i", "manylights", "-o", tmp_path / "a.exr") == 1
+    said = capfd.readouterr()
+    assert said.err.startswith("manylights: shape 0") and "bounds a participating medium" in said.err and not said.out
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral"])
+def test_a_variant_without_manylights_is_refused_and_may_render_the_scenes_integrator(tmp_path, variant):
+    arguments = scene_with(tmp_path, '<integrator type="path"/>'), "-o", tmp_path / "a.exr", "--spp", 1, "-m", variant
+    with process(*arguments) as refused:
+        said = refused.communicate(timeout=PATIENCE)[1]
+    assert refused.returncode == 1 and f'"manylights" does not support the variant "{variant}"' in said
+    assert "llvm_ad_rgb, llvm_ad_mono" in said and "llvm_rgb" not in said and "such as path" in said
+    with process(*arguments, "-i", "scene") as asked_for:
+        assert asked_for.wait(PATIENCE) == 0, asked_for.stderr.read()
+    assert images.read_exr(tmp_path / "a.exr")[2]["integrator"] == "path"
+
+
+@pytest.mark.skipif(dr.has_backend(dr.JitBackend.CUDA), reason="this machine has a GPU")
+def test_a_variant_without_its_gpu_says_what_to_do(tmp_path):
+    with process(CORNELL, "-o", tmp_path / "a.exr", "-m", "cuda_ad_rgb") as refused:
+        said = refused.communicate(timeout=PATIENCE)[1]
+    assert refused.returncode == 2 and len(said.splitlines()) == 1
+    assert "the variant 'cuda_ad_rgb' needs an NVIDIA GPU and its driver" in said and "llvm_ad_rgb" in said
+
+
+def test_the_command_says_what_ended_it_and_which_error_was_reached(tmp_path, capfd):
+    common = [CORNELL, *TINY, "-i", "path", "-o", tmp_path / "a.exr", "--error", "0.0001"]
+    assert run(*common, "--time", "1e-6") == 0
+    said = "".join(capfd.readouterr())
+    assert "error unknown (one pass), ended by time" in said and "The error of 0.01% was not reached" in said
+    assert run(*common, "--spp", "8", "--pass-spp", "4") == 0
+    error = images.read_exr(tmp_path / "a.exr")[2]["estimated_error"]
+    said = "".join(capfd.readouterr())
+    assert f"error {error:.2%}, ended by spp" in said and "The error of 0.01% was not reached" in said
 
 
 def test_log_says_what_replaced_what(tmp_path):
     with process(CORNELL, *TINY, "-o", tmp_path / "a.exr", "--spp", 1, "-v") as verbose:
         said = "".join(verbose.communicate(timeout=PATIENCE))
     assert verbose.returncode == 0
-    assert "The integrator is manylights in place of path; with -i scene it would be the scene's." in said
+    assert "The integrator is manylights in place of path; -i scene would keep the scene's." in said
 
 
 def test_exr_file_says_what_was_chosen(tmp_path):
@@ -166,7 +202,7 @@ def test_exr_file_says_what_was_chosen(tmp_path):
     output = tmp_path / "a.exr"
     assert run(CORNELL, "-D", "resx=192", "-D", "resy=192", "-o", output, "--spp", 64, "--pass-spp", 64) == 0
     found = json.loads(images.read_exr(output)[2]["statistics"])
-    assert "of the noise away" in found["balance"]
+    assert "of the variance" in found["balance"]
     assert found["light_paths"] > 0 and found["shadow_rays"] > 0 and found["seconds"]["cuts"] > 0
 
 

@@ -264,7 +264,7 @@ def test_comparison_is_of_path_and_manylights_unless_others_are_named(tmp_path, 
     assert (path["label"], ours["label"]) == ("path", "manylights")
     assert (path["parameters"], ours["parameters"]) == ({"max_depth": 6}, {"max_depth": 6})
     found = ours["statistics"]
-    assert "of the noise away" in found["balance"]
+    assert "of the variance" in found["balance"]
     assert found["light_paths"] > 0 and found["shadow_rays"] > 0 and sum(found["lights"].values()) > 0
     assert ours["rays_per_sample"] > 0 and ours["errors"]["relmse"] < path["errors"]["relmse"]
     assert found["balance"] in html.unescape((tmp_path / "report.html").read_text())

@@ -77,6 +77,35 @@ def test_kept_reference_that_cannot_be_read_is_named(tmp_path):
         references.path_traced(cornell(), 4, tmp_path)
 
 
+def altered_file(change):
+    """A change of the mean, the standard error and the metadata of a reference that is kept."""
+
+    def alter(file):
+        found = references.read(file)
+        described = {key: value for key, value in found.description.items() if key != "file"}
+        references.write(file, *change(found.image, found.standard_error, described))
+
+    return alter
+
+
+ALTERATIONS = {
+    "size": altered_file(lambda image, error, described: (image[:8], error[:8], described)),
+    "not finite": altered_file(lambda image, error, described: (image * np.nan, error, described)),
+    "negative error": altered_file(lambda image, error, described: (image, -error - 1, described)),
+    "text for samples": altered_file(lambda image, error, described: (image, error, described | {"spp": "many"})),
+    "one batch": altered_file(lambda image, error, described: (image, error, described | {"batches": 1})),
+}
+
+
+@pytest.mark.parametrize("alteration", ALTERATIONS)
+def test_an_altered_reference_is_not_continued(tmp_path, alteration):
+    references.path_traced(cornell(), 4, tmp_path)
+    (file,) = tmp_path.glob("*.exr")
+    ALTERATIONS[alteration](file)
+    with pytest.raises(ValueError, match=f"the kept reference '{file}' cannot be read"):
+        references.path_traced(cornell(), 8, tmp_path)
+
+
 def test_shipped_reference_fits_the_shipped_hall():
     path = ROOT / "scenes" / "hall_reference.exr"
     reference = references.read(path)

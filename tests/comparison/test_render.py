@@ -1,8 +1,13 @@
 """`manylights.render`: conditions that end a render, and results."""
 
 import itertools
+import re
 import signal
+import subprocess
+import sys
 import threading
+import traceback
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +17,7 @@ import pytest
 import manylights
 from comparison import convergence, rendering
 from comparison import render as render_module
+from tests.support.paths import CORNELL, ROOT
 from tests.support.rendering import render_with_statistics
 from tests.support.scenes import area_light, closed_box, cornell, sensor
 
@@ -22,7 +28,7 @@ def scene():
 
 
 def clock(monkeypatch, seconds):
-    """A clock that goes on by some seconds whenever it is looked at."""
+    """Replace the clock by a clock that advances by some seconds at each call."""
     ticks = itertools.count()
     monkeypatch.setattr(render_module.clock, "perf_counter", lambda: next(ticks) * seconds)
 
@@ -226,6 +232,66 @@ def test_ctrl_c_returns_what_is_finished(scene, monkeypatch, passes):
 def test_bad_values_are_refused(scene, arguments, message):
     with pytest.raises(ValueError, match=message):
         manylights.render(scene, **arguments)
+
+
+@pytest.mark.parametrize(("limits", "ended_by"), [({"time": 1e-9}, "time"), ({"spp": 16}, "spp")])
+def test_an_error_that_is_not_reached_is_a_warning(scene, capfd, limits, ended_by):
+    _, took = manylights.render(scene, "path", error=1e-4, pass_spp=1, **limits)
+    said = "".join(capfd.readouterr())
+    found = "an unknown error, as there is one pass" if took.error is None else f"an error of {took.error:.2%}"
+    assert took.ended_by == ended_by and (took.error is None) == (ended_by == "time")
+    assert f"The error of 0.01% was not reached: {ended_by} ended the render at {found}." in said
+
+
+def test_an_error_that_is_reached_is_no_warning(scene, capfd):
+    assert manylights.render(scene, "path", error=0.5)[1].ended_by == "error"
+    assert manylights.render(scene, "path", error=0.9, spp=64, pass_spp=16)[1].ended_by == "spp"
+    assert "was not reached" not in "".join(capfd.readouterr())
+
+
+def test_a_scene_may_be_a_path(scene, tmp_path):
+    expected = manylights.render(mi.load_file(CORNELL), spp=1, seed=2)[0].numpy()
+    for path in (CORNELL, Path(CORNELL)):
+        np.testing.assert_allclose(manylights.render(path, spp=1, seed=2)[0].numpy(), expected, rtol=1e-5)
+    with pytest.raises(FileNotFoundError, match=r"no scene file 'nosuch\.xml'"):
+        manylights.render("nosuch.xml")
+    with pytest.raises(TypeError, match=r"scene must be a mi\.Scene or the path of a scene file, got 3"):
+        manylights.render(3)
+
+
+def test_a_render_without_a_variant_is_told_to_set_one():
+    code = "import manylights; manylights.render('scenes/cornell.xml')"
+    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert 'RuntimeError: no variant is set: call mi.set_variant("llvm_ad_rgb")' in found.stderr
+
+
+FOG = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
+
+
+@pytest.mark.parametrize("name", ["manylights", "lightcuts", "adaptivedirect"])
+def test_a_participating_medium_is_refused_by_name(name):
+    scene = mi.load_dict(closed_box({"lamp": area_light(), "fog": FOG}, 8))
+    reason = r'\("fog", Sphere\) bounds a participating medium; many-light integrators support surfaces only'
+    with pytest.raises(ValueError, match=reason):
+        manylights.render(scene, name, spp=1)
+    with pytest.raises(RuntimeError) as error:
+        mi.render(scene, integrator=mi.load_dict({"type": name}), spp=1)
+    assert re.search(reason, "".join(traceback.format_exception(error.value)))
+
+
+@pytest.mark.parametrize("name", ["manylights", "lightcuts"])
+def test_frozen_functions_are_refused_by_name(scene, name):
+    plugin = mi.load_dict({"type": name})
+
+    @dr.freeze
+    def frozen(scene, seed):
+        return mi.render(scene, integrator=plugin, spp=1, seed=seed)
+
+    with pytest.raises(RuntimeError) as error:
+        frozen(scene, mi.UInt32(0))
+    said = "".join(traceback.format_exception(error.value))
+    assert f"{type(plugin).__name__} cannot be recorded by dr.freeze" in said
+    assert mi.render(scene, integrator=plugin, spp=1).shape == (16, 16, 3)
 
 
 def test_a_scene_without_an_integrator_needs_one():

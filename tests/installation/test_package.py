@@ -141,7 +141,7 @@ def test_mitsuba_3_10_finds_the_plugins_in_each_variant(environment, before):
 
 
 def test_commands_and_the_demo_are_installed(environment):
-    assert "Render a scene" in run(environment, "manylights", "--help")
+    assert "Render scenes with any integrator" in run(environment, "manylights", "--help")
     assert "usage: manylights-compare" in run(environment, "manylights-compare", "--help")
     script = "import compare; print(*(part for part in compare.DEMO if '/' in part), sep='\\n')"
     files = [Path(line) for line in run(environment, "python", "-c", script).splitlines()]
@@ -160,7 +160,9 @@ def draw(scene: mi.Scene) -> None:
     assert_type(took, manylights.Took)
     assert_type(took.error, float | None)
     assert_type(manylights.main(["scene.xml"]), int)
-    manylights.render(scene, spp="4")  # type: ignore[arg-type]
+    manylights.render("scene.xml", spp="4")  # type: ignore[arg-type]
+    manylights.write("image.exr", image, took.channels)
+    manylights.write(4, image)  # type: ignore[arg-type]
 """
 
 

@@ -1,7 +1,7 @@
 """Parameters of scene objects, for reading only.
 
-``mitsuba.traverse`` does what an optimiser needs: it defines a class for every object and notes which values change.
-Where a scene has a hundred thousand emitters, that takes ten times as long as looking at their values.
+``mitsuba.traverse`` serves optimisers: it defines a class for every object and tracks changed values, which takes ten
+times as long as reading the values in a scene of a hundred thousand emitters.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 
 class Parameters(Mapping):
-    """Parameters by name, fetched when they are asked for."""
+    """Parameters by name, fetched at access."""
 
     def __init__(self):
         self._found: dict = {}
@@ -35,24 +35,24 @@ class Parameters(Mapping):
         return value if cpptype is None else mi.get_property(value, cpptype, node)
 
     def add(self, name: str, value, cpptype, node) -> None:
-        """Take what Mitsuba says of a parameter."""
+        """Add a parameter as Mitsuba describes it."""
         self._found[name] = value, cpptype, node
 
 
 def parameters_of(node, below: bool = True) -> Parameters:
-    """Parameters of an object and, if wanted, of all objects below it, with the objects' own names before theirs."""
+    """Parameters of an object and, with ``below``, of all objects below, with the names of objects as prefixes."""
     found = Parameters()
     _read(node, "", found, {node} if below else None)
     return found
 
 
 def matrix_of(transform) -> np.ndarray:
-    """A transformation with one lane as a (4, 4) float64 matrix."""
+    """Matrix of a transformation of one lane, (4, 4) float64."""
     return np.array([[x[0] if dr.is_jit_v(x) else x for x in row] for row in transform.matrix], np.float64)
 
 
 def numbers(value) -> list[float]:
-    """The components of a number, or of a vector or colour with one lane."""
+    """Components of a number, or of a vector or colour of one lane."""
     if not dr.is_array_v(value):
         return [float(value)]
     if not dr.is_jit_v(value):
@@ -61,14 +61,14 @@ def numbers(value) -> list[float]:
 
 
 def fingerprint(nodes) -> str:
-    """What tells objects from others, in whatever order they come: of each of them, and of all below it, what Mitsuba
-    prints, and the values of all parameters."""
+    """Hash (hexadecimal) of objects and all objects below, in any order: of the texts that Mitsuba prints, and of the
+    values of all parameters."""
     known: dict = {}
     return hashlib.blake2b(b"".join(sorted(_digest(node, known) for node in nodes))).hexdigest()
 
 
 def fingerprint_without_camera(scene) -> str:
-    """What tells a scene from others, but for its sensors and its integrator."""
+    """Hash (hexadecimal) of a scene without the sensors and the integrator."""
     objects = (value for _, value, _ in _members(scene) if isinstance(value, mi.Object))
     return fingerprint(one for one in objects if not isinstance(one, mi.Sensor | mi.Integrator))
 
@@ -76,7 +76,7 @@ def fingerprint_without_camera(scene) -> str:
 def _digest(node, known: dict) -> bytes:
     if node in known:
         return known[node]
-    # Met again on the way, it is one that this one belongs to
+    # A cycle leads back to an object above
     known[node] = b""
     digest = hashlib.blake2b(f"{node.class_name()} {node}".encode())
     for name, value, cpptype in _members(node):
@@ -101,8 +101,8 @@ def _read(node, prefix: str, found: Parameters, visited: set | None) -> None:
 
 
 def _members(node) -> list[tuple]:
-    """(Name, value, its type in C++ where Python knows it by that alone) of all parameters of a node, and of all
-    objects right below it."""
+    """List of (name, value, C++ type) of the parameters of a node and the objects directly below it.  The type is None
+    unless Python needs it to read the value."""
     reader = _reader()()
     node.traverse(reader)
     return reader.members
@@ -110,16 +110,16 @@ def _members(node) -> list[tuple]:
 
 @cache
 def _reader():
-    # Mitsuba has no classes before a variant is set
+    # Mitsuba has no classes until a variant is set
     class Reader(mi.TraversalCallback):
-        """Notes what a node says of itself."""
+        """Collects the parameters that a node reports."""
 
         def __init__(self):
             super().__init__()
             self.members = []
 
         def put(self, name, value, flags, cpptype=None):
-            """Called by Mitsuba for every parameter."""
+            """Add a parameter; called by Mitsuba."""
             self.members.append((name, value, cpptype))
 
     return Reader
