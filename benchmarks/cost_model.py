@@ -92,7 +92,10 @@ def main() -> None:
     parser.add_argument("--passes", type=int, default=4, help="images with each value (default: 4)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the ratios to a result file")
     options = parser.parse_args()
-    found = {name: scenes.load(name, options.width) for name in scenes.available(options.scenes)}
+    available = scenes.available(options.scenes)
+    if not available:
+        parser.error("--scenes names no scene that is present")
+    found = {name: scenes.load(name, options.width) for name in available}
     print(f"{'constant':24s}" + "".join(f"{name[:11]:>24s}" for name in found) + f"{'geometric mean':>20s}")
     rows: dict = {}
     for constant in options.constants:

@@ -119,7 +119,7 @@ def product_of(name: str, width: int, seconds: float, passes: int, view: int) ->
     excess, uncertain = ours / theirs - 1, np.hypot(error / ours, their_error / theirs)
     print(
         f"{label:18s} {columns[0]:>22s} {columns[1]:>22s} {ratio:7.2f}   {excess:+.2%} ± {uncertain:.2%}"
-        f"{sets:12.2%}   {best['manylights'].integrator.statistics.get('balance')}",
+        f"{sets:12.2%}   {best['manylights'].integrator.statistics.get('plan')}",
         flush=True,
     )
     more = {"speedup": ratio, "bias": excess, "bias_deviation": uncertain, "set_deviation": sets}

@@ -185,7 +185,7 @@ def total_statistics(passes):
 class TotalStatistics:
     """Sum of the integrators' counters over passes.
 
-    Numbers are summed, also in nested dicts ("seconds"). Descriptions, such as the text "balance" and the dict
+    Numbers are summed, also in nested dicts ("seconds"). Descriptions, such as the text "plan" and the dict
     "lights", come from the pass with the most samples, the last of equal passes.
     """
 

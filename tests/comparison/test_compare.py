@@ -156,12 +156,12 @@ def test_statistics_add_up():
 
 def test_what_describes_a_pass_is_that_of_the_largest():
     statistics = [
-        {"balance": "too few samples", "share": 0.5},
-        {"balance": "glossy", "share": 0.25, "lights": {"surface": 7}},
-        {"balance": "too few samples"},
+        {"plan": "too few samples", "share": 0.5},
+        {"plan": "glossy", "share": 0.25, "lights": {"surface": 7}},
+        {"plan": "too few samples"},
     ]
     passes = [rendering.Pass(0, spp, 1.0, one) for spp, one in zip((1, 8, 2), statistics, strict=True)]
-    assert rendering.total_statistics(passes) == {"balance": "glossy", "share": 0.75, "lights": {"surface": 7}}
+    assert rendering.total_statistics(passes) == {"plan": "glossy", "share": 0.75, "lights": {"surface": 7}}
 
 
 def test_statistics_are_read_once_as_passes_come():
@@ -174,10 +174,10 @@ def test_statistics_are_read_once_as_passes_come():
 
     totals, passes, found = rendering.TotalStatistics(), [], []
     for spp in (4, 8, 2, 8):
-        passes.append(rendering.Pass(0, spp, 1.0, Read(rays=spp, balance=f"{spp}, {len(passes)}")))
+        passes.append(rendering.Pass(0, spp, 1.0, Read(rays=spp, plan=f"{spp}, {len(passes)}")))
         found.append(totals.of(passes))
-    assert len(read) == 4 and found[-1] == rendering.total_statistics(passes) == {"rays": 22, "balance": "8, 3"}
-    assert found[0] == {"rays": 4, "balance": "4, 0"}
+    assert len(read) == 4 and found[-1] == rendering.total_statistics(passes) == {"rays": 22, "plan": "8, 3"}
+    assert found[0] == {"rays": 4, "plan": "4, 0"}
 
 
 # --- Workers ---
@@ -264,10 +264,10 @@ def test_comparison_is_of_path_and_manylights_unless_others_are_named(tmp_path, 
     assert (path["label"], ours["label"]) == ("path", "manylights")
     assert (path["parameters"], ours["parameters"]) == ({"max_depth": 6}, {"max_depth": 6})
     found = ours["statistics"]
-    assert "of the variance" in found["balance"]
+    assert "of the variance" in found["plan"]
     assert found["light_paths"] > 0 and found["shadow_rays"] > 0 and sum(found["lights"].values()) > 0
     assert ours["rays_per_sample"] > 0 and ours["errors"]["relmse"] < path["errors"]["relmse"]
-    assert found["balance"] in html.unescape((tmp_path / "report.html").read_text())
+    assert found["plan"] in html.unescape((tmp_path / "report.html").read_text())
 
 
 def test_manylights_shares_no_lights_with_vpl(tmp_path, capsys):

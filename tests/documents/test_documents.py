@@ -116,5 +116,5 @@ def test_readme_lists_every_plugin():
 def test_the_architecture_names_every_module_and_no_other(package):
     _, _, rest = (ROOT / "docs" / "architecture.md").read_text().partition(f"# `{package}/`\n")
     cells = re.findall(r"^\| (`.*?) \|", rest.partition("\n#")[0], re.MULTILINE)
-    modules = {file.name for file in (ROOT / package).glob("*.py") if file not in PLUGINS} - {"__init__.py"}
+    modules = {file.name for file in (ROOT / package).rglob("*.py") if file not in PLUGINS} - {"__init__.py"}
     assert set(re.findall(r"\w+\.py", " ".join(cells))) == modules

@@ -27,7 +27,7 @@ def assert_image_of_path(description, spp=512, seeds=8, finds=0.01, reference="p
     def pair(seed):
         found, statistics = render_with_statistics("manylights", scene, spp, seed, **more)
         assert np.isfinite(found).all() and statistics["dropped"] == 0
-        assert (statistics.get("light_paths", 0) > 0) == lights, statistics["balance"]
+        assert (statistics.get("light_paths", 0) > 0) == lights, statistics["plan"]
         return found, render(scene, reference, spp, 1000 + seed, **more)
 
     assert_same_mean(pair, seeds, finds)

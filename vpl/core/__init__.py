@@ -9,6 +9,7 @@
 - ``garbage``: code blocks without Python's cyclic garbage collector
 - ``morton``: codes and orders along a Morton curve
 - ``cones``: axes of direction cones, rounding of cone cosines
+- ``clock``: seconds of a render by stage
 - ``stages``: names of the stages of a render, keys of its timings
 - ``parameters``: parameters of scene objects, read without ``mitsuba.traverse``
 - ``registry``: table from shapes or emitters to numbers

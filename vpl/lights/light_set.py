@@ -21,7 +21,7 @@ from .emission import bounding_sphere
 from .emitters import Emitters
 from .focus import Focus, spacing
 from .light_tree import CONE_COS, DeviceTree, LightTree, build_light_tree
-from .tracing import PathSettings, TracedLights, trace_lights
+from .tracing import LightPathSettings, TracedLights, trace_lights
 from .virtual_lights import KINDS, DeviceLights, VirtualLights
 
 
@@ -225,7 +225,7 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, places: np.
         if options.direct == "vpl":
             found += lights_of_emitters(scene, emitters, options.direct_count, derived_seed(seed, 20))
     if options.max_depth > 2:
-        settings = PathSettings(options.max_depth - 2, options.rr_depth, options.lobe_limit)
+        settings = LightPathSettings(options.max_depth - 2, options.rr_depth, options.lobe_limit)
         focus = Focus.of(places, bounding_sphere(scene))
         traced = trace_lights(scene, emitters, options.vpl_count, derived_seed(seed, 21), settings, focus)
         found.append(traced.lights)

@@ -80,7 +80,7 @@ class Scattered:
 
 
 def scatter_perturbed(si, sampler, throughput, lobe_limit: float, active) -> Scattered:
-    """Scatter light paths at perturbed surfaces.  ``lobe_limit``: see :class:`vpl.lights.tracing.PathSettings`."""
+    """Scatter light paths at perturbed surfaces.  ``lobe_limit``: see :class:`vpl.lights.tracing.LightPathSettings`."""
     bsdf = si.bsdf()
     arrived = dr.dot(si.n, si.to_world(si.wi))
     active &= arrived * si.wi.z > 0

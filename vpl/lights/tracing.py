@@ -44,7 +44,7 @@ _LEAST_EFFECTIVE = 0.02
 
 
 @dataclass(frozen=True)
-class PathSettings:
+class LightPathSettings:
     """Settings of light paths.
 
     ``deepest``: edges of the longest light path whose end may store a light (math.inf: no limit); ``rr_depth``: edges
@@ -77,11 +77,11 @@ class _Walk:
 
     perturbed: Perturbed
     focus: Focus | None
-    settings: PathSettings
+    settings: LightPathSettings
     bounce: Callable
 
     @classmethod
-    def of(cls, scene, focus: Focus | None, settings: PathSettings) -> _Walk:
+    def of(cls, scene, focus: Focus | None, settings: LightPathSettings) -> _Walk:
         """Walk in a scene that must stay unchanged during tracing.
 
         Dr.Jit records an edge once and replays it: for many shapes and materials, recording takes longer than tracing.
@@ -90,7 +90,7 @@ class _Walk:
         return cls(perturbed, focus, settings, partial(dr.freeze(_bounce), scene, perturbed, settings))
 
 
-def _scatter(si, sampler, throughput, settings: PathSettings) -> Scattered:
+def _scatter(si, sampler, throughput, settings: LightPathSettings) -> Scattered:
     """Scatter light paths by BSDF sampling, at surfaces without bump or normal map."""
     context = mi.BSDFContext(mi.TransportMode.Importance)
     sample, weight = si.bsdf().sample(context, si, sampler.next_1d(), sampler.next_2d(), si.is_valid())
@@ -112,7 +112,7 @@ def _scatter(si, sampler, throughput, settings: PathSettings) -> Scattered:
     return Scattered(stored, leaving, normal, normal, valid, direction, following, delta)
 
 
-def _bounce(scene, perturbed, settings: PathSettings, sampler, ray, throughput, power, depth, refuses_delta):
+def _bounce(scene, perturbed, settings: LightPathSettings, sampler, ray, throughput, power, depth, refuses_delta):
     """One edge of every path, in one kernel for every depth.
 
     ``throughput`` starts at 1, and ``power`` remains the emitted power: Russian roulette uses relative values.
@@ -233,7 +233,7 @@ def _warn_of_few(walk: _Walk, lights: VirtualLights) -> None:
 
 @garbage_kept()
 def trace_lights(
-    scene, emitters: Emitters, count: int, seed: int, settings: PathSettings, focus: Focus | None = None
+    scene, emitters: Emitters, count: int, seed: int, settings: LightPathSettings, focus: Focus | None = None
 ) -> TracedLights:
     """Trace light paths from all emitters that store about ``count`` virtual point lights, of kind "oriented".
 

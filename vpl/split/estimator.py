@@ -76,7 +76,7 @@ def estimate(
     mi.Log(mi.LogLevel.Info, f"manylights: {decision.plan}")
     lights, of_lights = make_lights(view, decision, kept, clock)
     radiance, valid, of_image = render_image(view, lights, decision, stopped, clock)
-    statistics = {"balance": decision.plan.reason} | roulette | of_lights | of_image
+    statistics = {"plan": decision.plan.reason} | roulette | of_lights | of_image
     return Estimate(radiance, valid, statistics | {"seconds": clock.seconds})
 
 

@@ -199,8 +199,8 @@ def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: i
     edge = FirstEdge.of(places.position, ray, ones(count) * dr.pi, density, False, State.PAST, cell, 1.0, True)
     lattice = Lattice(dr.arange(mi.UInt32, count), 1, seed)
     found = trace_paths(scene, emitters, edge, lattice, independent_sampler(derived_seed(seed, 1), count), settings)
-    # A light stands for paths of one length, because gather vertices far from the camera may use short paths only. It
-    # takes one contribution, drawn by its share, with that contribution's colour
+    # A light stands for paths of one length, because gather vertices far from the camera may use short paths only. The
+    # irradiance is a single contribution, drawn by its share, with the color of the contribution
     level, more = dr.sum(nearest), dr.sum(found.drawn)
     is_nearest = draw * (level + more) < level
     one = dr.select(is_nearest, nearest, found.drawn)

@@ -14,13 +14,13 @@ from vpl.core.sampling import Choice, derived_seed
 from vpl.lights import tracing
 from vpl.lights.emission import bounding_box, emitter_samplers
 from vpl.lights.emitters import read_emitters
-from vpl.lights.tracing import PathSettings, trace_lights
+from vpl.lights.tracing import LightPathSettings, trace_lights
 
 
 def traced(scene, count=20_000, seed=0, deepest=math.inf, rr_depth=5, lobe_limit=1.0):
     """Lights of a scene dictionary."""
     scene = mi.load_dict(scene)
-    return trace_lights(scene, read_emitters(scene), count, seed, PathSettings(deepest, rr_depth, lobe_limit))
+    return trace_lights(scene, read_emitters(scene), count, seed, LightPathSettings(deepest, rr_depth, lobe_limit))
 
 
 @pytest.fixture
@@ -105,7 +105,7 @@ def test_same_seed_same_lights():
 def test_a_light_that_cannot_get_in_does_not_starve_the_emitter_inside():
     scene = closed_box({"lamp": area_light(), "sky": {"type": "constant", "radiance": 1000.0}})
     scene = mi.load_dict(scene)
-    lights = trace_lights(scene, read_emitters(scene), 5000, 0, PathSettings(3, 5, 1.0)).lights
+    lights = trace_lights(scene, read_emitters(scene), 5000, 0, LightPathSettings(3, 5, 1.0)).lights
     inside = np.abs(lights.position).max(1) < 1.001
     facing_in = np.sum(lights.direction * lights.position, axis=1) < 0
     assert (inside & facing_in).sum() > 100

@@ -83,7 +83,7 @@ def test_lights_that_promise_less_are_not_followed(monkeypatch):
             patch.setattr(estimator, "may_pay", may_pay)
             integrator = mi.load_dict({"type": "manylights", "max_depth": 5})
             mi.render(scene, integrator=integrator, spp=64)
-        found.append((integrator.statistics["balance"], integrator.statistics["lights"], len(followed)))
+        found.append((integrator.statistics["plan"], integrator.statistics["lights"], len(followed)))
     (*chosen, number), (*expected, of_all) = found
     assert chosen == expected and number < of_all
 
