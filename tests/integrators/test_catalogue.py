@@ -22,11 +22,14 @@ from tests.support.catalogue import (
     plugin,
     stage,
 )
+from tests.support.marks import stress
 from tests.support.rendering import render
 from tests.support.scenes import rgb, wall
 from tests.support.statistics import assert_same_mean
 
 # A few materials that nothing else tests by every plugin, and emitters that compile quickly, for the short run
+QUICK_SENSORS = ("thinlens", "distant", "batch")
+QUICK_FILMS = ("luminance float32", "rgba float16", "xyza uint32", "crop", "border")
 QUICK_EMITTERS = ("point", "rectangle", "sphere", "envmap", "spot", "directional")
 
 
@@ -109,7 +112,7 @@ def measured(sensor, **film_options):
     return mi.load_dict(description | {"sensor": SENSORS[sensor](film(*size, **film_options))})
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize("sensor", [*QUICK_SENSORS, *stress(*(name for name in SENSORS if name not in QUICK_SENSORS))])
 def test_every_sensor(sensor):
     scene = measured(sensor)
     reference = cache(lambda seed: render(scene, "prb", 4096, 1000 + seed, max_depth=2))
@@ -138,7 +141,7 @@ def test_a_meter_on_a_surface(name):
     assert_mean_of_reference(scene, name, 4096, lambda seed: render(scene, "prb", 4096, seed, max_depth=2), tiles=1)
 
 
-@pytest.mark.parametrize("options", FILMS)
+@pytest.mark.parametrize("options", [*QUICK_FILMS, *stress(*(name for name in FILMS if name not in QUICK_FILMS))])
 def test_every_film_shows_what_it_shows_of_path(options):
     scene = measured("perspective", **FILMS[options])
     expected = render(scene, "path", 64, max_depth=2)

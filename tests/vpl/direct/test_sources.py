@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import stress
 from vpl.core.arrays import download, upload
 from vpl.core.sampling import find_interval, independent_sampler
 from vpl.direct.emitter_pieces import EmitterPieces
@@ -53,8 +54,10 @@ HOLLOW = ("cube", "sphere", "cylinder")
 PLAIN = [(name, flip, False) for name in SHAPES for flip in (False, True)]
 TEXTURED = [(name, False, True) for name in ("rectangle", "mirrored rectangle", "disk", "cube", "sphere", "cylinder")]
 TEXTURED += [("rectangle", True, True), ("cube", True, True)]
-CASES = pytest.mark.parametrize(
-    ("name", "flip", "textured"), PLAIN + TEXTURED, ids=lambda x: x if isinstance(x, str) else "FT"[x]
+NAMED = {"ids": lambda x: x if isinstance(x, str) else "FT"[x]}
+CASES = pytest.mark.parametrize(("name", "flip", "textured"), PLAIN + TEXTURED, **NAMED)
+QUICK_CASES = pytest.mark.parametrize(
+    ("name", "flip", "textured"), [*(PLAIN + TEXTURED)[::3], *stress(*(PLAIN[1::3] + PLAIN[2::3]))], **NAMED
 )
 
 
@@ -157,7 +160,7 @@ def test_sampled_points_are_visible_and_found_again(name, flip, textured):
     assert hits >= 5000
 
 
-@CASES
+@QUICK_CASES
 def test_integrals_over_directions_are_those_of_traced_rays(name, flip, textured):
     """Solid angle and radiance, whatever Mitsuba's own sampling does."""
     scene, points = emitting(name, flip, textured)

@@ -54,9 +54,9 @@ def test_the_image_is_that_of_path(monkeypatch, lights_cost_nothing, lights):
     scene = mi.load_dict(closed_box(lamp_behind_the_camera(), size=16))
 
     def pair(seed):
-        found, statistics = render_with_statistics("manylights", scene, 512, seed, virtual_lights=lights)
+        found, statistics = render_with_statistics("manylights", scene, 256, seed, virtual_lights=lights)
         assert ("lights" in statistics) == lights and statistics["worth"] > 0
-        return found, render(scene, "path", 512, 1000 + seed)
+        return found, render(scene, "path", 256, seed)
 
     assert_same_mean(pair, 8)
 
