@@ -119,7 +119,7 @@ def view(scene, integrator, sensor, spp=4, seed=0):
     return np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed), dtype=np.float64)
 
 
-def assert_mean_of_reference(scene, reference, spp=4, seeds=12, finds=0.01, plugin="adaptivedirect", **more):
+def assert_mean_of_reference(scene, reference, spp=4, seeds=12, finds=0.02, plugin="adaptivedirect", **more):
     """``reference``: function from a seed to an image."""
     assert_same_mean(lambda seed: (render(scene, plugin, spp, seed, error=0.2, **more), reference(seed)), seeds, finds)
 

@@ -57,7 +57,7 @@ def test_a_closed_box(max_depth):
 @pytest.mark.parametrize("emitters", [*QUICK_EMITTERS, *stress("constant", "sunsky")])
 def test_emitters(emitters):
     ball = {"ball": {"type": "sphere", "center": [-0.6, -0.4, 0.3], "radius": 0.55, "bsdf": {"type": "plastic"}}}
-    lamps = {f"{name}": next(iter(EMITTERS[name]().values())) for name in emitters.split()}
+    lamps = {name: next(iter(EMITTERS[name]().values())) for name in emitters.split()}
     assert_image_of_path(stage(lamps, ball, 16), max_depth=4)
 
 
@@ -275,12 +275,11 @@ def test_sensors(kind):
     objects = one_of(MATERIALS["roughplastic"]())
     scene = mi.load_dict(stage(EMITTERS["rectangle"](), objects, 16) | {"sensor": SENSORS[kind](film(*size))})
     spp = 4096 if kind in ONE_PIXEL else 256
-    found, expected = (
-        np.array([render(scene, name, spp, seed, max_depth=4).mean() for seed in seeds])
-        for name, seeds in (("manylights", range(8)), ("path", range(100, 108)))
-    )
-    error = np.sqrt((found.var(ddof=1) + expected.var(ddof=1)) / 8)
-    assert abs(found.mean() - expected.mean()) < 5 * error
+
+    def pair(seed):
+        return tuple(render(scene, name, spp, seed, max_depth=4) for name in ("manylights", "path"))
+
+    assert_same_mean(pair, 8, tiles=1 if kind in ONE_PIXEL else 4)
 
 
 @pytest.mark.parametrize("wrapper", ["moment", "aov"])
@@ -298,11 +297,11 @@ def test_inside_of_other_integrators(wrapper):
 def test_monochrome():
     mi.set_variant("llvm_ad_mono")
     scene = mi.load_dict(closed_box(lamp_behind_the_camera(), 16))
-    found, expected = (
-        np.array([render(scene, name, 64, seed, max_depth=5).mean() for seed in range(8)])
-        for name in ("manylights", "path")
-    )
-    assert abs(found.mean() - expected.mean()) < 5 * np.sqrt((found.var(ddof=1) + expected.var(ddof=1)) / 8)
+
+    def pair(seed):
+        return tuple(render(scene, name, 256, seed, max_depth=5) for name in ("manylights", "path"))
+
+    assert_same_mean(pair, 8)
 
 
 # ---------------------- Edges ----------------------

@@ -5,6 +5,5 @@ import pytest
 
 def stress(*values):
     """Parameters of a test that only the stress run takes."""
-    return [
-        pytest.param(*(value if isinstance(value, tuple) else [value]), marks=pytest.mark.stress) for value in values
-    ]
+    rows = (value if isinstance(value, tuple) else (value,) for value in values)
+    return [pytest.param(*row, marks=pytest.mark.stress) for row in rows]

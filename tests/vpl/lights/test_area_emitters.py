@@ -61,6 +61,6 @@ def test_a_mesh_with_vertex_normals_emits_to_the_side_of_its_shading_normals(met
     bsdf_samples = {"emitter_samples": 0, "bsdf_samples": 1}
 
     def pair(seed):
-        return render(scene, plugin, 64, seed, **more), render(scene, "direct", 64, seed, **bsdf_samples)
+        return render(scene, plugin, 256, seed, **more), render(scene, "direct", 256, seed, **bsdf_samples)
 
     assert_same_mean(pair, 8)
