@@ -15,6 +15,7 @@ import pytest
 import compare
 from comparison import images, runs, worker
 from tests.support.comparisons import SCHEMA
+from tests.support.marks import stress
 from tests.support.paths import CORNELL, ROOT
 from tests.support.processes import PATIENCE, wait_until
 
@@ -55,7 +56,7 @@ def workers_of(out):
     return found
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, *stress(signal.SIGTERM)])
 def test_interruption_leaves_a_report_of_what_is_finished(tmp_path, signal_number):
     process = start(tmp_path)
     process.send_signal(signal_number)

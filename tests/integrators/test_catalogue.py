@@ -58,8 +58,8 @@ def reference(scene, spp=512, seeds=4, **more):
     return [render(scene, "prb", spp, 100 + seed, max_depth=2, **more) for seed in range(seeds)]
 
 
-@pytest.mark.parametrize(("number", "material"), list(enumerate(MATERIALS)))
-def test_every_material_with_some_plugin(number, material):
+@pytest.mark.parametrize(("number", "material"), list(enumerate(list(MATERIALS)[::2])))
+def test_some_materials_with_some_plugin(number, material):
     names, emitters = list(PLUGINS), list(QUICK_EMITTERS)
     emitter = EMITTERS[emitters[number % len(emitters)]]()
     scene = mi.load_dict(stage(emitter, one_of(MATERIALS[material]()), 16))
