@@ -57,7 +57,7 @@ OTHER_PAIRS = [pair for pair in itertools.product(WITH_LIGHTS, LIGHTS) if pair n
 @pytest.mark.parametrize(("integrator", "light"), [*QUICK_PAIRS, *stress(*OTHER_PAIRS)])
 def test_energy_equals_path_in_closed_diffuse_scenes(integrator, light):
     scene = mi.load_dict(closed_box(LIGHTS[light]()))
-    assert_mean_of_path(scene, integrator, 32, 5, **EXACT)
+    assert_mean_of_path(scene, integrator, 8, 5, **EXACT)
 
 
 @pytest.mark.parametrize("direct", ["nee", "vpl"])
@@ -83,7 +83,7 @@ def test_direct_light_equals_path(direct, kind):
 @pytest.mark.parametrize("max_depth", [2, 3, -1])
 def test_max_depth_counts_the_same_edges_as_path(max_depth):
     scene = mi.load_dict(closed_box({"lamp": area_light()}))
-    assert_mean_of_path(scene, "lightcuts", 32, max_depth, **EXACT)
+    assert_mean_of_path(scene, "lightcuts", 8, max_depth, **EXACT)
 
 
 @pytest.mark.parametrize("max_depth", [0, 1])
