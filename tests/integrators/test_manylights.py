@@ -21,7 +21,7 @@ QUICK_MATERIALS = ("roughplastic", "principled", "blendbsdf", "twosided", "diffu
 pytestmark = pytest.mark.usefixtures("lights_cost_nothing")
 
 
-def assert_image_of_path(description, spp=256, seeds=8, finds=0.01, reference="path", lights=True, **more):
+def assert_image_of_path(description, spp=256, seeds=8, finds=0.02, reference="path", lights=True, **more):
     """Means over seeds, over tiles and over the image, are those of ``reference``."""
     scene = mi.load_dict(description)
 
@@ -58,7 +58,7 @@ def test_a_closed_box(max_depth):
 def test_emitters(emitters):
     ball = {"ball": {"type": "sphere", "center": [-0.6, -0.4, 0.3], "radius": 0.55, "bsdf": {"type": "plastic"}}}
     lamps = {name: next(iter(EMITTERS[name]().values())) for name in emitters.split()}
-    assert_image_of_path(stage(lamps, ball, 16), max_depth=4)
+    assert_image_of_path(stage(lamps, ball, 16), finds=0.01, max_depth=4)
 
 
 def test_a_turned_sphere_with_a_texture():
