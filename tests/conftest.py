@@ -1,6 +1,7 @@
 """Fixtures of all tests, and the number of processes of a run."""
 
 import os
+import signal
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,11 @@ from tests.support.rendering import plugin_with_model
 
 VARIANT = "llvm_ad_rgb"
 MOST_PROCESSES = 4  # each holds some 2 GiB
+
+
+def pytest_configure():
+    """Hear Ctrl-C, which the background processes of a script ignore, with all processes that tests start."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_xdist_auto_num_workers(config):

@@ -104,7 +104,7 @@ def squared_error(image, exact):
 
 @pytest.fixture(scope="module")
 def exact(variant):
-    return render(cornell(64).load(), "path", 2048, 99, max_depth=6)
+    return render(cornell(64).load(), "path", 1024, 99, max_depth=6)
 
 
 @pytest.mark.parametrize("integrator", ["path", "lightcuts", "manylights"])

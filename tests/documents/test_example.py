@@ -35,6 +35,7 @@ def rendered(scene, name, **more):
     return np.mean([np.array(mi.render(scene, integrator=plugin, seed=seed, spp=4)) for seed in range(4)], axis=0)
 
 
+@pytest.mark.stress
 def test_the_first_image(tmp_path):
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
     (tmp_path / "first.py").write_text(printed("start.md"))

@@ -7,10 +7,13 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+from tests.support.marks import stress
 from tests.support.processes import PATIENCE
 
 FOLDER = Path(__file__).resolve().parents[2] / "notebooks"
-notebooks = pytest.mark.parametrize("file", sorted(FOLDER.glob("*.ipynb")), ids=lambda file: file.stem)
+FILES = sorted(FOLDER.glob("*.ipynb"))
+notebooks = pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+QUICK = ("first_render", "compare_methods")
 
 
 @notebooks
@@ -22,12 +25,12 @@ def test_notebook_is_kept_without_outputs(file):
     assert file.stem in (FOLDER / "README.md").read_text()
 
 
-@notebooks
-def test_notebook_runs(file, tmp_path):
+@pytest.mark.parametrize("stem", [*QUICK, *stress(*(file.stem for file in FILES if file.stem not in QUICK))])
+def test_notebook_runs(stem, tmp_path):
     """Run in a copy of the folder, beside the scenes, so output files stay out of the repository."""
     (tmp_path / "scenes").symlink_to(FOLDER.parent / "scenes")
     (tmp_path / "notebooks").mkdir()
-    notebook = nbformat.read(file, as_version=4)
+    notebook = nbformat.read(FOLDER / f"{stem}.ipynb", as_version=4)
     client = NotebookClient(
         notebook, timeout=PATIENCE, kernel_name="python3", resources={"metadata": {"path": tmp_path / "notebooks"}}
     )

@@ -298,6 +298,7 @@ def test_properties_are_shown_with_their_defaults():
     assert "error = 0.015" in str(mi.load_dict({"type": NAME}))
 
 
+@pytest.mark.stress
 def test_no_kernel_reads_or_writes_outside_of_an_array(capfd):
     """Dr.Jit's debug mode checks every index."""
     scene = glossy_room()

@@ -1,5 +1,6 @@
 """The integrators through Mitsuba's interface: against ``path``, in each way of calling plugins."""
 
+import itertools
 import math
 
 import drjit as dr
@@ -7,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import stress
 from tests.support.rendering import render
 from tests.support.rooms import ODD_SCENES
 from tests.support.scenes import area_light, closed_box, sensor, wall
@@ -15,12 +17,12 @@ from tests.support.statistics import assert_same_mean
 EXACT = {"clamping": 0.0, "vpl_count": 2000}
 
 
-def assert_mean_of_path(scene, integrator, spp, max_depth, seeds=8, path_spp=256, **more):
+def assert_mean_of_path(scene, integrator, spp, max_depth, seeds=8, finds=0.015, **more):
     def pair(seed):
         found = render(scene, integrator, spp, seed, max_depth=max_depth, **more)
-        return found, render(scene, "path", path_spp, 1000 + seed, max_depth=max_depth)
+        return found, render(scene, "path", spp, seed, max_depth=max_depth)
 
-    assert_same_mean(pair, seeds)
+    assert_same_mean(pair, seeds, finds)
 
 
 LIGHTS = {
@@ -47,15 +49,19 @@ LIGHTS = {
 }
 
 
-@pytest.mark.parametrize("integrator", ["vpl", "lightcuts", "mdlightcuts", "lightslice"])
-@pytest.mark.parametrize("light", LIGHTS)
+WITH_LIGHTS = ("vpl", "lightcuts", "mdlightcuts", "lightslice")
+QUICK_PAIRS = list(zip(WITH_LIGHTS, LIGHTS, strict=True))
+OTHER_PAIRS = [pair for pair in itertools.product(WITH_LIGHTS, LIGHTS) if pair not in QUICK_PAIRS]
+
+
+@pytest.mark.parametrize(("integrator", "light"), [*QUICK_PAIRS, *stress(*OTHER_PAIRS)])
 def test_energy_equals_path_in_closed_diffuse_scenes(integrator, light):
     scene = mi.load_dict(closed_box(LIGHTS[light]()))
-    assert_mean_of_path(scene, integrator, 4, 5, **EXACT)
+    assert_mean_of_path(scene, integrator, 8, 5, **EXACT)
 
 
 @pytest.mark.parametrize("direct", ["nee", "vpl"])
-@pytest.mark.parametrize("kind", ["envmap", "constant", "directional", "area"])
+@pytest.mark.parametrize("kind", ["envmap", "area", *stress("constant", "directional")])
 def test_direct_light_equals_path(direct, kind):
     rng = np.random.default_rng(0)
     sky = mi.Bitmap(rng.uniform(0, 2, (8, 16, 3)).astype(np.float32) ** 3)
@@ -77,7 +83,7 @@ def test_direct_light_equals_path(direct, kind):
 @pytest.mark.parametrize("max_depth", [2, 3, -1])
 def test_max_depth_counts_the_same_edges_as_path(max_depth):
     scene = mi.load_dict(closed_box({"lamp": area_light()}))
-    assert_mean_of_path(scene, "lightcuts", 4, max_depth, 16, **EXACT)
+    assert_mean_of_path(scene, "lightcuts", 8, max_depth, **EXACT)
 
 
 @pytest.mark.parametrize("max_depth", [0, 1])
@@ -248,7 +254,7 @@ def test_odd_scenes_render_without_nan(integrator, name):
         assert image.max() > 0
 
 
-@pytest.mark.parametrize("integrator", ["lightcuts", "mdlightcuts", "lightslice", "matrixrecovery"])
+@pytest.mark.parametrize("integrator", ["lightcuts", "lightslice", *stress("mdlightcuts", "matrixrecovery")])
 def test_no_kernel_reads_or_writes_outside_of_an_array(integrator, capfd):
     """Dr.Jit's debug mode checks every index; a mirror and a pane give camera paths of several waves."""
     objects = {

@@ -8,6 +8,7 @@ import mitsuba as mi
 import pytest
 
 import integrators
+from tests.support.marks import stress
 from tests.support.rendering import plugin_with_model
 from tests.support.scenes import area_light, closed_box
 from vpl.core.registry import RegistryTable
@@ -38,7 +39,10 @@ def compiled():
         yield count
 
 
-@pytest.mark.parametrize("name", integrators.PLUGINS)
+QUICK = ("manylights", "lightcuts", "matrixrecovery", "adaptivedirect")
+
+
+@pytest.mark.parametrize("name", [*QUICK, *stress(*(name for name in integrators.PLUGINS if name not in QUICK))])
 def test_sizes_and_samples_are_in_no_kernel(name, compiled, lights_cost_nothing):
     views = {f"view_{size}": closed_box({}, size)["sensor"] for size in (32, 40, 48)}
     scene = mi.load_dict(closed_box({"lamp": area_light()}) | views)

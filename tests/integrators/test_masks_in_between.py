@@ -19,8 +19,8 @@ def assert_image_of_prb(description, max_depth, seeds=10):
     scene = mi.load_dict(description)
 
     def pair(seed):
-        found = render(scene, "vpl", 4, seed, max_depth=max_depth, **ALL_LIGHTS)
-        return found, render(scene, "prb", 1024, 1000 + seed, max_depth=max_depth)
+        found = render(scene, "vpl", 16, seed, max_depth=max_depth, **ALL_LIGHTS)
+        return found, render(scene, "prb", 256, seed, max_depth=max_depth)
 
     assert_same_mean(pair, seeds)
 

@@ -1,4 +1,4 @@
-"""The integrator ``matrixrecovery``: slices, columns, predictors, separation, and images against ``vpl``."""
+"""The integrator ``matrixrecovery``: predictors, and images against ``vpl``."""
 
 from functools import partial
 
@@ -6,25 +6,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from benchmarks.separated_light import light_of_entries
 from comparison.scene_files import SceneFile
 from tests.support.pairs import batch_of
 from tests.support.paths import ROOT
-from tests.support.properties import assert_properties_are_shown, assert_property_is_refused, examples, unit_vectors
+from tests.support.properties import assert_properties_are_shown, assert_property_is_refused
 from tests.support.rendering import render, render_with_statistics
 from tests.support.rooms import glossy_room, many_kinds
 from tests.support.scenes import area_light, closed_box, sensor, wall
 from tests.support.statistics import relative_error
-from vpl.core.arrays import download, upload
+from vpl.core.arrays import download
 from vpl.matrix import recovery as matrix_recovery
-from vpl.matrix.reduced_columns import _nearby
 from vpl.matrix.reduced_matrix import MatrixRows
-from vpl.matrix.separation import Separation, SeparationLimits, separate, sketch
+from vpl.matrix.separation import Separation
 from vpl.points.point_clusters import PointClusters
-from vpl.points.slice_rows import build_row_slices, golden_steps, rows_of, tangent_places
+from vpl.points.slice_rows import build_row_slices
 
 NAME = "matrixrecovery"
 PREDICTED = "nearest,linear,bayes"
@@ -33,167 +30,6 @@ SMALL = {"max_depth": 4, "vpl_count": 3000, "direct": "vpl"}
 EXACT = {"alpha": 0.0, "max_columns": 100_000, "sampling": 9.0}
 
 rendered = partial(render_with_statistics, NAME)
-
-
-# ---- Slices of rows
-
-
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    pixels=st.integers(1, 200),
-    samples=st.integers(1, 5),
-    most=st.integers(1, 70),
-    shape=st.sampled_from(["spread", "one place", "line", "one far away"]),
-)
-@settings(max_examples=examples(60), deadline=None)
-def test_every_point_is_in_one_slice_whose_rows_are_few_enough_and_whole(seed, pixels, samples, most, shape):
-    rng = np.random.default_rng(seed)
-    pixel = rng.permutation(np.repeat(np.arange(pixels), samples))
-    position, normal = rng.random((len(pixel), 3)).astype(np.float32), unit_vectors(rng, len(pixel))
-    if shape == "one place":
-        position[:], normal[:] = position[0], normal[0]
-    elif shape == "line":
-        position[:, 1:] = 0
-    elif shape == "one far away":
-        position[0] = 1e6
-    tree = build_row_slices(pixel, most, position, normal)
-    assert np.array_equal(np.sort(tree.order), np.arange(len(pixel)))
-    leaves = tree.leaves
-    assert np.array_equal(tree.first[leaves], np.cumsum(tree.count[leaves]) - tree.count[leaves])
-    begin = rows_of(pixel[tree.order], tree.leaf)
-    for leaf in leaves:
-        inside = pixel[tree.order][tree.leaf == leaf]
-        rows = np.flatnonzero((begin[:-1] >= tree.first[leaf]) & (begin[:-1] < tree.first[leaf] + tree.count[leaf]))
-        assert len(rows) == len(np.unique(inside)) <= most
-
-
-def test_slices_that_must_be_divided_are_halved():
-    rng = np.random.default_rng(0)
-    position = rng.random((4096, 3)).astype(np.float32)
-    tree = build_row_slices(np.arange(4096), 100, position, np.tile(np.float32([0, 0, 1]), (4096, 1)))
-    assert (tree.count[tree.leaves] == 64).all()
-
-
-def test_bad_row_slices_are_refused_by_name():
-    position, normal = np.zeros((3, 3), np.float32), np.tile(np.float32([0, 0, 1]), (3, 1))
-    with pytest.raises(ValueError, match="most must be at least 1, got 0"):
-        build_row_slices(np.arange(3), 0, position, normal)
-    position[1, 2] = np.inf
-    with pytest.raises(ValueError, match="position must be finite, but row 1"):
-        build_row_slices(np.arange(3), 2, position, normal)
-
-
-def test_places_in_the_plane_of_a_slice_keep_distances():
-    rng = np.random.default_rng(1)
-    position = rng.random((50, 3))
-    position[:, 0] = 3
-    places = tangent_places(position, np.tile([1.0, 0, 0], (50, 1)), np.array([0]), np.zeros(50, int))
-    extent = (position[:, 1:].max(0) - position[:, 1:].min(0)).max()
-    between = np.linalg.norm(position[:, None] - position, axis=2) / extent
-    assert np.allclose(np.linalg.norm(places[:, :, None] - places[:, None], axis=0), between, atol=1e-9)
-    assert places.min() == 0 and places.max() == pytest.approx(1)
-
-
-def test_steps_of_samples_visit_every_row_once():
-    counts = np.arange(1, 1100)
-    steps = golden_steps(counts)
-    for count, step in zip(counts, steps, strict=True):
-        assert len(np.unique(np.arange(count) * step % count)) == count
-
-
-def test_neighbours_lend_each_other_only_within_their_segment():
-    values = np.array([1.0, 5, 2, 0, 0, 7, 0, 3])
-    segment = np.array([0, 0, 0, 0, 0, 1, 1, 2])
-    assert _nearby(np.maximum, values, segment).tolist() == [5, 5, 5, 5, 2, 7, 7, 3]
-    assert _nearby(np.add, values, segment).tolist() == [8, 8, 8, 7, 2, 7, 7, 3]
-
-
-# ---- Separation
-
-
-def planted(seed, shape, rank, errors):
-    """Visibility of low rank: (what it is, the same with a share of entries wrong)."""
-    rng = np.random.default_rng(seed)
-    count, n, m = shape
-    columns = rng.random((count, n, rank)).argmax(2)
-    patterns = rng.random((count, rank, m)) < 0.6
-    true = np.take_along_axis(patterns, columns[:, :, None], 1).astype(np.float32)
-    wrong = rng.random(shape) < errors
-    return true, np.where(wrong, 1 - true, true)
-
-
-def separated(matrices, free=None, weight=None, **limits):
-    """Z and the rest of what is found, for matrices (s, n, m)."""
-    matrices = np.asarray(matrices, np.float32)
-    free = np.ones(matrices.shape, bool) if free is None else free
-    weight = np.ones_like(matrices) if weight is None else weight
-    mask = upload(mi.UInt32, free) == 1
-    arrays = [upload(mi.Float, values) for values in (matrices, weight)]
-    dr.eval(mask)
-    found = separate(arrays[0], mask, arrays[1], matrices.shape, SeparationLimits(**limits))
-    return download(found.error).reshape(matrices.shape), found
-
-
-def test_sparse_errors_are_told_from_low_rank():
-    true, wrong = planted(0, (3, 60, 90), 4, 0.04)
-    error, found = separated(wrong, residual=0.01, progress=-1.0, relative=0.12)
-    assert not found.failed.any() and (found.rank == 4).all()
-    corrected = wrong - np.round(error)
-    assert (corrected != true).mean() < 0.1 * (wrong != true).mean()
-
-
-def test_entries_that_were_traced_are_never_wrong():
-    _, wrong = planted(1, (2, 40, 50), 3, 0.05)
-    free = np.random.default_rng(2).random(wrong.shape) < 0.5
-    error, _ = separated(wrong, free)
-    assert (error[~free] == 0).all() and (error[free] != 0).any()
-
-
-def test_errors_are_of_the_sign_and_size_that_entries_allow():
-    _, wrong = planted(3, (2, 40, 50), 3, 0.1)
-    weight = np.random.default_rng(4).random(wrong.shape).astype(np.float32) * 5
-    error, _ = separated(wrong * weight, None, weight)
-    rest = wrong * weight - error
-    assert (rest > -1e-4).all() and (rest < weight + 1e-4).all()
-
-
-def test_the_sketch_has_the_leading_singular_values():
-    rng = np.random.default_rng(5)
-    matrix = (rng.random((80, 6)) @ rng.random((6, 120)) + 1e-3 * rng.random((80, 120))).astype(np.float32)
-    values, vectors = sketch(matrix, rng.standard_normal((120, 14)).astype(np.float32))
-    exact = np.linalg.svd(matrix, compute_uv=False)
-    assert np.allclose(values[:4], exact[:4], rtol=1e-2)
-    assert np.allclose(np.linalg.norm(vectors, axis=1)[:4], values[:4], rtol=1e-3)
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 30), (2, 30, 1), (3, 2, 2), (1, 50, 40)])
-@pytest.mark.parametrize("kind", ["zero", "one", "random", "single", "bright", "no weight", "rank one"])
-def test_hostile_matrices_stay_finite(shape, kind):
-    rng = np.random.default_rng(6)
-    matrices = {
-        "zero": np.zeros(shape), "one": np.ones(shape), "random": rng.random(shape).round(),
-        "single": np.zeros(shape), "bright": rng.random(shape), "no weight": rng.random(shape).round(),
-        "rank one": rng.random((shape[0], shape[1], 1)) * rng.random((shape[0], 1, shape[2])),
-    }[kind]  # fmt: skip
-    weight = np.ones(shape)
-    if kind in ("single", "bright"):
-        matrices[0, 0, 0] = 1e12 if kind == "bright" else 1
-    if kind == "no weight":
-        # One over E is infinite here
-        weight[:, :, ::2] = 0
-        matrices *= weight
-    error, found = separated(matrices, None, np.maximum(weight, matrices))
-    assert np.isfinite(error).all() and len(found.residual) <= 20
-    assert (error[weight == 0] == 0).all()
-    if kind in ("zero", "one"):
-        assert not found.failed.any() and np.abs(error).max() < 1e-3
-
-
-def test_values_that_are_not_finite_make_their_matrix_fail_alone():
-    _, wrong = planted(7, (3, 30, 40), 3, 0.05)
-    wrong[1, 4, 5] = np.nan
-    _, found = separated(wrong)
-    assert found.failed.tolist() == [False, True, False]
 
 
 # ---- Images

@@ -1,69 +1,138 @@
-"""Regions of environments that are kept between calls."""
-
-import sys
-from concurrent.futures import ThreadPoolExecutor
+"""Regions of the environment emitter: sampling and shares of light."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.core.arrays import download
-from vpl.direct.environment_regions import regions_of
+from tests.support.sources import (
+    COUNT,
+    SKIES,
+    assert_mostly,
+    colours,
+    interactions,
+    mean_and_error,
+    sky,
+    smooth_map,
+    tilted,
+)
+from vpl.core.arrays import download, upload
+from vpl.core.sampling import independent_sampler
+from vpl.direct.environment_regions import EnvironmentRegions
+from vpl.direct.sources import Sources
+from vpl.lights.emitters import read_emitters
 
 
-def constant(level: float):
-    return mi.load_dict({"type": "scene", "sky": {"type": "constant", "radiance": level}}).environment()
+def environment(plugin):
+    ball = {"type": "sphere", "radius": 0.1}
+    return mi.load_dict({"type": "scene", "sky": plugin, "ball": ball}).environment()
 
 
-def called_between_lines(function, other, *arguments):
-    """Result of a function, before each line of which another thread calls ``other``; and how many lines there were."""
-    lines, before = 0, sys.gettrace()
-
-    def trace(frame, event, _):
-        nonlocal lines
-        if frame.f_code is not function.__code__:
-            return None
-        if event == "line":
-            lines += 1
-            pool.submit(other).result()
-        return trace
-
-    with ThreadPoolExecutor(1) as pool:
-        sys.settrace(trace)
-        try:
-            return function(*arguments), lines
-        finally:
-            sys.settrace(before)
+def grid_directions(height=1024):
+    """Directions in the middle of all cells of a grid, and their solid angles."""
+    width = 2 * height
+    edges = np.cos(np.linspace(0, np.pi, height + 1))
+    theta = (np.arange(height) + 0.5) * np.pi / height
+    phi = (np.arange(width) + 0.5) * 2 * np.pi / width
+    sine, ones = np.sin(theta), np.ones(width)
+    unit = np.stack([np.outer(sine, np.cos(phi)), np.outer(sine, np.sin(phi)), np.outer(np.cos(theta), ones)], -1)
+    angle = np.repeat((edges[:-1] - edges[1:]) * 2 * np.pi / width, width)
+    return mi.Vector3f(*(upload(mi.Float, unit[..., k]) for k in range(3))), angle
 
 
-@pytest.mark.parametrize("known", [False, True])
-def test_a_thread_gets_the_regions_of_its_own_environment(known):
-    ours, theirs = constant(1.0), constant(5.0)
-    expected = regions_of(ours if known else theirs, 4).irradiance.sum()
-    assert expected == pytest.approx(4 * np.pi * (1 if known else 5), rel=1e-4)
-    regions, lines = called_between_lines(regions_of, lambda: regions_of(theirs, 4), ours, 4)
-    assert lines > 1
-    assert regions.environment is ours
-    assert regions.irradiance.sum() == pytest.approx(4 * np.pi, rel=1e-4)
+def draw_regions(regions, index, seed=0):
+    """(Direction, value, density) with every region of ``index`` in turn."""
+    sampler = independent_sampler(seed, len(index))
+    return regions.sample(upload(mi.UInt32, index), sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
 
 
-def test_regions_are_kept_until_the_environment_or_an_argument_changes():
-    environment = constant(1.0)
-    regions = regions_of(environment, 4)
-    assert regions_of(environment, 4) is regions
-    assert regions_of(environment, 5).count == 5
-    again = regions_of(environment, 4)
-    parameters = mi.traverse(environment)
-    parameters["radiance.value"] = 2.0
-    parameters.update()
-    assert regions_of(environment, 4).irradiance.sum() == pytest.approx(2 * again.irradiance.sum())
+def mitsubas_light(env):
+    """Samples of the light of all directions by Mitsuba's own routine, (COUNT, 3)."""
+    sample = independent_sampler(5, COUNT).next_2d()
+    return colours(env.sample_direction(interactions([[0, 0, 0]], COUNT), sample)[1], COUNT)
 
 
-def test_regions_show_their_own_environment_after_an_equal_one_was_edited():
-    edited, untouched = constant(1.0), constant(1.0)
-    regions_of(edited, 4)
-    parameters = mi.traverse(edited)
-    parameters["radiance.value"] = 3.0
-    parameters.update()
-    radiance = regions_of(untouched, 4).radiance(mi.Vector3f(0, 0, 1), mi.Bool(True))
-    assert download(radiance.x) == pytest.approx(1)
+@pytest.mark.parametrize("name", SKIES)
+@pytest.mark.parametrize("count", [1, 40])
+def test_directions_are_found_in_the_region_they_were_drawn_from(name, count):
+    regions = EnvironmentRegions(environment(SKIES[name]()), count)
+    assert 1 <= regions.count <= count
+    index = np.repeat(np.arange(regions.count), COUNT // regions.count)
+    direction, value, density = draw_regions(regions, index)
+    unit = download(direction)
+    assert np.allclose(np.linalg.norm(unit, axis=1), 1, atol=1e-5)
+    region, again = regions.find(direction, mi.Bool(True))
+    assert_mostly(download(region) == index, 0.999)
+    assert_mostly(np.abs(download(again) / download(density) - 1) < 1e-4, 0.998)
+    cosine = np.einsum("ij,ij->i", unit, regions.axis[index])
+    assert (cosine >= regions.cone_cos[index] - 1e-5).all()
+    radiance = colours(regions.radiance(direction, mi.Bool(True)), len(index))
+    assert np.allclose(colours(value, len(index)) * download(density)[:, None], radiance, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", SKIES)
+def test_regions_share_out_all_light(name):
+    env = environment(SKIES[name]())
+    regions = EnvironmentRegions(env, 30)
+    direction, angle = grid_directions()
+    region, density = regions.find(direction, mi.Bool(True))
+    region, radiance = download(region), colours(regions.radiance(direction, mi.Bool(True)), len(angle))
+    assert np.allclose(np.bincount(region, angle * download(density), regions.count), 1, atol=1e-3)
+    light = np.stack([np.bincount(region, angle * radiance[:, k], regions.count) for k in range(3)], 1)
+    assert np.allclose(regions.irradiance, light.mean(1), rtol=0.03)
+    per_region = 4000
+    drawn = colours(
+        draw_regions(regions, np.repeat(np.arange(regions.count), per_region))[1], regions.count * per_region
+    )
+    drawn = drawn.reshape(regions.count, per_region, 3)
+    mean, error = drawn.mean(1), drawn.std(1) / np.sqrt(per_region)
+    assert (np.abs(mean - light) < 5 * error + 5e-3 * light + 1e-12).all()
+    # Within a region the weights hardly differ, thanks to the table
+    assert (drawn.std(1) < 0.5 * mean).all()
+    expected, expected_error = mean_and_error(mitsubas_light(env))
+    assert np.allclose(light.sum(0), expected, rtol=5e-3, atol=5 * expected_error.max())
+
+
+def test_regions_of_a_constant_environment_fill_the_sphere():
+    regions = EnvironmentRegions(environment(SKIES["constant"]()), 50)
+    assert regions.count == 50
+    assert regions.irradiance.sum() == pytest.approx(4 * np.pi * 2, rel=1e-4)
+
+
+def test_a_black_environment_gives_nothing_and_no_nan():
+    for plugin in (sky(np.zeros((8, 16, 3))), {"type": "constant", "radiance": 0.0}):
+        regions = EnvironmentRegions(environment(plugin), 10)
+        assert regions.count >= 1
+        assert regions.irradiance.sum() == 0
+        assert np.isfinite(regions.axis).all()
+        direction, value, density = draw_regions(regions, np.zeros(1000, int))
+        assert np.isfinite(download(direction)).all()
+        assert colours(value, 1000).max() == 0
+        assert download(density).min() > 0
+        scene = mi.load_dict({"type": "scene", "sky": plugin, "ball": {"type": "sphere"}})
+        assert Sources(scene, read_emitters(scene), 10).count == 0
+
+
+@pytest.mark.parametrize("shape", [(32, 64), (256, 512), (1024, 2048)], ids=str)
+def test_a_single_very_bright_texel_is_found(shape):
+    pixels = np.full((*shape, 3), 1e-3)
+    pixels[shape[0] // 3, shape[1] // 5] = 1e9
+    env = environment(sky(pixels, tilted()))
+    regions = EnvironmentRegions(env, 20)
+    brightest = int(np.argmax(regions.irradiance))
+    assert regions.irradiance[brightest] > 0.1 * regions.irradiance.sum()
+    index = np.arange(COUNT) % regions.count
+    _, value, density = draw_regions(regions, index)
+    value = colours(value, COUNT)[:, 0]
+    total = np.array([value[index == region].mean() for region in range(regions.count)])
+    assert total.sum() == pytest.approx(mitsubas_light(env)[:, 0].mean(), rel=0.1)
+    assert np.mean(value[index == brightest] * download(density)[index == brightest] > 1) > 0.8
+
+
+def test_texels_that_are_not_finite_count_as_black():
+    pixels = smooth_map()
+    pixels[10, 10], pixels[20, 50] = np.nan, np.inf
+    regions = EnvironmentRegions(environment(sky(pixels)), 10)
+    assert np.isfinite(regions.irradiance).all()
+    value = colours(draw_regions(regions, np.arange(COUNT) % regions.count)[1], COUNT)
+    assert np.isfinite(value).all()
+    assert value.max() > 0

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from tests.support.catalogue import EMITTERS
+from tests.support.marks import stress
 from tests.support.rendering import render
 from tests.support.rooms import lamp_behind_the_camera
 from tests.support.scenes import closed_box, rgb, wall
@@ -33,8 +34,10 @@ def room_on_a_plane(light, size):
     return mi.load_dict(box)
 
 
-@pytest.mark.parametrize("size", [1e2, 1e4])
-@pytest.mark.parametrize("light", LIGHTS)
+@pytest.mark.parametrize(
+    ("light", "size"),
+    [("lamp", 1e4), ("sun", 1e2), ("envmap", 1e4), *stress(("lamp", 1e2), ("sun", 1e4), ("envmap", 1e2))],
+)
 def test_a_far_ground_takes_no_light_from_a_room(light, size):
     scene = room_on_a_plane(light, size)
     more = {"max_depth": 5}
@@ -47,14 +50,14 @@ def test_a_far_ground_takes_no_light_from_a_room(light, size):
     certain = light == "lamp" or size < 1e3
     expected = np.mean([render(scene, "path", 256, 2000 + seed, **more) for seed in range(4)])
     if certain:
-        assert_same_mean(pair, 8)
+        assert_same_mean(pair, 8, 0.02)
     else:
         assert np.mean([pair(seed)[0] for seed in range(8)]) == pytest.approx(expected, rel=0.2)
     clamped = np.mean([render(scene, "lightcuts", 4, seed, vpl_count=10_000, **more) for seed in range(4)])
     assert clamped == pytest.approx(expected, rel=0.05 if certain else 0.2)
 
 
-@pytest.mark.parametrize("name", ["vpl", "mdlightcuts", "lightslice", "matrixrecovery", "illuminationcut"])
+@pytest.mark.parametrize("name", ["vpl", "illuminationcut", *stress("mdlightcuts", "lightslice", "matrixrecovery")])
 def test_in_all_plugins_with_lights(name):
     scene = room_on_a_plane("lamp", 1e4)
     images = [render(scene, name, 8, seed, max_depth=3, vpl_count=2000) for seed in range(3)]

@@ -10,6 +10,7 @@ import pytest
 from tests.support.calls import calls_of
 from tests.support.catalogue import EMITTERS
 from tests.support.many_emitters import bulbs, interactions, panels, sampler_of, vertices
+from tests.support.marks import stress
 from tests.support.rendering import plugin_with_model, render
 from tests.support.scenes import closed_box, image, rgb, wall
 from tests.support.statistics import assert_same_mean
@@ -59,9 +60,9 @@ def always():
         yield
 
 
-def assert_image_of_path(scene, spp=128, **more):
+def assert_image_of_path(scene, **more):
     def pair(seed):
-        return render(scene, "manylights", spp, seed, **more), render(scene, "path", 2 * spp, 1000 + seed, **more)
+        return tuple(render(scene, name, 64, seed, **more) for name in ("manylights", "path"))
 
     assert_same_mean(pair, 8)
 
@@ -91,8 +92,10 @@ def test_lights_that_promise_less_are_not_followed(monkeypatch):
 # ---------------------- Expectation ----------------------
 
 
-@pytest.mark.parametrize("max_depth", [2, 3, -1])
-@pytest.mark.parametrize("floor", ["plastic", "diffuse"])
+@pytest.mark.parametrize(
+    ("floor", "max_depth"),
+    [("plastic", 3), ("diffuse", -1), *stress(("plastic", 2), ("plastic", -1), ("diffuse", 2), ("diffuse", 3))],
+)
 def test_the_mean_over_seeds_is_that_of_path(floor, max_depth, always):
     rng = np.random.default_rng(5)
     box = closed_box(panels(40, rng) | spots(20, rng) | bulbs(20, rng) | balls(20, rng) | EMITTERS["envmap"](), 16)
@@ -104,7 +107,7 @@ def test_the_mean_over_seeds_is_that_of_path(floor, max_depth, always):
     assert_image_of_path(scene, max_depth=max_depth)
 
 
-@pytest.mark.parametrize("integrator", [{"hide_emitters": True}, {"rr_depth": 1}])
+@pytest.mark.parametrize("integrator", [{"hide_emitters": True, "rr_depth": 1}])
 def test_emitters_that_are_hidden_and_paths_that_end_soon_change_no_mean(integrator, always):
     rng = np.random.default_rng(6)
     scene = mi.load_dict(closed_box(panels(40, rng) | balls(40, rng), 16))

@@ -57,9 +57,9 @@ def test_the_image_is_that_of_path(lights):
     scene = mi.load_dict(closed_box(lamp_behind_the_camera(), size=16))
 
     def pair(seed):
-        found, statistics = render_with_statistics("manylights", scene, 512, seed, virtual_lights=lights)
+        found, statistics = render_with_statistics("manylights", scene, 256, seed, virtual_lights=lights)
         assert ("lights" in statistics) == lights and statistics["roulette"] > 0
-        return found, render(scene, "path", 512, 1000 + seed)
+        return found, render(scene, "path", 256, seed)
 
     with plugin_with_model(pays_below=1e30, fewest_light_paths=4000, **ROULETTE_EVERYWHERE):
         assert_same_mean(pair, 8)

@@ -119,6 +119,6 @@ def test_the_mean_over_seeds_is_that_of_path():
     scene = mi.load_dict(closed_box(panels(60, rng) | bulbs(60, rng) | EMITTERS["envmap"](), 16, middle=middle))
 
     def pair(seed):
-        return render(scene, "manylights", 128, seed, max_depth=3), render(scene, "path", 256, 1000 + seed, max_depth=3)
+        return tuple(render(scene, name, 128, seed, max_depth=3) for name in ("manylights", "path"))
 
     assert_same_mean(pair, 8)
