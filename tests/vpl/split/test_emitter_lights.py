@@ -55,8 +55,9 @@ def smooth_tile(folder):
 @pytest.fixture
 def always():
     """Lights stand for emitters even in small images, because the cost model has all lights for nothing."""
-    free = dict.fromkeys(("fixed_cost", "light_path_cost", "ray_cost", "cut_variance"), 1e-9)
-    with plugin_with_model(pays_below=1e30, fewest_light_paths=4000, **free):
+    free = dict.fromkeys(("fixed_cost", "light_path_cost", "ray_cost", "emitter_cuts"), 1e-9)
+    # All vertices are lit
+    with plugin_with_model(pays_below=1e30, fewest_light_paths=4000, vertex_variance=1e9, **free):
         yield
 
 
@@ -120,9 +121,9 @@ def test_no_lights_stand_for_emitters_with_normals_of_vertices(tmp_path, always)
     like `path`."""
     rng = np.random.default_rng(7)
     scene = mi.load_dict(closed_box(bulbs(64, rng) | smooth_tile(tmp_path), 16))
-    emission = sampler_of(scene, rng, False)
-    assert emission.lights.carried.tolist() == [False]
-    assert [group.kind for group in emission.lights.groups(1000, 0)] == ["spot"]
+    emitters = sampler_of(scene, rng, False)
+    assert emitters.lights.carried.tolist() == [False]
+    assert [group.kind for group in emitters.lights.groups(1000, 0)] == ["spot"]
     assert_lights_stand_for_emitters(mi.load_dict({"type": "manylights", "max_depth": 3}), scene, 64)
     assert_image_of_path(scene, max_depth=3)
 
@@ -199,14 +200,14 @@ def test_a_dim_emitter_next_to_a_bright_one_has_points():
 def test_who_samples_an_emitter_and_who_meets_it_agree_on_what_is_carried(shapes, close):
     rng = np.random.default_rng(1)
     scene = mi.load_dict(closed_box(shapes(100, rng) | bulbs(10, rng)))
-    emission, si = sampler_of(scene, rng, True), interactions(*vertices(rng))
+    emitters, si = sampler_of(scene, rng, True), interactions(*vertices(rng))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(1, dr.width(si.p))
-    site = emission.choice.site(si.p, si.n)
+    cell = emitters.cell(si.p, si.n)
     numbers = sampler.next_1d(), sampler.next_1d(), sampler.next_2d()
-    sample = emission.sample(si, site, *numbers, mi.Bool(True))
+    sample = emitters.sample(si, cell, *numbers, mi.Bool(True))
     ray = si.spawn_ray(sample.direction)
-    met = emission.met(si.p, site, ray, scene.ray_intersect(ray), mi.Bool(True), mi.Bool(True))
+    met = emitters.met(si.p, cell, ray, scene.ray_intersect(ray), mi.Bool(True), mi.Bool(True))
     lit = np.array((dr.max(sample.arriving(scene, True)) > 0) & ~sample.is_point)
     assert lit.sum() > 100
     # Directions to the edge of a ball meet it elsewhere
