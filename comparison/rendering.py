@@ -56,23 +56,49 @@ class PassImage:
     taken: Pass
 
 
-def render_pass(scene, sensor, integrator, spp, seed):
-    """Render a pass of `spp` samples per pixel, which stratified samplers round up; return a `PassImage`. `sensor` is
-    an index."""
-    sensor = scene.sensors()[sensor]
-    # Set before the render, as integrators such as `prb` clone the sampler
-    with _sample_count(sensor.sampler(), spp) as spp:
-        begin = time.perf_counter()
-        image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
-        dr.eval(image)
-        dr.sync_thread()
-        seconds = time.perf_counter() - begin
+def render_pass(scene, sensor, integrator, spp, seed, first=None):
+    """Render a pass of `spp` samples per pixel, which stratified samplers round up; return a `PassImage`.
+
+    `sensor`: an index. `first`: (samples per pixel, seed) of the first pass of the render, on which the knowledge
+    depends that integrators such as `manylights` share between passes; by default this pass.
+    """
+    sensor, begin = scene.sensors()[sensor], time.perf_counter()
+    with _shared_start(scene, sensor, integrator, (spp, seed), first or (spp, seed)):
+        spp = _render(scene, sensor, integrator, spp, seed)
+    seconds = time.perf_counter() - begin
     # The film, as the image of `mi.render` lacks names, and channels of nested integrators
     bitmap = sensor.film().bitmap()
     channels = [entry.name for entry in bitmap.struct_()]
     planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
     statistics = dict(getattr(integrator, "statistics", None) or {})
     return PassImage(planes, channels, Pass(seed, spp, seconds, statistics))
+
+
+def _render(scene, sensor, integrator, spp, seed):
+    """Render to the film of a sensor; return the samples per pixel, as the sampler rounds them."""
+    # Set before the render, as integrators such as `prb` clone the sampler
+    with _sample_count(sensor.sampler(), spp) as spp:
+        dr.eval(mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp))
+        dr.sync_thread()
+        return spp
+
+
+@contextmanager
+def _shared_start(scene, sensor, integrator, this, first):
+    """Let the pass `this`, (samples per pixel, seed), use the start of the pass `first`, if the integrator shares it.
+
+    Makes the start if the first pass was rendered elsewhere, so that an image is the same on any number of workers.
+    """
+    if not hasattr(integrator, "pass_of"):
+        yield
+        return
+    with _sample_count(sensor.sampler(), first[0]) as rounded:
+        key = id(scene), id(sensor), rounded, first[1]
+    with integrator.pass_of(key, this == first) as is_missing:
+        if is_missing:
+            with integrator.only_start():
+                _render(scene, sensor, integrator, *first)
+        yield
 
 
 class Passes:
@@ -131,7 +157,8 @@ class Progressive(Passes):
         `accept` returns False afterwards (the result is then None), the average does not change.
         """
         seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
-        image = render_pass(self._scene, self._sensor, self.integrator, spp, seed)
+        first = (self.passes[0].spp, self.passes[0].seed) if self.passes else None
+        image = render_pass(self._scene, self._sensor, self.integrator, spp, seed, first)
         return self.add(image) if accept() else None
 
     def should_stop(self):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
@@ -11,7 +14,7 @@ from vpl.lights.perturbed import Perturbed
 from vpl.split.cost_model import CostModel
 from vpl.split.emitters import emitter_sampler
 from vpl.split.emitters.learned import learning_rays
-from vpl.split.estimator import estimate
+from vpl.split.estimator import Start, estimate, make_start
 from vpl.split.roulette import OutgoingRadiance
 from vpl.split.surface_lights import KeptLights
 from vpl.split.view import PathRules, View
@@ -19,6 +22,17 @@ from vpl.split.view import PathRules, View
 from .gathering import GatheringIntegrator
 from .knobs import Boolean
 from .manual import manual_page
+
+# Samples of a pixel by which the emitter sampler sizes its learning where passes share it: a usual size of a pass
+_SHARED_SAMPLES = 16
+
+
+@dataclass
+class SharedStart:
+    """The ``start`` of the passes of a render, once it is made, and the ``key`` of the render."""
+
+    key: tuple | None = None
+    start: Start | None = None
 
 
 @manual_page
@@ -57,7 +71,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
     **Decisions.** A pilot of some ten thousand paths decides whether virtual lights pay, how many there are, where they
     lie, and how many samples of a pixel they light.  Without lights, ``manylights`` is ``path`` with stratified
     samples.  The decision is in ``statistics``, in the log (level Info) and in the files that the command writes.  It
-    depends on the seed and not on the clock.
+    depends on the seed and not on the clock.  The passes of ``manylights.render`` and of the
+    command share the pilot of the first pass; each pass draws its own lights.
 
     **Kept lights.** With ``keep_lights``, the frames of a moving camera or several sensors share the virtual lights of
     a seed and their tree, up to two million lights.  Each frame keeps the mean of ``path`` and has a pilot of its own;
@@ -111,16 +126,48 @@ class ManyLightsIntegrator(GatheringIntegrator):
     def __init__(self, props, cost_model: CostModel | None = None):
         super().__init__(props)
         self.cost_model, self._kept = cost_model or CostModel(), KeptLights()
+        self._shared, self._is_pass, self._only_starts = SharedStart(), False, False
+
+    @contextmanager
+    def pass_of(self, render, is_first: bool):
+        """Within the block, a render is a pass of the longer render with the key ``render``, whose start it uses.
+
+        The start depends on the first pass alone.  Yields whether the start is missing: the caller then renders the
+        first pass within :meth:`only_start`.
+        """
+        if is_first or self._shared.key != render:
+            self._shared = SharedStart(render)
+        self._is_pass = True
+        try:
+            yield self._shared.start is None and not is_first
+        finally:
+            self._is_pass = False
+
+    @contextmanager
+    def only_start(self):
+        """Within the block, a render makes the start of its pass and no image."""
+        self._only_starts = True
+        try:
+            yield
+        finally:
+            self._only_starts = False
 
     def _sample(self, scene, sampler, ray, active):
         clock = Clock(Stage.SCENE)
-        view = self._view(scene, sampler, ray, active)
+        known = self._shared.start if self._is_pass else None
+        view = self._view(scene, sampler, ray, active, known)
+        clock.begin(Stage.PILOT)
+        start = known or make_start(view, self.virtual_lights, self._is_pass)
+        if self._is_pass:
+            self._shared.start = start
+        if self._only_starts:
+            return dr.zeros(mi.Spectrum, view.count), dr.zeros(mi.Bool, view.count), []
         kept = self._kept if self.keep_lights else None
-        found = estimate(view, self.virtual_lights, kept, self.should_stop, clock)
-        self.statistics = found.statistics
+        found = estimate(view, start, kept, self.should_stop, clock)
+        self.statistics = found.statistics | {"pilots": int(known is None)}
         return mi.Spectrum(found.radiance), found.valid, []
 
-    def _view(self, scene, sampler, ray, active) -> View:
+    def _view(self, scene, sampler, ray, active, known: Start | None) -> View:
         number = dr.detach(sampler.next_1d())
         seed = int(dr.reinterpret_array(mi.UInt32, number)[0])
         grid, count = self.pixel_grid(scene, sampler), max(dr.width(ray), dr.width(number))
@@ -129,11 +176,14 @@ class ManyLightsIntegrator(GatheringIntegrator):
         ray.o, ray.d, ray.time = ray.o + wide, ray.d + wide, ray.time + wide
         active = mi.Bool(active) & dr.full(mi.Bool, True, count)
         dr.make_opaque(ray, active)
-        alike = dr.opaque(mi.Float, 1.0, -(-count // grid.samples))
+        pixels = -(-count // grid.samples)
+        # A shared start serves larger passes, too
+        learning = max(count, _SHARED_SAMPLES * pixels) if self._is_pass else count
+        emitters = known.emitters if known else emitter_sampler(scene, learning_rays(learning))
         return View(
-            scene, emitter_sampler(scene, learning_rays(count)), Perturbed(scene),
-            PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray, active, grid.width, grid.samples, seed,
-            alike, OutgoingRadiance.unknown(), self.cost_model,
+            scene, emitters, Perturbed(scene), PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray,
+            active, grid.width, grid.samples, seed, dr.opaque(mi.Float, 1.0, pixels), OutgoingRadiance.unknown(),
+            learning, self.cost_model,
         )  # fmt: skip
 
 

@@ -89,7 +89,8 @@ class DistributedPasses(Passes):
         sources = self._pool.sources
         if self is not sources[0] and sum(one.waiting_bytes for one in sources) >= WAITING_BYTES:
             return None  # earlier images wait for a pass
-        arguments = (self._bundle, self._sensor, size, pass_seed(self.seed, self._next))
+        first = (self.passes[0].spp, self.passes[0].seed) if self.passes else (self._size(0), pass_seed(self.seed, 0))
+        arguments = (self._bundle, self._sensor, size, pass_seed(self.seed, self._next), first)
         task = Task(self, self._next, worker.render_pass, arguments)
         self._next += 1
         return task

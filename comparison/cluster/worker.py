@@ -43,14 +43,17 @@ def add_file(hash, content, dask_worker):
     Store(dask_worker.local_directory).add(hash, content)
 
 
-def render_pass(bundle, sensor, spp, seed):
-    """Render a pass of the scene of a `SceneBundle`; return a `PassImage`. Raises FilesMissing for missing files,
-    Interrupted for an unfinished pass, and RenderError for other errors."""
+def render_pass(bundle, sensor, spp, seed, first):
+    """Render a pass of the scene of a `SceneBundle`; return a `PassImage`.
+
+    `first`: see `rendering.render_pass`. Raises FilesMissing for missing files, Interrupted for an unfinished pass, and
+    RenderError for other errors.
+    """
     with _LOCK:
         path = Store(get_worker().local_directory).place(bundle)
         try:
             scene = _scene(bundle, path)
-            image = rendering.render_pass(scene, sensor, scene.integrator(), spp, seed)
+            image = rendering.render_pass(scene, sensor, scene.integrator(), spp, seed, first)
         except Exception as error:
             # Exceptions of Mitsuba and Dr.Jit may be impossible to unpickle on the client
             raise RenderError(explain(error)) from None

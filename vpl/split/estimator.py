@@ -1,7 +1,10 @@
-"""Estimator of ``manylights``: pilot → plan → lights → image.
+"""Estimator of ``manylights``: start (pilot, emitter sampler) → plan → lights → image.
 
 Each step takes the results of the steps before it and returns its own result; nothing is changed in place but the
 emitter sampler, which learns from the pilot.  The same seed makes the same decisions.
+
+The passes of one render may share a :class:`Start`.  Each pass still draws its own lights and paths and has a plan for
+its own size.  The start is independent of the random numbers of later passes, so every pass is unbiased.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from ..core.sampling import derived_seed
 from ..core.stages import Stage
 from ..points.camera_paths import SceneTraits
 from ..transport.evaluation import Transport
+from .emitters.base import EmitterSampler
 from .emitters.learned import learning_rays
 from .gather_vertices import LitVertices
 from .path_tracer import Traced, trace_camera_rays
@@ -47,6 +51,17 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class Start:
+    """Knowledge with which a pass begins: the ``pilot``; the sampler of ``emitters``, which has learned from it; kinds
+    of lights to compare, ``options``, empty where ``refusal`` has a reason against lights."""
+
+    pilot: Pilot
+    emitters: EmitterSampler
+    options: list[Option]
+    refusal: str
+
+
+@dataclass(frozen=True)
 class Decision:
     """A ``plan`` with the ``evidence`` of the ``pilot`` and the ``options`` that were compared."""
 
@@ -62,16 +77,14 @@ class Decision:
         return np.maximum(self.pilot.nearby(self.pilot.radiance - remains), 0)
 
 
-def estimate(
-    view: View, virtual_lights: bool, kept: KeptLights | None, stopped: Callable[[], bool], clock: Clock
-) -> Estimate:
+def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callable[[], bool], clock: Clock) -> Estimate:
     """Estimate the radiance of a view's camera rays.
 
-    ``virtual_lights``: whether there may be any; ``kept``: lights of earlier images, None where none are kept;
-    ``stopped``: whether to end early.
+    ``kept``: lights of earlier images, None where none are kept; ``stopped``: whether to end early.
     """
     clock.begin(Stage.PILOT)
-    decision = decide(view, learning_pilot(view), virtual_lights)
+    view = replace(view, emitters=start.emitters)
+    decision = decide(view, start)
     view, roulette = with_roulette(view, decision)
     mi.Log(mi.LogLevel.Info, f"manylights: {decision.plan}")
     lights, of_lights = make_lights(view, decision, kept, clock)
@@ -80,7 +93,18 @@ def estimate(
     return Estimate(radiance, valid, statistics | {"seconds": clock.seconds})
 
 
-# ---------------------- Pilot ----------------------
+# ---------------------- Start ----------------------
+
+
+def make_start(view: View, virtual_lights: bool, is_shared: bool) -> Start:
+    """Trace the pilot of a view, learn from it, and measure kinds of virtual lights.
+
+    ``virtual_lights``: whether there may be any; ``is_shared``: whether passes of other sizes use the start, too, so
+    that all kinds have to be measured.
+    """
+    pilot, refusal = learning_pilot(view), _refusal(view, virtual_lights)
+    options = [] if refusal else _options(view, pilot, _evidence(view, pilot), is_shared)
+    return Start(pilot, view.emitters, options, refusal)
 
 
 def learning_pilot(view: View) -> Pilot:
@@ -89,7 +113,7 @@ def learning_pilot(view: View) -> Pilot:
     The sampler forgets where the second pilot has the greater variance × cost: small shadows and gloss can mislead it.
     """
     pilot = Pilot.trace(view, ViewLights())
-    rays, seed = learning_rays(view.count), derived_seed(view.seed, Stream.LEARNING)
+    rays, seed = learning_rays(view.learning_count), derived_seed(view.seed, Stream.LEARNING)
     if not view.emitters.learn(*pilot.vertices, rays, seed):
         return pilot
     again = Pilot.trace(view, ViewLights())
@@ -103,16 +127,16 @@ def learning_pilot(view: View) -> Pilot:
 # ---------------------- Plan ----------------------
 
 
-def decide(view: View, pilot: Pilot, virtual_lights: bool) -> Decision:
-    """Compare the kinds of virtual lights by the pilot."""
-    emitters = _may_carry_emitters(view)
-    direct = pilot.radiance - pilot.indirect
-    evidence = Evidence(pilot.radiance, direct, pilot.brightness, view.count, view.samples, emitters, view.model)
-    refusal = _refusal(view, virtual_lights)
-    if refusal:
-        return Decision(pilot, evidence, without_lights(refusal), [])
-    options = _options(view, pilot, evidence)
-    return Decision(pilot, evidence, choose(evidence, options), options)
+def decide(view: View, start: Start) -> Decision:
+    """Compare the kinds of virtual lights for a view of a certain size."""
+    evidence = _evidence(view, start.pilot)
+    plan = without_lights(start.refusal) if start.refusal else choose(evidence, start.options)
+    return Decision(start.pilot, evidence, plan, start.options)
+
+
+def _evidence(view: View, pilot: Pilot) -> Evidence:
+    emitters, direct = _may_carry_emitters(view), pilot.radiance - pilot.indirect
+    return Evidence(pilot.radiance, direct, pilot.brightness, view.count, view.samples, emitters, view.model)
 
 
 def _may_carry_emitters(view: View) -> bool:
@@ -130,8 +154,9 @@ def _refusal(view: View, virtual_lights: bool) -> str:
     return ""
 
 
-def _options(view: View, pilot: Pilot, evidence: Evidence) -> list[Option]:
-    """Kinds of lights that may pay; measures the residual of lights on surfaces where it can change the choice."""
+def _options(view: View, pilot: Pilot, evidence: Evidence, measures_all: bool) -> list[Option]:
+    """Kinds of lights that may pay; measures the residual of lights on surfaces where it can change the choice, or
+    always."""
     options, assumed, emitters = [], _with_surfaces(view, pilot, False), None
     if evidence.emitters:
         emitters = view.emitter_lights([])
@@ -141,7 +166,7 @@ def _options(view: View, pilot: Pilot, evidence: Evidence) -> list[Option]:
     # A measured residual only raises the price of an option: the most promising option is measured first, and another
     # one only if it still promises more
     for option in sorted(assumed, key=partial(price, evidence)):
-        if may_pay(evidence, option, options):
+        if measures_all or may_pay(evidence, option, options):
             # The distance between lights is not known yet. With c = 0 lights carry the most
             surfaces = view.light_set([], 0.0)
             residual = Pilot.trace(view, ViewLights(surfaces, emitters if option.emitters else None))

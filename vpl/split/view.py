@@ -158,7 +158,8 @@ class View:
     ``scene``; ``emitters``: its emitter sampler; ``perturbed``: its shapes without a minorant; ``rules`` of the paths;
     ``ray``, ``active``: of the camera, evaluated, the ``samples`` of a pixel side by side; ``width`` of the image in
     pixels; ``seed``; ``importance``: of radiance in each pixel, and ``outgoing`` radiance of surfaces, for Russian
-    roulette; ``model``: constants of the decisions.
+    roulette; ``learning_count``: number of camera rays by which the emitter sampler sizes its learning; ``model``:
+    constants of the decisions.
     """
 
     scene: mi.Scene
@@ -172,6 +173,7 @@ class View:
     seed: int
     importance: mi.Float
     outgoing: OutgoingRadiance
+    learning_count: int
     model: CostModel
 
     @property

@@ -1,0 +1,65 @@
+"""Passes of a render by `manylights` share the pilot of the first pass."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import manylights
+from comparison.rendering import render_pass
+from tests.support.rendering import plugin_with_model, render
+from tests.support.scenes import area_light, closed_box
+from tests.support.statistics import assert_same_mean
+
+FIRST = 4, 7  # samples per pixel, seed
+
+
+@pytest.fixture(autouse=True)
+def lights():
+    """Let virtual lights pay in small images."""
+    with plugin_with_model(pays_below=1e30, fewest_light_paths=2000):
+        yield
+
+
+def plugin():
+    return mi.load_dict({"type": "manylights", "max_depth": 4})
+
+
+def scene(size=16):
+    return mi.load_dict(closed_box({"lamp": area_light(), "sky": {"type": "constant"}}, size))
+
+
+def test_a_render_has_a_single_pilot_and_lights_for_each_pass():
+    _, took = manylights.render(scene(), plugin(), spp=24, pass_spp=8)
+    assert took.passes == 3 and took.statistics["pilots"] == 1
+    assert took.statistics["light_paths"] == 3 * 2000
+
+
+def test_a_second_render_has_a_pilot_of_its_own():
+    integrator, box = plugin(), scene()
+    for _ in range(2):
+        _, took = manylights.render(box, integrator, spp=16, pass_spp=8)
+        assert took.statistics["pilots"] == 1
+    mi.render(box, integrator=integrator, spp=4)
+    assert integrator.statistics["pilots"] == 1
+
+
+def test_a_pass_is_the_same_wherever_the_first_pass_was_rendered():
+    """As on a worker that has not rendered the first pass."""
+    box, here, elsewhere = scene(), plugin(), plugin()
+    first = render_pass(box, 0, here, *FIRST, FIRST)
+    expected = render_pass(box, 0, here, 16, 8, FIRST)
+    assert first.taken.statistics["pilots"] == 1 and expected.taken.statistics["pilots"] == 0
+    found = render_pass(box, 0, elsewhere, 16, 8, FIRST)
+    np.testing.assert_allclose(found.planes, expected.planes, rtol=1e-4, atol=1e-5)
+    alone = render_pass(box, 0, plugin(), 16, 8)
+    assert np.abs(alone.planes - expected.planes).max() > 1e-3
+
+
+def test_a_later_pass_has_the_mean_of_path():
+    box = scene()
+
+    def pair(seed):
+        found = render_pass(box, 0, plugin(), 256, 1000 + seed, (4, seed))
+        return found.planes[..., :3].astype(np.float64), render(box, "path", 256, 1000 + seed, max_depth=4)
+
+    assert_same_mean(pair, 8)
