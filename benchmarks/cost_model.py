@@ -4,8 +4,8 @@
     python benchmarks/cost_model.py --constants shared carried --passes 6  two constants
 
 Prints variance × CPU seconds over that with the default value, scene by scene, with geometric means.  Below 1: the
-other value is better.  "=": the images are the same, so the constant decides nothing there.  Each constant renders in
-turn with the default, with the same seeds, after a render that compiles its kernels.
+other value is better.  "=": all images are the same, so the constant decides nothing there.  The row "default" repeats
+the defaults and shows the spread of the times.
 """
 
 from __future__ import annotations
@@ -31,31 +31,28 @@ from vpl.split.cost_model import CostModel  # noqa: E402
 # Rooms with one and with many emitters, noisy and smooth indirect light
 NAMES = ("kitchen", "staircase2", "veach_ajar", "everything8003", "living_room")
 FACTORS = (0.5, 2.0)
-# Errors are part of their definition, and the size of a pilot is bounded by its time
+# Parts of the definition of the error
 FIXED = ("trimmed", "black")
+# Of a pixel, relative to the mean of the image: twice the rounding of sums over threads is far below
 LARGEST_DIFFERENCE = 1e-4
 
 
 class Measured:
-    """Images and CPU seconds of a scene with a cost model."""
+    """Images of a scene with a cost model, their CPU seconds."""
 
-    def __init__(self, scene, model: CostModel, spp: int):
-        self._scene, self._spp, self.images, self.seconds = scene, spp, [], []
-        self._integrator = mi.load_dict({"type": "manylights", "max_depth": DEPTH})
-        self._integrator.cost_model = model
-        self._render(0)
-
-    def _render(self, seed: int) -> np.ndarray:
-        image = mi.render(self._scene, integrator=self._integrator, spp=self._spp, seed=seed)
-        return np.array(image, np.float64)[..., :3]
-
-    def add(self, seed: int) -> None:
-        """Render one more image."""
-        dr.sync_thread()
-        start = time.process_time()
-        image = self._render(seed)
-        self.seconds.append(time.process_time() - start)
-        self.images.append(image)
+    def __init__(self, scene, model: CostModel, spp: int, passes: int):
+        self.images, self.seconds = [], []
+        integrator = mi.load_dict({"type": "manylights", "max_depth": DEPTH})
+        integrator.cost_model = model
+        for seed in range(passes + 1):
+            dr.sync_thread()
+            start = time.process_time()
+            image = mi.render(scene, integrator=integrator, spp=spp, seed=seed)
+            image, spent = np.array(image, np.float64)[..., :3], time.process_time() - start
+            # The first render compiles
+            if seed:
+                self.images.append(image)
+                self.seconds.append(spent)
 
     def product(self, scale: np.ndarray) -> float:
         """Relative variance between images × median CPU seconds."""
@@ -63,22 +60,34 @@ class Measured:
         return error[: int(len(error) * (1 - TRIMMED))].mean() * float(np.median(self.seconds))
 
 
-def ratio(scene, name: str, factor: float, spp: int, passes: int) -> float | None:
-    """Variance × time with a constant times ``factor``, over that with the default; None if the images are the same."""
-    default = CostModel()
-    value = getattr(default, name) * factor
-    value = max(round(value), 1) if isinstance(getattr(default, name), int) else value
-    rivals = [Measured(scene, model, spp) for model in (default, replace(default, **{name: value}))]
-    for seed in range(1, passes + 1):
-        for rival in rivals:
-            rival.add(seed)
-        usual, other = (rival.images[-1] for rival in rivals)
-        if seed == 1 and np.abs(usual - other).max() <= LARGEST_DIFFERENCE * usual.mean():
-            return None
-    mean = np.mean([image for rival in rivals for image in rival.images], axis=0)
-    scale = mean**2 + 0.01 * mean.mean() ** 2
-    usual, other = (rival.product(scale) for rival in rivals)
-    return float(other / usual)
+def ratios_of(name: str, constants: list[str], options) -> dict:
+    """Variance × time with each constant times FACTORS over that with the defaults; None where the images are the same.
+
+    The key "default" repeats the defaults: its ratio shows the spread of the times.
+    """
+    scene, default, found = scenes.load(name, options.width), CostModel(), {}
+    usual = Measured(scene, default, options.spp, options.passes)
+    mean = np.mean(usual.images, axis=0)
+    scale = mean**2 + default.black * mean.mean() ** 2
+    for constant in ["default", *constants]:
+        pair = []
+        for factor in FACTORS:
+            changed = {} if constant == "default" else {constant: scaled(default, constant, factor)}
+            other = Measured(scene, replace(default, **changed), options.spp, options.passes)
+            difference = max(np.abs(x - y).max() for x, y in zip(usual.images, other.images, strict=True))
+            is_same = difference <= LARGEST_DIFFERENCE * mean.mean() and constant != "default"
+            pair.append(None if is_same else float(other.product(scale) / usual.product(scale)))
+        found[constant] = pair
+        print(
+            f"{name:16s}{constant:24s}" + "".join(f"{'=' if x is None else f'{x:.2f}':>8s}" for x in pair), flush=True
+        )
+    return found
+
+
+def scaled(model: CostModel, name: str, factor: float):
+    """A constant times a factor, at most its largest valid value; integers stay integers of at least 1."""
+    value, most = getattr(model, name) * factor, {one.name: one.metadata["most"] for one in fields(model)}[name]
+    return max(round(value), 1) if isinstance(getattr(model, name), int) else min(value, most)
 
 
 def main() -> None:
@@ -95,22 +104,20 @@ def main() -> None:
     available = scenes.available(options.scenes)
     if not available:
         parser.error("--scenes names no scene that is present")
-    found = {name: scenes.load(name, options.width) for name in available}
-    print(f"{'constant':24s}" + "".join(f"{name[:11]:>24s}" for name in found) + f"{'geometric mean':>20s}")
+    # One scene at a time, because kernels hold the code of all scenes that are alive
+    found = {name: ratios_of(name, options.constants, options) for name in available}
     rows: dict = {}
-    for constant in options.constants:
-        columns = {}
-        for name, scene in found.items():
-            columns[name] = [ratio(scene, constant, factor, options.spp, options.passes) for factor in FACTORS]
-        means = [scenes.geometric_mean([pair[k] or 1.0 for pair in columns.values()]) for k in range(len(FACTORS))]
-        cells = [" / ".join("=" if x is None else f"{x:.2f}" for x in pair) for pair in (*columns.values(), means)]
-        print(f"{constant:24s}" + "".join(f"{cell:>24s}" for cell in cells[:-1]) + f"{cells[-1]:>20s}", flush=True)
+    print(f"\n{'geometric means':24s}" + "".join(f"{'× ' + format(factor, 'g'):>8s}" for factor in FACTORS))
+    for constant in ["default", *options.constants]:
+        pairs = [of_scene[constant] for of_scene in found.values()]
+        means = [scenes.geometric_mean([pair[k] or 1.0 for pair in pairs]) for k in range(len(FACTORS))]
+        print(f"{constant:24s}" + "".join(f"{mean:8.2f}" for mean in means))
         rows[constant] = {
             f"times {factor:g}": {"product_ratio": mean} for factor, mean in zip(FACTORS, means, strict=True)
         }
-        if options.json:
-            settings = {"width": options.width, "samples": options.spp, "passes": options.passes, "scenes": list(found)}
-            results.write_results(options.json, "cost_model", settings, rows)
+    if options.json:
+        settings = {"width": options.width, "samples": options.spp, "passes": options.passes, "scenes": list(found)}
+        results.write_results(options.json, "cost_model", settings, rows)
 
 
 if __name__ == "__main__":

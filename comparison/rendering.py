@@ -56,14 +56,14 @@ class PassImage:
     taken: Pass
 
 
-def render_pass(scene, sensor, integrator, spp, seed, first=None):
+def render_pass(scene, sensor, integrator, spp, seed, first=None, shared=None):
     """Render a pass of `spp` samples per pixel, which stratified samplers round up; return a `PassImage`.
 
-    `sensor`: an index. `first`: (samples per pixel, seed) of the first pass of the render, on which the knowledge
-    depends that integrators such as `manylights` share between passes; by default this pass.
+    `sensor`: an index. `first`: (samples per pixel, seed) of the first pass of the render, by default this pass, on
+    which the start depends that passes of `manylights` share; `shared`: the `SharedStart` of the render.
     """
     sensor, begin = scene.sensors()[sensor], time.perf_counter()
-    with _shared_start(scene, sensor, integrator, (spp, seed), first or (spp, seed)):
+    with _sharing(scene, sensor, integrator, (spp, seed), first or (spp, seed), shared or SharedStart()):
         spp = _render(scene, sensor, integrator, spp, seed)
     seconds = time.perf_counter() - begin
     # The film, as the image of `mi.render` lacks names, and channels of nested integrators
@@ -83,8 +83,16 @@ def _render(scene, sensor, integrator, spp, seed):
         return spp
 
 
+@dataclass
+class SharedStart:
+    """What the passes of a render share: `start`, an object of the integrator, None before the first pass. The scene
+    must not change while it is used."""
+
+    start: object = None
+
+
 @contextmanager
-def _shared_start(scene, sensor, integrator, this, first):
+def _sharing(scene, sensor, integrator, this, first, shared):
     """Let the pass `this`, (samples per pixel, seed), use the start of the pass `first`, if the integrator shares it.
 
     Makes the start if the first pass was rendered elsewhere, so that an image is the same on any number of workers.
@@ -92,9 +100,7 @@ def _shared_start(scene, sensor, integrator, this, first):
     if not hasattr(integrator, "pass_of"):
         yield
         return
-    with _sample_count(sensor.sampler(), first[0]) as rounded:
-        key = id(scene), id(sensor), rounded, first[1]
-    with integrator.pass_of(key, this == first) as is_missing:
+    with integrator.pass_of(shared, this == first) as is_missing:
         if is_missing:
             with integrator.only_start():
                 _render(scene, sensor, integrator, *first)
@@ -147,7 +153,7 @@ class Progressive(Passes):
 
     def __init__(self, scene, seed, sensor=0, integrator=None):
         super().__init__(seed)
-        self._scene, self._sensor = scene, sensor
+        self._scene, self._sensor, self._shared = scene, sensor, SharedStart()
         self.integrator = integrator or scene.integrator()
 
     def render(self, spp, seed=None, accept=lambda: True):
@@ -158,7 +164,7 @@ class Progressive(Passes):
         """
         seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
         first = (self.passes[0].spp, self.passes[0].seed) if self.passes else None
-        image = render_pass(self._scene, self._sensor, self.integrator, spp, seed, first)
+        image = render_pass(self._scene, self._sensor, self.integrator, spp, seed, first, self._shared)
         return self.add(image) if accept() else None
 
     def should_stop(self):

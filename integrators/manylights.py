@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from vpl.core.clock import Clock
+from vpl.core.exclusive import exclusive
 from vpl.core.stages import Stage
 from vpl.lights.perturbed import Perturbed
 from vpl.split.cost_model import CostModel
@@ -25,14 +25,6 @@ from .manual import manual_page
 
 # Samples of a pixel by which the emitter sampler sizes its learning where passes share it: a usual size of a pass
 _SHARED_SAMPLES = 16
-
-
-@dataclass
-class SharedStart:
-    """The ``start`` of the passes of a render, once it is made, and the ``key`` of the render."""
-
-    key: tuple | None = None
-    start: Start | None = None
 
 
 @manual_page
@@ -68,7 +60,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
     emitter.  Environments, directional emitters, and meshes with vertex normals other than their geometric normals are
     traced.
 
-    **Decisions.** A pilot of some ten thousand paths decides whether virtual lights pay, how many there are, where they
+    **Decisions.** A pilot of up to 32 768 paths decides whether virtual lights pay, how many there are, where they
     lie, and how many samples of a pixel they light.  Without lights, ``manylights`` is ``path`` with stratified
     samples.  The decision is in ``statistics``, in the log (level Info) and in the files that the command writes.  It
     depends on the seed and not on the clock.  The passes of ``manylights.render`` and of the
@@ -126,40 +118,42 @@ class ManyLightsIntegrator(GatheringIntegrator):
     def __init__(self, props, cost_model: CostModel | None = None):
         super().__init__(props)
         self.cost_model, self._kept = cost_model or CostModel(), KeptLights()
-        self._shared, self._is_pass, self._only_starts = SharedStart(), False, False
+        self._shared, self._makes_start, self._only_starts = None, False, False
 
     @contextmanager
-    def pass_of(self, render, is_first: bool):
-        """Within the block, a render is a pass of the longer render with the key ``render``, whose start it uses.
+    def pass_of(self, shared, is_first: bool):
+        """Within the block, a render is a pass of a longer render and uses the start that its passes share.
 
-        The start depends on the first pass alone.  Yields whether the start is missing: the caller then renders the
-        first pass within :meth:`only_start`.
+        ``shared``: object with an attribute ``start``, None until the first pass is rendered.  The start depends on the
+        first pass alone: where it is missing and this is not the first pass, yields True, and the caller has to render
+        the first pass within :meth:`only_start`.
         """
-        if is_first or self._shared.key != render:
-            self._shared = SharedStart(render)
-        self._is_pass = True
-        try:
-            yield self._shared.start is None and not is_first
-        finally:
-            self._is_pass = False
+        with exclusive(integrator=self):
+            self._shared, self._makes_start = shared, is_first
+            try:
+                yield shared.start is None and not is_first
+            finally:
+                self._shared, self._makes_start = None, False
 
     @contextmanager
     def only_start(self):
         """Within the block, a render makes the start of its pass and no image."""
-        self._only_starts = True
+        self._makes_start = self._only_starts = True
         try:
             yield
         finally:
-            self._only_starts = False
+            self._makes_start = self._only_starts = False
 
     def _sample(self, scene, sampler, ray, active):
-        clock = Clock(Stage.SCENE)
-        known = self._shared.start if self._is_pass else None
+        clock, shared = Clock(Stage.SCENE), self._shared
+        known = shared.start if shared else None
+        if shared and known is None and not self._makes_start:
+            raise RuntimeError("the start of the first pass is missing: render the first pass before later ones")
         view = self._view(scene, sampler, ray, active, known)
         clock.begin(Stage.PILOT)
-        start = known or make_start(view, self.virtual_lights, self._is_pass)
-        if self._is_pass:
-            self._shared.start = start
+        start = known or make_start(view, self.virtual_lights, shared is not None)
+        if shared:
+            shared.start = start
         if self._only_starts:
             return dr.zeros(mi.Spectrum, view.count), dr.zeros(mi.Bool, view.count), []
         kept = self._kept if self.keep_lights else None
@@ -178,7 +172,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         dr.make_opaque(ray, active)
         pixels = -(-count // grid.samples)
         # A shared start serves larger passes, too
-        learning = max(count, _SHARED_SAMPLES * pixels) if self._is_pass else count
+        learning = max(count, _SHARED_SAMPLES * pixels) if self._shared else count
         emitters = known.emitters if known else emitter_sampler(scene, learning_rays(learning))
         return View(
             scene, emitters, Perturbed(scene), PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray,

@@ -19,7 +19,7 @@ from .scene_travel import Store
 
 KEPT_SCENES = 2
 _LOCK = threading.Lock()
-_SCENES = OrderedDict()  # by key of the bundle, most recently used last
+_SCENES = OrderedDict()  # (scene, shared starts) by key of the bundle, most recently used last
 _THREADS = None
 
 
@@ -52,8 +52,9 @@ def render_pass(bundle, sensor, spp, seed, first):
     with _LOCK:
         path = Store(get_worker().local_directory).place(bundle)
         try:
-            scene = _scene(bundle, path)
-            image = rendering.render_pass(scene, sensor, scene.integrator(), spp, seed, first)
+            scene, starts = _scene(bundle, path)
+            shared = starts.setdefault((sensor, first), rendering.SharedStart())
+            image = rendering.render_pass(scene, sensor, scene.integrator(), spp, seed, first, shared)
         except Exception as error:
             # Exceptions of Mitsuba and Dr.Jit may be impossible to unpickle on the client
             raise RenderError(explain(error)) from None
@@ -67,7 +68,7 @@ def _scene(bundle, path):
     if bundle.key not in _SCENES:
         while len(_SCENES) >= KEPT_SCENES:
             _SCENES.popitem(last=False)
-        _SCENES[bundle.key] = bundle.make(path).load(_THREADS)
+        _SCENES[bundle.key] = bundle.make(path).load(_THREADS), {}
     _SCENES.move_to_end(bundle.key)
     return _SCENES[bundle.key]
 

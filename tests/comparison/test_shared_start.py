@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import manylights
-from comparison.rendering import render_pass
+from comparison.rendering import SharedStart, render_pass
 from tests.support.rendering import plugin_with_model, render
 from tests.support.scenes import area_light, closed_box
 from tests.support.statistics import assert_same_mean
@@ -46,8 +46,9 @@ def test_a_second_render_has_a_pilot_of_its_own():
 def test_a_pass_is_the_same_wherever_the_first_pass_was_rendered():
     """As on a worker that has not rendered the first pass."""
     box, here, elsewhere = scene(), plugin(), plugin()
-    first = render_pass(box, 0, here, *FIRST, FIRST)
-    expected = render_pass(box, 0, here, 16, 8, FIRST)
+    shared = SharedStart()
+    first = render_pass(box, 0, here, *FIRST, FIRST, shared)
+    expected = render_pass(box, 0, here, 16, 8, FIRST, shared)
     assert first.taken.statistics["pilots"] == 1 and expected.taken.statistics["pilots"] == 0
     found = render_pass(box, 0, elsewhere, 16, 8, FIRST)
     np.testing.assert_allclose(found.planes, expected.planes, rtol=1e-4, atol=1e-5)
@@ -63,3 +64,27 @@ def test_a_later_pass_has_the_mean_of_path():
         return found.planes[..., :3].astype(np.float64), render(box, "path", 256, 1000 + seed, max_depth=4)
 
     assert_same_mean(pair, 8)
+
+
+def test_a_missing_start_is_an_error():
+    integrator = plugin()
+    with integrator.pass_of(SharedStart(), False) as is_missing, pytest.raises(RuntimeError) as error:
+        assert is_missing
+        mi.render(scene(8), integrator=integrator, spp=4)
+    causes, cause = [], error.value
+    while cause is not None:
+        causes.append(str(cause))
+        cause = cause.__cause__
+    assert any("start of the first pass is missing" in text for text in causes)
+
+
+def test_a_part_of_the_image_without_vertices_keeps_the_counters_of_the_others():
+    """The image has two parts, and the lower one sees nothing."""
+    description = closed_box({"lamp": area_light()}, 512)
+    for name in ("floor", "left", "right", "front", "back"):
+        del description[name]
+    description["ball"] = {"type": "sphere", "center": [0, 0.7, -0.3], "radius": 0.2}
+    description["sensor"]["film"]["height"] = 1024
+    integrator = plugin()
+    mi.render(mi.load_dict(description), integrator=integrator, spp=1)
+    assert integrator.statistics["gather_points"] > 0

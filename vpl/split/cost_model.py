@@ -11,11 +11,12 @@ squared brightness of its pixel.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 
 
-def _constant(default: float, unit: str, meaning: str, evidence: str) -> float:
-    return field(default=default, metadata={"unit": unit, "meaning": meaning, "evidence": evidence})
+def _constant(default: float, unit: str, meaning: str, evidence: str, most: float = math.inf) -> float:
+    return field(default=default, metadata={"unit": unit, "meaning": meaning, "evidence": evidence, "most": most})
 
 
 _SENSITIVITY = "benchmarks/cost_model.py"
@@ -25,7 +26,7 @@ _PRODUCT = "benchmarks/manylights.py --parts product"
 
 @dataclass(frozen=True)
 class CostModel:
-    """Constants of the decisions of ``manylights``."""
+    """Constants of the decisions of ``manylights``; raises ValueError for a value out of range."""
 
     # ---------------------- Pilot ----------------------
     pilot_rays: int = _constant(1 << 15, "camera rays", "Largest size of a pilot.", _SENSITIVITY)
@@ -40,6 +41,7 @@ class CostModel:
         "fraction",
         "Largest squared errors that a relative variance leaves out, as the comparison's trimmed relMSE does.",
         "definition of the error",
+        most=1,
     )
     black: float = _constant(
         0.01,
@@ -60,18 +62,21 @@ class CostModel:
         "fraction",
         "Fraction of the variance of direct light that stratified samples retain; at least n^-0.5 for n samples.",
         _SENSITIVITY,
+        most=1,
     )
     stratified_many: float = _constant(
         1.0,
         "fraction",
         "The same where there are many emitters: samples are hardly stratified over more emitters than samples.",
         "everything8003: lights are not chosen with 0.5",
+        most=1,
     )
-    carried: float = _constant(
+    carried_fraction: float = _constant(
         0.9,
         "fraction",
         "Fraction of the variance of indirect light that virtual lights take away, until it is measured.",
         "within a few percent in kitchen, sponza_crytek, classroom, blender_room",
+        most=1,
     )
     doubtful: float = _constant(
         1.5,
@@ -97,6 +102,7 @@ class CostModel:
         "fraction",
         "Largest standard error of the image mean due to one light set.",
         f"{_PRODUCT}, column sets: 0.02 to 0.81%",
+        most=1,
     )
     cut_variance: float = _constant(
         0.3,
@@ -115,7 +121,7 @@ class CostModel:
     fixed_cost: float = _constant(
         200_000, "paths", "Cost of starting lights and cuts: recorded kernels, trees.", _SENSITIVITY
     )
-    light_path_cost: float = _constant(4.0, "paths", "Cost of a virtual light with its path.", _LIGHTS)
+    light_path_cost: float = _constant(4.0, "paths", "Cost of a line with the lights that it meets.", _LIGHTS)
     ray_cost: float = _constant(0.2, "paths", "Cost of a shadow ray of a cut, with its bounds.", _SENSITIVITY)
     emitter_cuts: float = _constant(
         0.4,
@@ -139,11 +145,11 @@ class CostModel:
     most_light_paths: int = _constant(
         2_000_000, "light paths", "Largest number of light paths: bounds memory.", _LIGHTS
     )
-    least_light_share: float = _constant(1 / 64, "light paths", "Fewest light paths for a camera ray.", _LIGHTS)
-    most_light_share: float = _constant(1 / 8, "light paths", "Most light paths for a camera ray.", _LIGHTS)
+    least_light_share: float = _constant(1 / 64, "1 / camera ray", "Fewest light paths for a camera ray.", _LIGHTS)
+    most_light_share: float = _constant(1 / 8, "1 / camera ray", "Most light paths for a camera ray.", _LIGHTS)
     c_per_spacing: float = _constant(
         6.0,
-        "lights",
+        "spacings",
         "c of the split over the distance between lights.",
         "four times: least raw variance in five scenes; six: less in blocks of pixels, for denoisers",
     )
@@ -166,14 +172,14 @@ class CostModel:
     )
     largest_cut: int = _constant(1000, "nodes", "Largest cut of a cluster of gather vertices.", _SENSITIVITY)
     emitter_points_share: float = _constant(
-        0.03, "points", "Virtual lights on area emitters for a camera ray.", _SENSITIVITY
+        0.03, "1 / camera ray", "Virtual lights on area emitters for a camera ray.", _SENSITIVITY
     )
     fewest_emitter_points: int = _constant(
         10_000, "points", "Smallest number of lights on area emitters.", _SENSITIVITY
     )
     most_emitter_points: int = _constant(200_000, "points", "Largest number of lights on area emitters.", _SENSITIVITY)
     least_vertices: float = _constant(
-        1 / 8, "fraction", "Least fraction of a pixel's samples that are lit.", _SENSITIVITY
+        1 / 8, "fraction", "Least fraction of a pixel's samples that are lit.", _SENSITIVITY, most=1
     )
 
     # ---------------------- Russian roulette ----------------------
@@ -182,6 +188,7 @@ class CostModel:
         "probability",
         "Least probability of going on: expected contributions are rough.",
         "0.05 to 0.2: living_room −12%, kitchen −7%, others +1 to 4%",
+        most=1,
     )
     roulette_gain: float = _constant(
         0.95, "ratio", "Roulette is used where the predicted variance × cost falls below this ratio.", _SENSITIVITY
@@ -192,6 +199,13 @@ class CostModel:
     roulette_prior: float = _constant(
         4.0, "vertices", "Vertices of average radiance that each cell has besides its own.", _SENSITIVITY
     )
+
+    def __post_init__(self):
+        for one in fields(self):
+            value, most = getattr(self, one.name), one.metadata["most"]
+            if not 0 <= value <= most:
+                limit = "at least 0" if most == math.inf else f"from 0 to {most:g}"
+                raise ValueError(f"{one.name} must be {limit}, got {value!r}")
 
 
 def table() -> str:

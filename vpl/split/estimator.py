@@ -1,7 +1,7 @@
 """Estimator of ``manylights``: start (pilot, emitter sampler) → plan → lights → image.
 
-Each step takes the results of the steps before it and returns its own result; nothing is changed in place but the
-emitter sampler, which learns from the pilot.  The same seed makes the same decisions.
+Each step takes the results of the steps before it and returns its own result; no step changes the results of another
+one but the emitter sampler, which learns from the pilot.  The same seed makes the same decisions.
 
 The passes of one render may share a :class:`Start`.  Each pass still draws its own lights and paths and has a plan for
 its own size.  The start is independent of the random numbers of later passes, so every pass is unbiased.
@@ -27,7 +27,7 @@ from .emitters.base import EmitterSampler
 from .emitters.learned import learning_rays
 from .gather_vertices import LitVertices
 from .path_tracer import Traced, trace_camera_rays
-from .pilot import Pilot, judged_by, relative_variance
+from .pilot import Pilot, error_scale, relative_variance
 from .pixel_clusters import PixelClusters, light_clusters
 from .plan import Evidence, Option, Plan, choose, may_pay, price, without_lights
 from .roulette import OutgoingRadiance, best_multiple
@@ -78,12 +78,10 @@ class Decision:
 
 
 def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callable[[], bool], clock: Clock) -> Estimate:
-    """Estimate the radiance of a view's camera rays.
+    """Estimate the radiance of a view's camera rays; ``view.emitters`` is the sampler of ``start``.
 
     ``kept``: lights of earlier images, None where none are kept; ``stopped``: whether to end early.
     """
-    clock.begin(Stage.PILOT)
-    view = replace(view, emitters=start.emitters)
     decision = decide(view, start)
     view, roulette = with_roulette(view, decision)
     mi.Log(mi.LogLevel.Info, f"manylights: {decision.plan}")
@@ -183,12 +181,12 @@ def _with_surfaces(view: View, traced: Pilot, emitters: bool) -> list[Option]:
 
 
 def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
-    """The view with Russian roulette by expected contribution, where that pays, and its multiple as a statistic."""
+    """(View with Russian roulette by expected contribution, where that pays; its multiple, as a statistic)."""
     pilot, onward, model = decision.pilot, decision.pilot.onward, view.model
     if len(onward.path) == 0:
         return view, {}
     outgoing, predicted = OutgoingRadiance.learned(onward.position, onward.normal, onward.sent, model)
-    relative = onward.throughput / judged_by(decision.evidence.brightness, model)[onward.path]
+    relative = onward.throughput / error_scale(decision.evidence.brightness, model)[onward.path]
     whole = decision.evidence.variance(pilot.radiance)
     paths = len(pilot.radiance)
     multiple = best_multiple(relative * predicted, relative * onward.sent, onward.edges, paths, whole, model)
@@ -197,8 +195,8 @@ def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
     if decision.plan.gathers:
         # The less variance remains, the more a contribution matters
         multiple *= (whole / max(decision.plan.variance, 1e-9)) ** 0.5
-    importance = upload(mi.Float, multiple / judged_by(pilot.nearby(pilot.radiance), model))
-    return replace(view, outgoing=outgoing, importance=importance), {"roulette": multiple}
+    importance = upload(mi.Float, multiple / error_scale(pilot.nearby(pilot.radiance), model))
+    return replace(view, outgoing=outgoing, importance=importance), {"roulette": f"{multiple:.3g}"}
 
 
 # ---------------------- Lights ----------------------
@@ -260,7 +258,8 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
             of_pixels = expected[first // view.samples :][: -(-len(lane) // view.samples)]
             light, counts = _gathered_part(view, lights, decision.plan, points, part, of_pixels, first, clock)
             part += light
-            statistics = {name: statistics.get(name, 0) + number for name, number in counts.items()}
+            for name, number in counts.items():
+                statistics[name] = statistics.get(name, 0) + number
         dr.scatter(radiance, part, lane)
         dr.scatter(valid, opaque, lane)
         dr.eval(radiance, valid)

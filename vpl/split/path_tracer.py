@@ -195,7 +195,7 @@ def trace_paths(
         turn = dr.select(hit.smooth, turn, sampler.next_2d())
         # One call: kernels hold the code of all materials for each
         toward = hit.si.to_local(sample.direction)
-        value, density, turned, share = hit.bsdf.eval_pdf_sample(
+        value, density, turned, bsdf_weight = hit.bsdf.eval_pdf_sample(
             context, hit.si, toward, lobe, turn, path.active & ~hit.hidden
         )  # fmt: skip
         lit = _lit(path, hit, sample, toward.z, value, density, weight, settings, sampler)
@@ -203,10 +203,10 @@ def trace_paths(
         found.add(lit * arriving, path.depth + 2, sampler.next_1d())
 
         # ---------------------- BSDF sampling ----------------------
-        kept = _turn(path, hit, turned, share, gathers, weight)
+        survival = _turn(path, hit, turned, bsdf_weight, gathers, weight)
 
         # ---------------------- Russian roulette: residual of the direction, and throughput ----------------------
-        _end_at_direction(path, hit, kept, settings, sampler.next_1d())
+        _end_at_direction(path, hit, survival, settings, sampler.next_1d())
         if dr.hint(settings.hide_emitters, mode="scalar"):
             _pass_hidden(path, hit, first)
 
@@ -304,12 +304,12 @@ def _lit(path: Path, hit: Hit, sample: EmitterSample, height, value, density, we
     return dr.select(hit.smooth & (sample.density > 0), value * mis, 0)
 
 
-def _turn(path: Path, hit: Hit, bs, share, gathers, weight):
-    """Continue along a BSDF sample ``bs`` of weight ``share``: the fraction of β that is left in its direction.
+def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight):
+    """Continue along a BSDF sample ``bs`` with its weight; returns the survival probability by the residual.
 
     ``gathers``, ``weight``: whether the vertex is a gather vertex, and its weight, which the path carries on.
     """
-    full = path.throughput * mi.unpolarized_spectrum(share)
+    full = path.throughput * mi.unpolarized_spectrum(bsdf_weight)
     path.delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     # As in `path`, by the sampled direction, even where the path ends
     null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
@@ -321,21 +321,21 @@ def _turn(path: Path, hit: Hit, bs, share, gathers, weight):
     path.throughput = full - path.carried * lambertian
     # At diffuse surfaces the residual is the same in all directions, and has ended paths before
     judged = (dr.max(dr.abs(path.carried)) > 0) & ~hit.is_diffuse
-    kept = residual_survival(path.throughput, full, judged)
+    survival = residual_survival(path.throughput, full, judged)
     path.carried = weight * lambertian
     onward = dr.select(gathers & ~path.delta, mi.UInt32(State.CONNECTING), mi.UInt32(State.PAST))
     path.state = dr.select((path.state == State.SEEKING) & ~gathers, mi.UInt32(State.SEEKING), onward)
     path.ray = hit.si.spawn_ray(dr.select(hit.hidden, path.ray.d, hit.si.to_world(bs.wo)))
     path.vertex = mi.Point3f(hit.si.p)
     path.depth += dr.select(hit.goes_on, 1, 0)
-    return kept
+    return survival
 
 
-def _end_at_direction(path: Path, hit: Hit, kept, settings: PathSettings, sample) -> None:
-    """Russian roulette by the residual of the direction, ``kept``, and by the throughput, as in ``path``."""
+def _end_at_direction(path: Path, hit: Hit, survival, settings: PathSettings, sample) -> None:
+    """Russian roulette by ``survival``, the residual of the direction, and by the throughput, as in ``path``."""
     # Where the BSDF is 0, its minorant may still have to be subtracted
     largest = dr.maximum(dr.max(dr.abs(path.throughput)), dr.max(dr.abs(path.carried)))
-    survival = kept * throughput_survival(largest, path.eta, path.depth >= settings.rr_depth)
+    survival *= throughput_survival(largest, path.eta, path.depth >= settings.rr_depth)
     path.active = hit.goes_on & (largest > 0) & (sample < survival)
     path.throughput /= survival
     path.carried /= survival

@@ -21,13 +21,14 @@ class Arrivals:
     """Second vertices with a minorant, of paths whose first vertices have one, too.
 
     ``position``, ``normal`` (n, 3): on the side where the path arrived; ``weight`` (n,) float64: contribution per
-    irradiance; ``level`` (n,) float64: radiance that the path brought from there.
+    irradiance; ``radiance`` (n,) float64: radiance that the path
+    brought from there.
     """
 
     position: np.ndarray
     normal: np.ndarray
     weight: np.ndarray
-    level: np.ndarray
+    radiance: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Onward:
 
 @dataclass(frozen=True)
 class Pilot:
-    """Paths in pairs of neighbours: of one pixel, or of two where a pixel has a single sample.
+    """Paths in pairs of neighbouring samples, mostly of one pixel.
 
     ``pixel``, ``radiance`` (n,): of each path; ``indirect`` (n,): part of the radiance that came through arrivals.
     Where virtual lights carry a part, values may be negative.  ``vertices``: positions and normals (k, 3) of first and
@@ -124,11 +125,11 @@ def relative_variance(values: np.ndarray, brightness: np.ndarray, model: CostMod
     """
     count = len(values) // 2
     first, second = values[: 2 * count].astype(np.float64).reshape(-1, 2).T
-    error = np.sort(0.5 * (first - second) ** 2 / judged_by(brightness, model)[: 2 * count : 2] ** 2)
+    error = np.sort(0.5 * (first - second) ** 2 / error_scale(brightness, model)[: 2 * count : 2] ** 2)
     return float(np.mean(error[: count - int(model.trimmed * count)])) if count else 0.0
 
 
-def judged_by(brightness: np.ndarray, model: CostModel) -> np.ndarray:
+def error_scale(brightness: np.ndarray, model: CostModel) -> np.ndarray:
     """Denominator of relative errors (n,) where an image has a ``brightness`` (n,)."""
     level = np.sqrt(brightness**2 + model.black * np.mean(brightness) ** 2)
     return np.maximum(level, np.finfo(np.float64).tiny ** 0.5)

@@ -20,7 +20,7 @@ _TINY = np.finfo(np.float64).tiny
 class Plan:
     """Decision for an image.
 
-    ``light_paths``: number of virtual lights on surfaces that are drawn, 0 for none; ``emitters``: whether virtual
+    ``light_paths``: number of lines that draw virtual lights on surfaces, 0 for none; ``emitters``: whether virtual
     lights stand for emitters; ``error``: bound of the cuts, as a fraction of the pixel; ``vertices`` of a pixel that
     are lit; ``variance``: relative variance of a camera path that remains; ``reason`` in words.
     """
@@ -69,7 +69,7 @@ class Option:
         traced, model = evidence.variance(self.traced), evidence.model
         if not self.surfaces:
             return traced
-        assumed = traced - model.carried * (traced - min(evidence.variance(self.expected), traced))
+        assumed = traced - model.carried_fraction * (traced - min(evidence.variance(self.expected), traced))
         measured = assumed if self.residual is None else evidence.variance(self.residual)
         return measured if measured > model.doubtful * assumed else assumed
 

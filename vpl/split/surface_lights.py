@@ -96,8 +96,8 @@ def _importance(octree: ArrivalOctree, arrivals: Arrivals) -> np.ndarray:
     """Fraction of the lights for each leaf: its number of arrivals times the root mean square of their radiance."""
     leaf, size = octree.leaf_of_point, len(octree.leaf_weight)
     number = np.bincount(leaf, minlength=size)
-    squared = np.bincount(leaf, arrivals.level**2, size)
-    typical = np.mean(arrivals.level**2)
+    squared = np.bincount(leaf, arrivals.radiance**2, size)
+    typical = np.mean(arrivals.radiance**2)
     if not typical > 0:
         return octree.leaf_weight
     return number * np.sqrt((squared + _PRIOR * typical) / (number + _PRIOR))
@@ -200,7 +200,7 @@ def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: i
     lattice = Lattice(dr.arange(mi.UInt32, count), 1, seed)
     found = trace_paths(scene, emitters, edge, lattice, independent_sampler(derived_seed(seed, 1), count), settings)
     # A light stands for paths of one length, because gather vertices far from the camera may use short paths only. The
-    # irradiance is a single contribution, drawn by its share, with the color of the contribution
+    # irradiance is a single contribution, drawn by its share, with the colour of the contribution
     level, more = dr.sum(nearest), dr.sum(found.drawn)
     is_nearest = draw * (level + more) < level
     one = dr.select(is_nearest, nearest, found.drawn)
@@ -213,8 +213,8 @@ class KeptLights:
 
     Their density is positive on every surface, so they light other cameras without bias, with fewer lights where the
     first camera did not look.  A scene counts as the same while everything that Mitsuba prints and lists as a parameter
-    of its objects, without sensors and integrator, is the same: see :func:`vpl.core.parameters.fingerprint`.
-    ``most``: largest number of lights that are kept.
+    of its objects, without sensors and integrator, is the same: see
+    :func:`vpl.core.parameters.fingerprint_without_camera`. ``most``: largest number of lights that are kept.
     """
 
     def __init__(self):

@@ -1,11 +1,11 @@
 """The balance of lights and paths: decisions for images of known noise."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
-from vpl.split.cost_model import CostModel
+from vpl.split.cost_model import CostModel, table
 from vpl.split.plan import Evidence, Option, choose, may_pay, price
 
 MODEL = CostModel()
@@ -80,3 +80,17 @@ def test_more_light_paths_are_followed_the_noisier_indirect_light_is():
 def test_one_sample_has_no_noise_that_lights_could_take_away():
     chosen = balanced(np.full(2, 0.5), np.full(2, 0.5), 1, 1)
     assert chosen.light_paths == 0 and "nan" not in chosen.reason
+
+
+def test_constants_out_of_range_are_refused_by_name():
+    with pytest.raises(ValueError, match=r"carried_fraction must be from 0 to 1, got 1\.8"):
+        CostModel(carried_fraction=1.8)
+    with pytest.raises(ValueError, match="ray_cost must be at least 0, got -1"):
+        CostModel(ray_cost=-1)
+
+
+def test_every_constant_has_a_unit_a_meaning_and_evidence():
+    about = [one.metadata for one in fields(CostModel)]
+    assert len(about) > 30
+    assert all(one["unit"] and one["meaning"].endswith(".") and one["evidence"] for one in about)
+    assert table().count("\n") == len(about) + 1

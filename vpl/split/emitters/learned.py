@@ -94,8 +94,10 @@ class CellChoice:
         places = Places(dr.gather(mi.Point3f, position, vertex), facing + dr.opaque(mi.Float, 0.0), facing)
         dr.eval(places, source)
         self._learns = dr.opaque(mi.Bool, True)
-        reached, unoccluded = look(places, source)
-        self._learns = dr.opaque(mi.Bool, False)
+        try:
+            reached, unoccluded = look(places, source)
+        finally:
+            self._learns = dr.opaque(mi.Bool, False)
         reached, unoccluded = (
             download(x).astype(np.float64).reshape(cells, self.count, _RAYS_EACH)
             for x in (channel_mean(reached), unoccluded)
