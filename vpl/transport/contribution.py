@@ -35,9 +35,14 @@ def contribution(kind: str, surface, light: Light, smallest_distance, active=Tru
 
 
 def shadow_ray(kind: str, interaction, light):
-    """Ray from a surface to a light that ends just before it; for lights at infinity it has no end."""
+    """Ray from a surface to a light that ends just before it; for lights at infinity it has no end.
+
+    It ends above the surface of a surface light by the uncertainty of the light's position.
+    """
     if kind in AT_INFINITY:
         return interaction.spawn_ray(-light.direction)
+    if kind == "surface":
+        return interaction.spawn_ray_to(light.position + light.uncertainty * light.direction)
     return interaction.spawn_ray_to(light.position)
 
 
