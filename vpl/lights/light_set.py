@@ -44,11 +44,15 @@ class LightOptions:
 
 @dataclass
 class LightGroup:
-    """Lights of one kind on the device, with their tree (None where the method asks for none)."""
+    """Lights of one kind on the device, with their tree (None where the method asks for none).
+
+    ``sign``: of the contributions, -1 where the intensities are absolute values of negative ones.
+    """
 
     kind: str
     lights: DeviceLights
     tree: DeviceTree | None
+    sign: float = 1.0
 
     @property
     def count(self) -> int:
@@ -194,13 +198,13 @@ class ScatteredGroup(LightGroup):
     cumulative: object = None
 
     @classmethod
-    def of(cls, lights: VirtualLights, seed: int) -> ScatteredGroup:
+    def of(cls, lights: VirtualLights, seed: int, sign: float = 1.0) -> ScatteredGroup:
         """Lights of one kind, with their tree."""
         tree = _tree_of(lights, np.random.default_rng(seed))
         first, last = (upload(mi.UInt32, column) for column in _leaf_ranges(tree).T)
         intensity = lights.intensity.mean(1, dtype=np.float64)
         return cls(
-            lights.kind, DeviceLights(lights), DeviceTree(lights.kind, tree, tree.representative), first, last,
+            lights.kind, DeviceLights(lights), DeviceTree(lights.kind, tree, tree.representative), sign, first, last,
             upload(mi.UInt32, tree.leaf_order), running_sums(upload(mi.Float, intensity[tree.leaf_order])),
         )  # fmt: skip
 

@@ -206,9 +206,9 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
 
     made = kept.find(view.scene, (view.seed, view.rules.max_depth), make) if kept else make()
     statistics = {"light_paths": sum(drawn), "lights": {"surface": made.lights.count}}
-    if made.group is None:
+    if not made.groups:
         return None, statistics
-    return view.light_set([made.group], made.spacing(arrivals)), statistics
+    return view.light_set(made.groups, made.spacing(arrivals)), statistics
 
 
 # ---------------------- Image ----------------------

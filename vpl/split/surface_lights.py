@@ -42,13 +42,15 @@ _MOST_KEPT = 1 << 21
 
 @dataclass(frozen=True)
 class SurfaceLights:
-    """``lights`` of kind "surface", drawn by ``lines`` lines through ``octree``; ``group``: the lights with their tree,
-    None where there are none."""
+    """``lights`` of kind "surface", drawn by ``lines`` lines through ``octree``.
+
+    ``groups``: the positive and the negative parts of their intensities with light trees, empty parts left out.
+    """
 
     lights: VirtualLights
     octree: ArrivalOctree
     lines: int
-    group: ScatteredGroup | None
+    groups: list[ScatteredGroup]
 
     def spacing(self, arrivals: Arrivals) -> float:
         """Typical distance between lights where camera paths arrive, world units."""
@@ -57,18 +59,30 @@ class SurfaceLights:
 
 
 def surface_lights(view: View, arrivals: Arrivals, count: int, announce_tree: Callable[[], None]) -> SurfaceLights:
-    """The lights that ``count`` lines meet, with their tree; calls ``announce_tree`` before building the tree."""
+    """The lights that ``count`` lines meet, with their trees; calls ``announce_tree`` before building the trees."""
     # A path from a light lacks the two edges between camera and light; it is no camera path, so nothing is known of its
     # expected contribution
     rules = replace(view.rules, max_depth=view.rules.max_depth - 2, rr_depth=1)
     settings = replace(view, rules=rules, outgoing=OutgoingRadiance.unknown()).settings(ViewLights())
     seed = derived_seed(view.seed, Stream.SURFACE_LIGHTS)
     lights, octree = _drawn_lights(view.scene, view.emitters, arrivals, count, settings, seed)
-    group = None
-    if lights.count:
+    parts = _by_sign(lights)
+    if parts:
         announce_tree()
-        group = ScatteredGroup.of(lights, derived_seed(view.seed, Stream.TREE))
-    return SurfaceLights(lights, octree, count, group)
+    seed = derived_seed(view.seed, Stream.TREE)
+    return SurfaceLights(lights, octree, count, [ScatteredGroup.of(part, seed, sign) for part, sign in parts])
+
+
+def _by_sign(lights: VirtualLights) -> list[tuple[VirtualLights, float]]:
+    """Positive and negative parts of intensities as lights of their own: (lights, sign), without empty parts.
+
+    Surfaces whose reflectance is negative somewhere send negative light.  ``path`` adds it, and the traced part
+    subtracts the share of virtual lights from it.
+    """
+    parts = [
+        (replace(lights, intensity=np.maximum(sign * lights.intensity, 0)).without_bad()[0], sign) for sign in (1, -1)
+    ]
+    return [(part, sign) for part, sign in parts if part.count]
 
 
 def _drawn_lights(scene, emitters: EmitterSampler, arrivals: Arrivals, count: int, settings: PathSettings, seed: int):
@@ -87,8 +101,7 @@ def _drawn_lights(scene, emitters: EmitterSampler, arrivals: Arrivals, count: in
     density = count * octree.density(lights.position, lights.direction)
     with np.errstate(over="ignore"):
         lights.intensity = (lights.intensity / density[:, None]).astype(np.float32)
-    # Drops the intensities that single precision cannot hold
-    return lights.without_bad()[0], octree
+    return lights, octree
 
 
 def _importance(octree: ArrivalOctree, arrivals: Arrivals) -> np.ndarray:
@@ -120,7 +133,7 @@ def _lights_at(scene, emitters: EmitterSampler, hits: LineHits, settings: PathSe
     *columns, uncertainty = (download(column) for column in columns)
     lights = VirtualLights.of("surface", *columns, facing=download(places.facing))
     lights.uncertainty = uncertainty
-    return lights.without_bad()[0]
+    return lights.select((lights.intensity != 0).any(1))
 
 
 def _places_with_minorants(scene, emitters, rays, settings: PathSettings, seed: int):
@@ -166,10 +179,10 @@ def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: i
     found = trace_paths(scene, emitters, edge, lattice, independent_sampler(derived_seed(seed, 1), count), settings)
     # A light stands for paths of one length, because gather vertices far from the camera may use short paths only. It
     # takes one contribution, drawn by its share, with that contribution's colour
-    level, more = dr.sum(nearest), dr.sum(found.drawn)
+    level, more = dr.sum(dr.abs(nearest)), dr.sum(dr.abs(found.drawn))
     is_nearest = draw * (level + more) < level
     one = dr.select(is_nearest, nearest, found.drawn)
-    irradiance = dr.select(level + more > 0, one * (level + more) / dr.sum(one), 0)
+    irradiance = dr.select(level + more > 0, one * (level + more) / dr.sum(dr.abs(one)), 0)
     return irradiance, dr.select(is_nearest, mi.UInt32(1), found.length)
 
 
