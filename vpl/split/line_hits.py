@@ -23,12 +23,11 @@ import numpy as np
 
 from ..core.arrays import download, select_record, upload, upload_vectors
 from ..core.loops import recorded_once
-from ..core.registry import RegistryTable
 from ..lights.emitters import registered_shapes
 from .line_sampling import Lines
 
-# Largest distance between a surface and a point found on it, as a fraction of the extent of its shape: two units in the
-# last place
+# Largest distance between a surface and a point found on it, as a fraction of the extent of its shape or triangle: two
+# units in the last place
 _UNCERTAINTY = 2.0**-22
 # Step behind a surface that is met again, as a fraction of the rest of the line; doubled each time
 _FIRST_STEP = 1e-6
@@ -38,19 +37,19 @@ _MOST_LAYERS = 1024
 
 @dataclass
 class LineHits:
-    """Crossings of lines with surfaces, one per lane, evaluated.
+    """Crossings of lines with surfaces.
 
-    ``ray``: begins shortly before the surface; ``position``: where the line meets the surface, world units;
-    ``uncertainty`` of that position along the normal, world units.
+    ``ray``: begins shortly before each surface, evaluated; ``position`` (n, 3) float32: where the line meets the
+    surface; ``uncertainty`` (n,) float32: of that position along the normal.  World units.
     """
 
     ray: mi.Ray3f
-    position: mi.Point3f
-    uncertainty: mi.Float
+    position: np.ndarray
+    uncertainty: np.ndarray
 
     @property
     def count(self) -> int:
-        return len(self.uncertainty)
+        return len(self.position)
 
 
 def hits_of(scene, lines: Lines, scene_size: float, generator) -> LineHits:
@@ -61,52 +60,67 @@ def hits_of(scene, lines: Lines, scene_size: float, generator) -> LineHits:
         upload_vectors(mi.Vector3f, x) for x in (lines.origin - before[:, None] * lines.direction, lines.direction)
     )
     segments = origin, direction, upload(mi.Float, lines.length + before + np.float32(margin))
-    extents = _extents(scene)
     # The same kernel counts the crossings and finds them
-    number = _meet(scene, segments, extents, dr.zeros(mi.UInt32, len(before)), False, _Found.none(1))
+    number = _meet(scene, segments, dr.zeros(mi.UInt32, len(before)), False, _Found.none(1))
     found = _Found.none(int(dr.sum(number)[0]))
     if dr.width(found.line):
-        _meet(scene, segments, extents, dr.prefix_reduce(dr.ReduceOp.Add, number), True, found)
+        _meet(scene, segments, dr.prefix_reduce(dr.ReduceOp.Add, number), True, found)
     # Position and box as the density sees them
     row = np.flatnonzero(lines.hold(download(found.line), download(found.position)))
     found = dr.gather(_Found, found, upload(mi.UInt32, row))
-    hits = LineHits(
-        mi.Ray3f(found.start, dr.gather(mi.Vector3f, direction, found.line)), found.position,
-        _UNCERTAINTY * found.extent,
-    )  # fmt: skip
-    dr.eval(hits)
-    return hits
-
-
-def _extents(scene) -> RegistryTable:
-    """Bits of the extent of each shape that is no mesh, single precision, world units; 0 for meshes."""
-    shapes = [(index, shape.bbox()) for index, shape in registered_shapes(scene) if not shape.is_mesh()]
-    extent = np.float32([max(box.extents()) if box.valid() else 0 for _, box in shapes])
-    return RegistryTable([index for index, _ in shapes], extent.view(np.uint32))
+    ray = mi.Ray3f(found.start, dr.gather(mi.Vector3f, direction, found.line))
+    dr.eval(ray, found)
+    return LineHits(ray, download(found.position), _uncertainty(scene, found, scene_size))
 
 
 @dataclass
 class _Found:
     """Output arrays of :func:`_meet`.
 
-    ``start`` of the ray to a surface; ``position`` on the surface; ``extent`` of its shape; number of the ``line``.
+    ``start`` of the ray to a surface; ``position`` on the surface; registry index of its ``shape``; number of the
+    ``primitive``; number of the ``line``.
     """
 
     start: mi.Point3f
     position: mi.Point3f
-    extent: mi.Float
+    shape: mi.UInt32
+    primitive: mi.UInt32
     line: mi.UInt32
 
     @classmethod
     def none(cls, count: int) -> _Found:
         """Arrays of ``count`` entries, not written yet."""
-        zeros = (dr.zeros(kind, count) for kind in (mi.Point3f, mi.Point3f, mi.Float, mi.UInt32))
-        return cls(*zeros)
+        kinds = (mi.Point3f, mi.Point3f, mi.UInt32, mi.UInt32, mi.UInt32)
+        return cls(*(dr.zeros(kind, count) for kind in kinds))
+
+
+def _uncertainty(scene, found: _Found, scene_size: float) -> np.ndarray:
+    """Uncertainty of positions, (n,) float32, where it exceeds Mitsuba's own offset of rays; 0 elsewhere."""
+    position, shape = download(found.position), download(found.shape)
+    offset = mi.math.RayEpsilon * (1 + np.abs(position).max(1, initial=0))
+    uncertainty = np.zeros(len(position), np.float32)
+    for index, one in registered_shapes(scene):
+        # Rectangles that Mitsuba merged have no box
+        extent = max(one.bbox().extents()) if one.bbox().valid() else scene_size
+        row = np.flatnonzero((shape == index) & (_UNCERTAINTY * extent > offset))
+        if len(row):
+            if one.is_mesh():
+                extent = _longest_edges(one, dr.gather(mi.UInt32, found.primitive, upload(mi.UInt32, row)))
+            uncertainty[row] = _UNCERTAINTY * extent
+    return np.where(uncertainty > offset, uncertainty, np.float32(0))
+
+
+def _longest_edges(mesh, triangle: mi.UInt32) -> np.ndarray:
+    """Longest edge of each ``triangle`` of a mesh, (n,) float32, world units."""
+    faces, positions = mesh.faces_buffer(), mesh.vertex_positions_buffer()
+    corners = [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * triangle + k)) for k in range(3)]
+    lengths = [dr.norm(corners[k] - corners[k - 1]) for k in range(3)]
+    return download(dr.maximum(dr.maximum(lengths[0], lengths[1]), lengths[2]))
 
 
 @recorded_once
 @dr.syntax
-def _meet(scene, lines, extents: RegistryTable, first, find: bool, found: _Found):
+def _meet(scene, lines, first, find: bool, found: _Found):
     """Number of surfaces that each of the ``lines`` (origin, direction, length) crosses.
 
     With ``find``, writes them to ``found``, for each line from the index ``first`` on.
@@ -117,15 +131,15 @@ def _meet(scene, lines, extents: RegistryTable, first, find: bool, found: _Found
     place, remaining, number = mi.Point3f(origin), mi.Float(length), dr.zeros(mi.UInt32, dr.width(length))
     this, active = dr.arange(mi.UInt32, dr.width(length)), length > 0
     step, last = mi.Float(0), _Primitive.none(dr.width(length))
-    while dr.hint(active, exclude=[scene, origin, direction, length, extents, first, find, this, found]):
+    while dr.hint(active, exclude=[scene, origin, direction, length, first, find, this, found]):
         ray = mi.Ray3f(place, direction, remaining, 0.0, [])
         si = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=active)
         active &= si.is_valid()
         si.p, met = ray(si.t), _Primitive.of(si, direction)
         again = met.equals(last)
         crossed = active & ~again
-        extent = dr.reinterpret_array(mi.Float, extents.at(si.shape, crossed))
-        dr.scatter(found, _Found(place, si.p, extent, this), first + number, crossed & find)
+        crossing = _Found(place, si.p, met.shape, met.number, this)
+        dr.scatter(found, crossing, first + number, crossed & find)
         number += dr.select(crossed, 1, 0)
         last = select_record(active, met, last)
         onward = si.spawn_ray(direction)

@@ -1,7 +1,7 @@
 """Virtual lights on surfaces where camera paths arrive, each with the irradiance that one path finds there.
 
-Random lines (:mod:`vpl.split.line_sampling`) meet surfaces with a known density (:mod:`vpl.split.line_hits`).  Each hit on a surface with a minorant
-becomes a light: irradiance × minorant over the density.  The irradiance comes from next-event estimation and one path
+Random lines (:mod:`vpl.split.line_sampling`) meet surfaces (:mod:`vpl.split.line_hits`) with a known density.  Each hit
+on a surface with a minorant becomes a light: irradiance × minorant over the density.  The irradiance comes from next-event estimation and one path
 that starts at the light.  No path starts at an emitter, so the method needs no adjoint BSDFs, no correction for shading
 normals and no emission sampling, and an environment lights a room through its windows as in ``path``.
 
@@ -127,12 +127,12 @@ def _lights_at(scene, emitters: EmitterSampler, hits: LineHits, settings: PathSe
     if places.count == 0:
         return VirtualLights.of("surface", [], [], [])
     irradiance, length = _irradiance(scene, emitters, places, settings, seed)
-    position, uncertainty = (dr.gather(type(x), x, hit) for x in (hits.position, hits.uncertainty))
-    columns = (position, places.normal, spectrum_to_rgb(minorant * irradiance), length, uncertainty)
+    columns = (places.normal, spectrum_to_rgb(minorant * irradiance), length)
     dr.eval(columns)
-    *columns, uncertainty = (download(column) for column in columns)
-    lights = VirtualLights.of("surface", *columns, facing=download(places.facing))
-    lights.uncertainty = uncertainty
+    row = download(hit)
+    position, columns = hits.position[row], (download(column) for column in columns)
+    lights = VirtualLights.of("surface", position, *columns, facing=download(places.facing))
+    lights.uncertainty = hits.uncertainty[row]
     return lights.select((lights.intensity != 0).any(1))
 
 
