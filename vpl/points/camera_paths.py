@@ -32,7 +32,9 @@ class SceneTraits:
 
     ``perturbed``: registry indices of shapes whose material shades with a normal of its own (bump and normal maps);
     ``open_shapes``: registry indices of shapes that light may pass unscattered, None for all;
-    ``open_scene``: a scene of those shapes alone, None where ``open_shapes`` is None or empty.
+    ``open_scene``: a scene of those shapes alone, None where ``open_shapes`` is None or empty;
+    ``nearest_hits``: whether a shadow ray looks for its nearest hit as a path does.  On spheres of more than some
+    hundred units, Mitsuba's test for any hit reports the surface at the origin of a ray more often.
     """
 
     delta: bool
@@ -43,6 +45,7 @@ class SceneTraits:
     perturbed: tuple
     open_shapes: tuple | None
     open_scene: object | None
+    nearest_hits: bool = False
 
     def is_null(self, shape):
         """Whether light may pass a shape (a pointer array) unscattered."""

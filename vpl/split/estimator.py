@@ -22,6 +22,7 @@ from ..points.camera_paths import SceneTraits
 from ..transport.evaluation import Transport
 from .emitters.learned import learning_rays
 from .gather_vertices import LitVertices
+from .line_hits import has_large_curves
 from .path_tracer import Traced, trace_camera_rays
 from .pilot import Pilot, judged_by, relative_variance
 from .pixel_clusters import PixelClusters, light_clusters
@@ -283,8 +284,9 @@ def _gathered_part(view: View, lights: ViewLights, plan: Plan, points: LitVertic
     # Of the sum over the samples of a pixel
     allowed = plan.error * samples * level[clusters.pixel]
     shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, first)
+    traits = replace(_OPAQUE, nearest_hits=has_large_curves(view.scene))
     for number, carrying in enumerate(lights.all):
-        transport, stream = Transport(view.scene, _OPAQUE, carrying), derived_seed(seed, 1, number)
+        transport, stream = Transport(view.scene, traits, carrying), derived_seed(seed, 1, number)
         shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit)
     clock.stop()
     counts = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}

@@ -110,6 +110,12 @@ def _uncertainty(scene, found: _Found, scene_size: float) -> np.ndarray:
     return np.where(uncertainty > offset, uncertainty, np.float32(0))
 
 
+def has_large_curves(scene) -> bool:
+    """Whether hits on a shape that is no mesh are more uncertain than Mitsuba's offset of rays near the origin."""
+    shapes = (shape for shape in scene.shapes() if not shape.is_mesh() and shape.bbox().valid())
+    return any(_UNCERTAINTY * max(shape.bbox().extents()) > mi.math.RayEpsilon for shape in shapes)
+
+
 def _longest_edges(mesh, triangle: mi.UInt32) -> np.ndarray:
     """Longest edge of each ``triangle`` of a mesh, (n,) float32, world units."""
     faces, positions = mesh.faces_buffer(), mesh.vertex_positions_buffer()

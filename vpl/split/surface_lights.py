@@ -1,9 +1,10 @@
 """Virtual lights on surfaces where camera paths arrive, each with the irradiance that one path finds there.
 
 Random lines (:mod:`vpl.split.line_sampling`) meet surfaces (:mod:`vpl.split.line_hits`) with a known density.  Each hit
-on a surface with a minorant becomes a light: irradiance × minorant over the density.  The irradiance comes from next-event estimation and one path
-that starts at the light.  No path starts at an emitter, so the method needs no adjoint BSDFs, no correction for shading
-normals and no emission sampling, and an environment lights a room through its windows as in ``path``.
+on a surface with a minorant becomes a light: irradiance × minorant over the density.  The irradiance comes from
+next-event estimation and one path that starts at the light.  No path starts at an emitter, so the method needs no
+adjoint BSDFs, no correction for shading normals and no emission sampling, and an environment lights a room through its
+windows as in ``path``.
 
 Lines go to the cells from which a pilot's paths brought radiance: lights are wanted where they are seen and bright.
 """

@@ -51,7 +51,11 @@ def transmittance(scene, traits, kind: str, ray, most, active):
 
     ``most``: surfaces that it may pass, UInt32.  Lanes that are not ``active`` give 0.
     """
-    passed = mi.Float(1) & active & ~scene.ray_test(ray, active)
+    if traits.nearest_hits:
+        blocked = scene.ray_intersect_preliminary(ray, active=active).is_valid()
+    else:
+        blocked = scene.ray_test(ray, active)
+    passed = mi.Float(1) & active & ~blocked
     if not traits.null or kind in ("point", "spot", "surface", "directional"):
         return passed
     through = active & (passed == 0) & (most > 0)
