@@ -111,6 +111,14 @@ def test_a_blend_of_a_mirror_and_a_diffuse_wall(weight):
     assert_image_of_path(room_of(blend, bulb()), max_depth=4)
 
 
+def test_walls_whose_reflectance_is_negative_in_places():
+    """Surfaces around receive negative light from there, which virtual lights carry as well."""
+    texels = np.full((4, 4, 3), 0.7)
+    texels[::2, ::2] = [-0.5, 0.3, -0.2]
+    wall = {"type": "diffuse", "reflectance": image(texels) | {"filter_type": "nearest"}}
+    assert_image_of_path(room_of(wall, bulb()), 1024, 16, max_depth=5)
+
+
 def test_a_half_transparent_mask_around_all():
     mask = {"type": "mask", "opacity": 0.6, "nested": {"type": "diffuse", "reflectance": rgb(0.9)}}
     assert_image_of_path(room_of(mask, bulb()), reference="prb", max_depth=4)

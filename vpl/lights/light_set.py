@@ -41,11 +41,15 @@ class LightOptions:
 
 @dataclass
 class LightGroup:
-    """Lights of one kind on the device, with their tree (None if the method uses none)."""
+    """Lights of one kind on the device, with their tree (None if the method uses none).
+
+    ``sign``: of the contributions, -1 where the intensities are absolute values of negative ones.
+    """
 
     kind: str
     lights: DeviceLights
     tree: DeviceTree | None
+    sign: float = field(default=1.0, kw_only=True)
 
     @property
     def count(self) -> int:
@@ -193,14 +197,14 @@ class ScatteredGroup(LightGroup):
     cumulative: mi.Float64
 
     @classmethod
-    def of(cls, lights: VirtualLights, seed: int) -> ScatteredGroup:
-        """Group with a tree over lights of one kind; ``seed``: of the representatives."""
+    def of(cls, lights: VirtualLights, seed: int, sign: float = 1.0) -> ScatteredGroup:
+        """Group with a tree over lights of one kind; ``seed``: of the representatives; ``sign``: see LightGroup."""
         tree = _tree_of(lights, np.random.default_rng(seed))
         first, last = (upload(mi.UInt32, column) for column in _leaf_ranges(tree).T)
         intensity = lights.intensity.mean(1, dtype=np.float64)
         return cls(
             lights.kind, DeviceLights(lights), DeviceTree(lights.kind, tree, tree.representative), first, last,
-            upload(mi.UInt32, tree.leaf_order), running_sums(upload(mi.Float, intensity[tree.leaf_order])),
+            upload(mi.UInt32, tree.leaf_order), running_sums(upload(mi.Float, intensity[tree.leaf_order])), sign=sign,
         )  # fmt: skip
 
     def draw(self, nodes, sample):

@@ -19,7 +19,7 @@ KINDS = ("point", "spot", "oriented", "directional", "environment", "surface")
 AT_INFINITY = ("directional", "environment")
 
 _RECORD = 16
-_COLUMNS = ("position", "direction", "intensity", "depth", "cone", "facing")
+_COLUMNS = ("position", "direction", "intensity", "depth", "cone", "facing", "uncertainty")
 
 
 @dataclass
@@ -33,7 +33,8 @@ class VirtualLights:
     ``depth`` (n,) uint32: edges of the light path that ends in the light, 0 for lights that stand for an emitter;
     ``cone`` (n, 2) float32: cut-off angle and beam angle of spots in radians, (pi, pi) elsewhere;
     ``facing`` (n, 3) float32: of lights on surfaces, the vector to whose side alone they shine, such as a shading
-    normal (None: they shine wherever ``direction`` lets them).
+    normal (None: they shine wherever ``direction`` lets them);
+    ``uncertainty`` (n,) float32: of the position of lights on surfaces along ``direction``, world units (None: 0).
     """
 
     kind: str
@@ -43,6 +44,7 @@ class VirtualLights:
     depth: np.ndarray
     cone: np.ndarray
     facing: np.ndarray | None = None
+    uncertainty: np.ndarray | None = None
 
     @property
     def count(self) -> int:
@@ -98,6 +100,7 @@ class Light:
     depth: object
     cone: object
     facing: object = None
+    uncertainty: object = None
 
 
 class DeviceLights:
@@ -109,6 +112,8 @@ class DeviceLights:
             records[:, 0:3] = lights.position
         records[:, 3] = lights.depth.view(np.float32)
         records[:, 4:7] = lights.direction
+        if lights.uncertainty is not None:
+            records[:, 7] = lights.uncertainty
         records[:, 8:11] = lights.intensity
         records[:, 12:14] = lights.cone
         if lights.facing is not None:
@@ -129,7 +134,8 @@ class DeviceLights:
             fourth = dr.gather(mi.Vector4f, self._records, index * 4 + 3, active)
             cone, facing = mi.Vector2f(fourth.x, fourth.y), fourth.xyz if self._facing else None
         depth = dr.reinterpret_array(mi.UInt32, first.w)
-        return Light(first.xyz, second.xyz, mi.Color3f(third.x, third.y, third.z), depth, cone, facing)
+        color = mi.Color3f(third.x, third.y, third.z)
+        return Light(first.xyz, second.xyz, color, depth, cone, facing, second.w)
 
 
 def spot_falloff(cosine, cone):

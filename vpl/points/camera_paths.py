@@ -33,7 +33,8 @@ class SceneTraits:
     ``delta``, ``null``, ``smooth``, ``glossy``, ``transmissive``: whether any BSDF has such a lobe; ``perturbed``:
     registry indices of shapes with bump or normal maps; ``open_shapes``: registry indices of shapes that transmit light
     unscattered, None for every shape; ``open_scene``: a scene of the open shapes alone, None if ``open_shapes`` is None
-    or empty.
+    or empty; ``nearest_hits``: whether a shadow ray searches its nearest hit, as a path does.  On spheres of more than
+    some hundred units, Mitsuba's test for any hit reports the surface at the origin of a ray more often.
     """
 
     delta: bool
@@ -44,6 +45,7 @@ class SceneTraits:
     perturbed: tuple[int, ...]
     open_shapes: tuple[int, ...] | None
     open_scene: mi.Scene | None
+    nearest_hits: bool = False
 
     def is_null(self, shape):
         """Whether shapes (a pointer array) may transmit light unscattered."""

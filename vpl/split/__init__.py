@@ -29,6 +29,7 @@ The lights and the decisions:
 - ``cost_model``: every constant of the decisions, with its unit and its evidence
 - ``plan``: whether lights pay, how many, and how finely they are clustered
 - ``line_sampling``: random lines that meet surfaces with a known density, where camera paths arrive
+- ``line_hits``: surfaces that such lines meet, each counted once per crossing
 - ``surface_lights``: a virtual light wherever such a line meets a surface; kept lights
 - ``emitter_lights``: virtual lights that stand for many emitters
 """

@@ -26,6 +26,7 @@ from ..transport.evaluation import Transport
 from .emitters.base import EmitterSampler
 from .emitters.learned import learning_rays
 from .gather_vertices import LitVertices
+from .line_hits import has_large_curves
 from .path_tracer import Traced, trace_camera_rays
 from .pilot import Pilot, error_scale, relative_variance
 from .pixel_clusters import PixelClusters, light_clusters
@@ -229,9 +230,9 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
 
     made = kept.find(view.scene, (view.seed, view.rules.max_depth), make) if kept else make()
     statistics = {"light_paths": sum(drawn), "lights": {"surface": made.lights.count}}
-    if made.group is None:
+    if not made.groups:
         return None, statistics
-    return view.light_set([made.group], made.spacing(arrivals)), statistics
+    return view.light_set(made.groups, made.spacing(arrivals)), statistics
 
 
 # ---------------------- Image ----------------------
@@ -307,8 +308,9 @@ def _gathered_part(view: View, lights: ViewLights, plan: Plan, points: LitVertic
     # Of the sum over the samples of a pixel
     allowed = plan.error * samples * level[clusters.pixel]
     shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, first)
+    traits = replace(_OPAQUE, nearest_hits=has_large_curves(view.scene))
     for number, carrying in enumerate(lights.all):
-        transport, stream = Transport(view.scene, _OPAQUE, carrying), derived_seed(seed, 1, number)
+        transport, stream = Transport(view.scene, traits, carrying), derived_seed(seed, 1, number)
         shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit)
     clock.stop()
     counts = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}

@@ -34,11 +34,20 @@ _FIRST_OF_LEVEL = 8 ** np.arange(_LEVELS + 1, dtype=np.uint64)
 
 @dataclass
 class Lines:
-    """Line segments inside boxes: ``origin``, ``direction`` (n, 3), ``length`` (n,), float32, world units."""
+    """Line segments inside boxes, world units.
+
+    ``origin``, ``direction`` (n, 3), ``length`` (n,), float32; ``low``, ``size`` (n, 3) float64: the box of each.
+    """
 
     origin: np.ndarray
     direction: np.ndarray
     length: np.ndarray
+    low: np.ndarray
+    size: np.ndarray
+
+    def hold(self, line, position) -> np.ndarray:
+        """Whether points (n, 3) lie in the boxes of the lines with the numbers ``line`` (n,), boundary included."""
+        return _inside(position, self.low[line], self.size[line])
 
 
 @dataclass
@@ -110,7 +119,7 @@ class ArrivalOctree:
         place = np.where(back[:, None], place + direction * length[:, None], place)
         direction = np.where(back[:, None], -direction, direction)
         columns = (low[row] + place, direction, length)
-        return Lines(*(column.astype(np.float32) for column in columns))
+        return Lines(*(column.astype(np.float32) for column in columns), low[row], size[row])
 
     def density(self, position, normal) -> np.ndarray:
         """Expected hits per area of one line, on the side of a surface with the ``normal`` (n, 3): (n,) float64."""
@@ -129,8 +138,7 @@ class ArrivalOctree:
         for level in np.unique(boxes.level):
             number = finest >> np.uint64(3 * (_LEVELS - level))
             row = np.minimum(np.searchsorted(boxes.number, number), len(boxes.number) - 1)
-            beyond = position - boxes.low[row]
-            yield row, (boxes.number[row] == number) & ((beyond >= 0) & (beyond <= boxes.size[row])).all(1)
+            yield row, (boxes.number[row] == number) & _inside(position, boxes.low[row], boxes.size[row])
 
     def _boxes_around(self, cell, position, normal, weight) -> Boxes:
         number, row, count = np.unique(cell, return_inverse=True, return_counts=True)
@@ -161,6 +169,12 @@ class ArrivalOctree:
             for axis in range(3):
                 cell[:, axis] += ((code >> np.uint64(3 * bit + axis)) & np.uint64(1)).astype(np.float64) * 2.0**bit
         return self._low + cell * (self._size * 0.5**boxes.level)[:, None]
+
+
+def _inside(position, low, size) -> np.ndarray:
+    """Whether points (n, 3) lie in boxes, boundary included."""
+    beyond = position - low
+    return ((beyond >= 0) & (beyond <= size)).all(1)
 
 
 def _leaves(finest: np.ndarray) -> np.ndarray:

@@ -253,7 +253,9 @@ def _carry(path: Path, hit: Hit, settings: PathSettings, radiance, gathered: Gat
     outward = si.n * dr.mulsign(mi.Float(1), -dr.dot(si.n, path.ray.d))
     means = (channel_mean(x) for x in (path.carried, path.throughput, radiance))
     second = connects | (hit.smooth & (path.scattered == 1))
-    gathered.second = select_record(second, SecondVertices(si.p, outward, *means), gathered.second)
+    # On the ray, as virtual lights: on large shapes, Mitsuba's own point lies beside it
+    arrival = SecondVertices(path.ray(si.t), outward, *means)
+    gathered.second = select_record(second, arrival, gathered.second)
     path.carried = dr.select(connects, path.carried * w, 0)
     return connects
 

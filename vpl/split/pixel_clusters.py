@@ -138,7 +138,7 @@ def light_clusters(transport: Transport, clusters: PixelClusters, allowed: np.nd
         ray, surface, weight = clusters.draw(cluster, precise_sample(sampler))
         light, scale = chunk.group.draw(chunk.nodes, precise_sample(sampler))
         value, traced = evaluate_pairs(transport, chunk.group, surface, light, scale)
-        value = mi.UnpolarizedSpectrum(value) * weight
+        value = mi.UnpolarizedSpectrum(value) * weight * dr.opaque(mi.Float, chunk.group.sign)
         add_at(result, dr.select(chunk.written & dr.all(dr.isfinite(value)), value, 0), ray)
         dr.eval(result, traced)
         rays += int(dr.count(traced)[0])

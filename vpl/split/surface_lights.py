@@ -1,9 +1,10 @@
 """Virtual lights on surfaces where camera paths arrive, each with the irradiance that one path finds there.
 
-Random lines (:mod:`vpl.split.line_sampling`) meet surfaces with a known density.  Each hit on a surface with a minorant
-becomes a light: irradiance × minorant over the density.  The irradiance comes from next-event estimation and one path
-that starts at the light.  No path starts at an emitter, so the method needs no adjoint BSDFs, no correction for shading
-normals and no emission sampling, and an environment lights a room through its windows as in ``path``.
+Random lines (:mod:`vpl.split.line_sampling`) meet surfaces (:mod:`vpl.split.line_hits`) with a known density.  Each hit
+on a surface with a minorant becomes a light: irradiance × minorant over the density.  The irradiance comes from
+next-event estimation and one path that starts at the light.  No path starts at an emitter, so the method needs no
+adjoint BSDFs, no correction for shading normals and no emission sampling, and an environment lights a room through its
+windows as in ``path``.
 
 Lines go to the cells from which a pilot's paths brought radiance: lights are wanted where they are seen and bright.
 """
@@ -17,8 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import download, ones, spectrum_to_rgb, upload, upload_vectors
-from ..core.loops import recorded_once
+from ..core.arrays import download, ones, spectrum_to_rgb
 from ..core.parameters import fingerprint_without_camera
 from ..core.sampling import derived_seed, independent_sampler
 from ..lights.emission import bounding_box
@@ -26,7 +26,8 @@ from ..lights.light_set import ScatteredGroup
 from ..lights.virtual_lights import VirtualLights
 from .emitters.base import EmitterSampler, Places, irradiance_from_emitters
 from .lattice import Lattice
-from .line_sampling import ArrivalOctree, Lines
+from .line_hits import LineHits, hits_of
+from .line_sampling import ArrivalOctree
 from .path_tracer import trace_paths
 from .pilot import Arrivals
 from .roulette import OutgoingRadiance
@@ -36,21 +37,21 @@ from .view import FirstEdge, Gathering, PathSettings, State, Stream, View, ViewL
 _PRIOR = 2.0
 # Emitter samples of a light in scenes of many emitters: with one, a light near a lamp was a bright blotch
 _EMITTER_SAMPLES = 4
-# Surfaces that a line may meet: ends an endless row of hits at one place
-_MOST_LAYERS = 1024
 # Lights of all seeds that are kept together, some 400 bytes each
 _MOST_KEPT = 1 << 21
 
 
 @dataclass(frozen=True)
 class SurfaceLights:
-    """``lights`` of kind "surface", drawn by ``lines`` lines through ``octree``; ``group``: the lights with their tree,
-    None where there are none."""
+    """``lights`` of kind "surface", drawn by ``lines`` lines through ``octree``.
+
+    ``groups``: the positive and the negative parts of their intensities with light trees, empty parts left out.
+    """
 
     lights: VirtualLights
     octree: ArrivalOctree
     lines: int
-    group: ScatteredGroup | None
+    groups: list[ScatteredGroup]
 
     def spacing(self, arrivals: Arrivals) -> float:
         """Typical distance between lights where camera paths arrive, world units."""
@@ -59,18 +60,30 @@ class SurfaceLights:
 
 
 def surface_lights(view: View, arrivals: Arrivals, count: int, announce_tree: Callable[[], None]) -> SurfaceLights:
-    """The lights that ``count`` lines meet, with their tree; calls ``announce_tree`` before building the tree."""
+    """The lights that ``count`` lines meet, with their trees; calls ``announce_tree`` before building the trees."""
     # A path from a light lacks the two edges between camera and light; it is no camera path, so nothing is known of its
     # expected contribution
     rules = replace(view.rules, max_depth=view.rules.max_depth - 2, rr_depth=1)
     settings = replace(view, rules=rules, outgoing=OutgoingRadiance.unknown()).settings(ViewLights())
     seed = derived_seed(view.seed, Stream.SURFACE_LIGHTS)
     lights, octree = _drawn_lights(view.scene, view.emitters, arrivals, count, settings, seed)
-    group = None
-    if lights.count:
+    parts = _by_sign(lights)
+    if parts:
         announce_tree()
-        group = ScatteredGroup.of(lights, derived_seed(view.seed, Stream.TREE))
-    return SurfaceLights(lights, octree, count, group)
+    seed = derived_seed(view.seed, Stream.TREE)
+    return SurfaceLights(lights, octree, count, [ScatteredGroup.of(part, seed, sign) for part, sign in parts])
+
+
+def _by_sign(lights: VirtualLights) -> list[tuple[VirtualLights, float]]:
+    """Positive and negative parts of intensities as lights of their own: (lights, sign), without empty parts.
+
+    Surfaces whose reflectance is negative somewhere send negative light.  ``path`` adds it, and the traced part
+    subtracts the share of virtual lights from it.
+    """
+    parts = [
+        (replace(lights, intensity=np.maximum(sign * lights.intensity, 0)).without_bad()[0], sign) for sign in (1, -1)
+    ]
+    return [(part, sign) for part, sign in parts if part.count]
 
 
 def _drawn_lights(scene, emitters: EmitterSampler, arrivals: Arrivals, count: int, settings: PathSettings, seed: int):
@@ -84,12 +97,12 @@ def _drawn_lights(scene, emitters: EmitterSampler, arrivals: Arrivals, count: in
         arrivals.position, arrivals.normal, arrivals.weight, low + 0.5 * (extent - size), size, generator
     )  # fmt: skip
     octree.choose_by(_importance(octree, arrivals))
-    lights = _lights_along(scene, emitters, octree.lines(count, generator), settings, derived_seed(seed, 1))
+    hits = hits_of(scene, octree.lines(count, generator), size, generator)
+    lights = _lights_at(scene, emitters, hits, settings, derived_seed(seed, 1))
     density = count * octree.density(lights.position, lights.direction)
     with np.errstate(over="ignore"):
         lights.intensity = (lights.intensity / density[:, None]).astype(np.float32)
-    # Drops the intensities that single precision cannot hold
-    return lights.without_bad()[0], octree
+    return lights, octree
 
 
 def _importance(octree: ArrivalOctree, arrivals: Arrivals) -> np.ndarray:
@@ -103,66 +116,31 @@ def _importance(octree: ArrivalOctree, arrivals: Arrivals) -> np.ndarray:
     return number * np.sqrt((squared + _PRIOR * typical) / (number + _PRIOR))
 
 
-def _lights_along(scene, emitters: EmitterSampler, lines: Lines, settings: PathSettings, seed: int) -> VirtualLights:
-    """A light wherever a line meets a surface with a minorant; intensities are minorant × irradiance."""
-    rays = _rays_to_surfaces(scene, lines)
-    if dr.width(rays.o) == 0:
+def _lights_at(scene, emitters: EmitterSampler, hits: LineHits, settings: PathSettings, seed: int) -> VirtualLights:
+    """A light at every hit on a surface with a minorant; intensities are minorant × irradiance.
+
+    Mitsuba's point at a hit may lie beside the line.  The light lies on the line, where the density of lines is known;
+    its irradiance is found at Mitsuba's point, as ``path`` finds it.
+    """
+    if hits.count == 0:
         return VirtualLights.of("surface", [], [], [])
-    places, minorant = _places_with_minorants(scene, emitters, rays, settings, derived_seed(seed, 3))
+    places, minorant, hit = _places_with_minorants(scene, emitters, hits.ray, settings, derived_seed(seed, 3))
     if places.count == 0:
         return VirtualLights.of("surface", [], [], [])
     irradiance, length = _irradiance(scene, emitters, places, settings, seed)
-    columns = (places.position, places.normal, spectrum_to_rgb(minorant * irradiance), length)
+    columns = (places.normal, spectrum_to_rgb(minorant * irradiance), length)
     dr.eval(columns)
-    lights = VirtualLights.of("surface", *(download(column) for column in columns))
-    lights.facing = download(places.facing)
-    return lights.without_bad()[0]
-
-
-def _rays_to_surfaces(scene, lines: Lines):
-    """A ray for every surface that a line meets, which begins shortly before the surface; line by line."""
-    origin, direction = (upload_vectors(mi.Point3f, x) for x in (lines.origin, lines.direction))
-    direction, length = mi.Vector3f(direction), upload(mi.Float, lines.length)
-    lines = origin, direction, length
-    # The same kernel counts the surfaces and finds them
-    number = _meet(scene, lines, dr.zeros(mi.UInt32, len(length)), False, dr.zeros(mi.Point3f, 1), mi.UInt32(0))
-    count = int(dr.sum(number)[0])
-    if count == 0:
-        return dr.zeros(mi.Ray3f, 0)
-    starts, line = dr.zeros(mi.Point3f, count), dr.zeros(mi.UInt32, count)
-    _meet(scene, lines, dr.prefix_reduce(dr.ReduceOp.Add, number), True, starts, line)
-    return mi.Ray3f(starts, dr.gather(mi.Vector3f, direction, line))
-
-
-@recorded_once
-@dr.syntax
-def _meet(scene, lines, first, find: bool, starts, line):
-    """Number of surfaces that each of the ``lines`` (origin, direction, length) meets.
-
-    With ``find``, writes the point before each surface to ``starts`` and the number of its line to ``line``, for each
-    line from the index ``first`` on.
-    """
-    origin, direction, length = lines
-    find = dr.opaque(mi.Bool, find)
-    dr.make_opaque(first, starts, line)
-    place, remaining, number = mi.Point3f(origin), mi.Float(length), dr.zeros(mi.UInt32, dr.width(length))
-    this, active = dr.arange(mi.UInt32, dr.width(length)), length > 0
-    while dr.hint(active, exclude=[scene, origin, direction, length, first, find, this, starts, line]):
-        ray = mi.Ray3f(place, direction, remaining, 0.0, [])
-        si = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=active)
-        active &= si.is_valid()
-        dr.scatter(starts, place, first + number, active & find)
-        dr.scatter(line, this, first + number, active & find)
-        number += dr.select(active, 1, 0)
-        onward = si.spawn_ray(direction)
-        place, remaining = dr.select(active, onward.o, place), remaining - si.t
-        active &= (remaining > 0) & (number < _MOST_LAYERS)
-    dr.eval(number, starts, line)
-    return number
+    row = download(hit)
+    position, columns = hits.position[row], (download(column) for column in columns)
+    lights = VirtualLights.of("surface", position, *columns, facing=download(places.facing))
+    lights.uncertainty = hits.uncertainty[row]
+    return lights.select((lights.intensity != 0).any(1))
 
 
 def _places_with_minorants(scene, emitters, rays, settings: PathSettings, seed: int):
-    """(Points where rays meet a surface with a minorant, minorants), evaluated; normals on the side that was met.
+    """(Points where rays meet a surface with a minorant, minorants, indices of the rays), evaluated.
+
+    Normals lie on the side that was met.
 
     Uses the kernel of :func:`vpl.split.path_tracer.trace_paths`: another one with the code of all materials would take
     long to compile.
@@ -174,11 +152,12 @@ def _places_with_minorants(scene, emitters, rays, settings: PathSettings, seed: 
     sampler = independent_sampler(derived_seed(seed, 1), count)
     edge = FirstEdge.of_camera(rays, 1.0, True)
     met = trace_paths(scene, emitters, edge, lattice, sampler, settings).gathered.first
-    met = met.select(dr.compress((met.depth > 0) & (dr.max(met.weight) > 0)))
+    index = dr.compress((met.depth > 0) & (dr.max(met.weight) > 0))
+    met = met.select(index)
     outward = met.flat * dr.mulsign(mi.Float(1), dr.dot(met.flat, met.normal))
     places = Places(met.position, outward, met.normal)
     dr.eval(places)
-    return places, met.weight
+    return places, met.weight, index
 
 
 def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: int):
@@ -201,10 +180,10 @@ def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: i
     found = trace_paths(scene, emitters, edge, lattice, independent_sampler(derived_seed(seed, 1), count), settings)
     # A light stands for paths of one length, because gather vertices far from the camera may use short paths only. The
     # irradiance is a single contribution, drawn by its share, with the colour of the contribution
-    level, more = dr.sum(nearest), dr.sum(found.drawn)
+    level, more = dr.sum(dr.abs(nearest)), dr.sum(dr.abs(found.drawn))
     is_nearest = draw * (level + more) < level
     one = dr.select(is_nearest, nearest, found.drawn)
-    irradiance = dr.select(level + more > 0, one * (level + more) / dr.sum(one), 0)
+    irradiance = dr.select(level + more > 0, one * (level + more) / dr.sum(dr.abs(one)), 0)
     return irradiance, dr.select(is_nearest, mi.UInt32(1), found.length)
 
 

@@ -35,9 +35,14 @@ def contribution(kind: str, surface, light: Light, smallest_distance, active=Tru
 
 
 def shadow_ray(kind: str, interaction, light):
-    """Ray from a surface to a light that ends just before it; for lights at infinity it has no end."""
+    """Ray from a surface to a light that ends just before it; for lights at infinity it has no end.
+
+    It ends above the surface of a surface light by the uncertainty of the light's position.
+    """
     if kind in AT_INFINITY:
         return interaction.spawn_ray(-light.direction)
+    if kind == "surface":
+        return interaction.spawn_ray_to(light.position + light.uncertainty * light.direction)
     return interaction.spawn_ray_to(light.position)
 
 
@@ -46,7 +51,11 @@ def transmittance(scene, traits, kind: str, ray, most, active):
 
     ``most``: surfaces that it may pass, UInt32.  Lanes that are not ``active`` give 0.
     """
-    passed = mi.Float(1) & active & ~scene.ray_test(ray, active)
+    if traits.nearest_hits:
+        blocked = scene.ray_intersect_preliminary(ray, active=active).is_valid()
+    else:
+        blocked = scene.ray_test(ray, active)
+    passed = mi.Float(1) & active & ~blocked
     if not traits.null or kind in ("point", "spot", "surface", "directional"):
         return passed
     through = active & (passed == 0) & (most > 0)

@@ -9,8 +9,8 @@ from tests.support.rendering import render
 from tests.support.scenes import area_light, closed_box, rgb
 from vpl.direct import cluster_sampling, emitter_sampling
 from vpl.lights.emitters import read_emitters
+from vpl.split.line_hits import hits_of
 from vpl.split.line_sampling import Lines
-from vpl.split.surface_lights import _rays_to_surfaces
 
 
 @pytest.mark.parametrize(
@@ -33,13 +33,17 @@ def test_surfaces_along_lines_are_looked_for_once_in_a_kernel():
     calls = []
 
     class Counted:
+        def __getattr__(self, name):
+            return getattr(scene, name)
+
         def ray_intersect(self, *arguments, **more):
             calls.append(1)
             return scene.ray_intersect(*arguments, **more)
 
     origin, direction = np.full((10, 3), [0.1, 0.2, -9], np.float32), np.full((10, 3), [0, 0, 1], np.float32)
-    rays = _rays_to_surfaces(Counted(), Lines(origin, direction, np.full(10, 20, np.float32)))
-    assert len(calls) == 2 and len(rays.o.x) == 20
+    lines = Lines(origin, direction, np.full(10, 20, np.float32), np.full((10, 3), -10.0), np.full((10, 3), 20.0))
+    assert hits_of(Counted(), lines, 20.0, np.random.default_rng(0)).count == 20
+    assert len(calls) == 2
 
 
 def test_a_few_emitters_among_many_shapes_are_called_alone():

@@ -1,0 +1,182 @@
+"""Surfaces that random lines meet, each counted once per crossing.
+
+Single precision places a hit on a large shape up to some 1e-7 of the size of the shape beside the true surface: a
+millimetre on a planet of ten kilometres.  Three consequences matter to virtual lights:
+
+- A ray that continues behind a hit meets the same surface again.  Between two crossings of a primitive in the same
+  direction, a line must cross it in the other direction.  So a hit of the same primitive as the hit before, on the same
+  side, is no other crossing.
+- A line may find a surface outside of its box that lies inside, and the other way round.  So lines begin and end
+  outside of their boxes by more than the error, and hits inside count.  The distance is random, because distances along
+  a ray to a large shape are multiples of the error.
+- The next ray that arrives finds the surface elsewhere and may end before the light.  So a light knows the uncertainty
+  of its position, and shadow rays end above the surface by so much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import download, select_record, upload, upload_vectors
+from ..core.loops import recorded_once
+from ..lights.emitters import registered_shapes
+from .line_sampling import Lines
+
+# Largest distance between a surface and a point found on it, as a fraction of the extent of its shape or triangle: two
+# units in the last place
+_UNCERTAINTY = 2.0**-22
+# Step behind a surface that is met again, as a fraction of the rest of the line; doubled each time
+_FIRST_STEP = 1e-6
+# Surfaces that a line may meet: ends an endless row of hits at one place
+_MOST_LAYERS = 1024
+
+
+@dataclass
+class LineHits:
+    """Crossings of lines with surfaces.
+
+    ``ray``: begins shortly before each surface, evaluated; ``position`` (n, 3) float32: where the line meets the
+    surface; ``uncertainty`` (n,) float32: of that position along the normal.  World units.
+    """
+
+    ray: mi.Ray3f
+    position: np.ndarray
+    uncertainty: np.ndarray
+
+    @property
+    def count(self) -> int:
+        return len(self.position)
+
+
+def hits_of(scene, lines: Lines, scene_size: float, generator) -> LineHits:
+    """All crossings of ``lines`` with surfaces inside their boxes, line by line; ``scene_size``: world units."""
+    margin = _UNCERTAINTY * scene_size
+    before = (margin * (1 + generator.random(len(lines.length)))).astype(np.float32)
+    origin, direction = (
+        upload_vectors(mi.Vector3f, x) for x in (lines.origin - before[:, None] * lines.direction, lines.direction)
+    )
+    segments = origin, direction, upload(mi.Float, lines.length + before + np.float32(margin))
+    # The same kernel counts the crossings and finds them
+    number = _meet(scene, segments, dr.zeros(mi.UInt32, len(before)), False, _Found.none(1))
+    found = _Found.none(int(dr.sum(number)[0]))
+    if dr.width(found.line):
+        _meet(scene, segments, dr.prefix_reduce(dr.ReduceOp.Add, number), True, found)
+    # Position and box as the density sees them
+    row = np.flatnonzero(lines.hold(download(found.line), download(found.position)))
+    found = dr.gather(_Found, found, upload(mi.UInt32, row))
+    ray = mi.Ray3f(found.start, dr.gather(mi.Vector3f, direction, found.line))
+    dr.eval(ray, found)
+    return LineHits(ray, download(found.position), _uncertainty(scene, found, scene_size))
+
+
+@dataclass
+class _Found:
+    """Output arrays of :func:`_meet`.
+
+    ``start`` of the ray to a surface; ``position`` on the surface; registry index of its ``shape``; number of the
+    ``primitive``; number of the ``line``.
+    """
+
+    start: mi.Point3f
+    position: mi.Point3f
+    shape: mi.UInt32
+    primitive: mi.UInt32
+    line: mi.UInt32
+
+    @classmethod
+    def none(cls, count: int) -> _Found:
+        """Arrays of ``count`` entries, not written yet."""
+        kinds = (mi.Point3f, mi.Point3f, mi.UInt32, mi.UInt32, mi.UInt32)
+        return cls(*(dr.zeros(kind, count) for kind in kinds))
+
+
+def _uncertainty(scene, found: _Found, scene_size: float) -> np.ndarray:
+    """Uncertainty of positions, (n,) float32, where it exceeds Mitsuba's own offset of rays; 0 elsewhere."""
+    position, shape = download(found.position), download(found.shape)
+    offset = mi.math.RayEpsilon * (1 + np.abs(position).max(1, initial=0))
+    uncertainty = np.zeros(len(position), np.float32)
+    for index, one in registered_shapes(scene):
+        # Rectangles that Mitsuba merged have no box
+        extent = max(one.bbox().extents()) if one.bbox().valid() else scene_size
+        row = np.flatnonzero((shape == index) & (_UNCERTAINTY * extent > offset))
+        if len(row):
+            if one.is_mesh():
+                extent = _longest_edges(one, dr.gather(mi.UInt32, found.primitive, upload(mi.UInt32, row)))
+            uncertainty[row] = _UNCERTAINTY * extent
+    return np.where(uncertainty > offset, uncertainty, np.float32(0))
+
+
+def has_large_curves(scene) -> bool:
+    """Whether hits on a shape that is no mesh are more uncertain than Mitsuba's offset of rays near the origin."""
+    shapes = (shape for shape in scene.shapes() if not shape.is_mesh() and shape.bbox().valid())
+    return any(_UNCERTAINTY * max(shape.bbox().extents()) > mi.math.RayEpsilon for shape in shapes)
+
+
+def _longest_edges(mesh, triangle: mi.UInt32) -> np.ndarray:
+    """Longest edge of each ``triangle`` of a mesh, (n,) float32, world units."""
+    faces, positions = mesh.faces_buffer(), mesh.vertex_positions_buffer()
+    corners = [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * triangle + k)) for k in range(3)]
+    lengths = [dr.norm(corners[k] - corners[k - 1]) for k in range(3)]
+    return download(dr.maximum(dr.maximum(lengths[0], lengths[1]), lengths[2]))
+
+
+@recorded_once
+@dr.syntax
+def _meet(scene, lines, first, find: bool, found: _Found):
+    """Number of surfaces that each of the ``lines`` (origin, direction, length) crosses.
+
+    With ``find``, writes them to ``found``, for each line from the index ``first`` on.
+    """
+    origin, direction, length = lines
+    find = dr.opaque(mi.Bool, find)
+    dr.make_opaque(first, found)
+    place, remaining, number = mi.Point3f(origin), mi.Float(length), dr.zeros(mi.UInt32, dr.width(length))
+    this, active = dr.arange(mi.UInt32, dr.width(length)), length > 0
+    step, last = mi.Float(0), _Primitive.none(dr.width(length))
+    while dr.hint(active, exclude=[scene, origin, direction, length, first, find, this, found]):
+        ray = mi.Ray3f(place, direction, remaining, 0.0, [])
+        si = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=active)
+        active &= si.is_valid()
+        si.p, met = ray(si.t), _Primitive.of(si, direction)
+        again = met.equals(last)
+        crossed = active & ~again
+        crossing = _Found(place, si.p, met.shape, met.number, this)
+        dr.scatter(found, crossing, first + number, crossed & find)
+        number += dr.select(crossed, 1, 0)
+        last = select_record(active, met, last)
+        onward = si.spawn_ray(direction)
+        step = dr.select(again, dr.maximum(2 * step, _FIRST_STEP * length), 0)
+        place, remaining = dr.select(active, onward.o + step * direction, place), remaining - si.t - step
+        active &= (remaining > 0) & (number < _MOST_LAYERS)
+    dr.eval(number, found)
+    return number
+
+
+@dataclass
+class _Primitive:
+    """Primitive that a line met, and from which side."""
+
+    shape: mi.UInt32
+    instance: mi.UInt32
+    number: mi.UInt32
+    enters: mi.Bool
+
+    @classmethod
+    def none(cls, count: int) -> _Primitive:
+        """Nothing met so far."""
+        return cls(*(dr.zeros(mi.UInt32, count) for _ in range(3)), dr.zeros(mi.Bool, count))
+
+    @classmethod
+    def of(cls, si, direction) -> _Primitive:
+        """The primitive that a ray met at ``si``."""
+        shape, instance = (dr.reinterpret_array(mi.UInt32, pointer) for pointer in (si.shape, si.instance))
+        return cls(shape, instance, mi.UInt32(si.prim_index), dr.dot(si.n, direction) < 0)
+
+    def equals(self, other: _Primitive) -> mi.Bool:
+        """Whether both are the same primitive from the same side."""
+        same = (self.shape == other.shape) & (self.instance == other.instance)
+        return same & (self.number == other.number) & (self.enters == other.enters)
