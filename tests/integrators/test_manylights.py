@@ -21,7 +21,7 @@ QUICK_MATERIALS = ("roughplastic", "principled", "blendbsdf", "twosided", "diffu
 pytestmark = pytest.mark.usefixtures("lights_cost_nothing")
 
 
-def assert_image_of_path(description, spp=256, seeds=8, finds=0.02, reference="path", lights=True, **more):
+def assert_image_of_path(description, spp=128, seeds=8, finds=0.025, reference="path", lights=True, **more):
     """Means over seeds, over tiles and over the image, are those of ``reference``."""
     scene = mi.load_dict(description)
 
@@ -279,7 +279,7 @@ def test_sensors(kind):
     def pair(seed):
         return tuple(render(scene, name, spp, seed, max_depth=4) for name in ("manylights", "path"))
 
-    assert_same_mean(pair, 8, tiles=1 if kind in ONE_PIXEL else 4)
+    assert_same_mean(pair, 8, 0.02, tiles=1 if kind in ONE_PIXEL else 4)
 
 
 @pytest.mark.parametrize("wrapper", ["moment", "aov"])
@@ -301,7 +301,7 @@ def test_monochrome():
     def pair(seed):
         return tuple(render(scene, name, 256, seed, max_depth=5) for name in ("manylights", "path"))
 
-    assert_same_mean(pair, 8)
+    assert_same_mean(pair, 8, 0.02)
 
 
 # ---------------------- Edges ----------------------
