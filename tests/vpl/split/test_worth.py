@@ -58,7 +58,7 @@ def test_the_image_is_that_of_path(monkeypatch, lights_cost_nothing, lights):
         assert ("lights" in statistics) == lights and statistics["worth"] > 0
         return found, render(scene, "path", 256, seed)
 
-    assert_same_mean(pair, 8)
+    assert_same_mean(pair, 8, 0.025)
 
 
 def test_alpha_is_that_of_path_where_a_pixel_sees_masks_behind_masks(monkeypatch):
