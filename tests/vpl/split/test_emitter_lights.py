@@ -171,7 +171,7 @@ def test_turned_covered_hollow_and_uneven_emitters_change_no_mean(always):
     box["floor"]["bsdf"] = bump
     del box["left"]
     scene = mi.load_dict(box)
-    assert_image_of_path(scene, 256, 0.08, max_depth=4)
+    assert_image_of_path(scene, 256, 0.1, max_depth=4)
 
 
 # ---------------------- Lights ----------------------
