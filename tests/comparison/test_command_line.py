@@ -365,9 +365,8 @@ sys.exit(manylights.main({[CORNELL, *TINY, "-o", str(output), "--spp", "100", "-
 
 
 def test_interruption_reaches_a_process(tmp_path):
-    size = [*TINY, "--spp", 10**9, "--pass-spp", 1]
-    with process(CORNELL, *size, "-o", tmp_path / "a.exr", "-i", "path", "-v") as rendering:
-        assert any("Starting render job" in line for line in iter(rendering.stdout.readline, ""))
+    with process(CORNELL, *TINY, "-o", tmp_path / "a.exr", "--spp", 10**9, "--pass-spp", 1, "-v") as rendering:
+        assert any("The integrator is manylights" in line for line in iter(rendering.stdout.readline, ""))
         rendering.send_signal(signal.SIGINT)
         _, said = rendering.communicate(timeout=PATIENCE)
     assert rendering.returncode == 130 and "interrupted" in said

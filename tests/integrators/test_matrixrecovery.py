@@ -83,6 +83,7 @@ def test_the_error_falls_with_alpha(shadows):
     assert errors[2] < 0.7 * errors[0] and errors[1] < errors[0]
 
 
+@pytest.mark.stress
 def test_the_bias_of_prediction_is_small_and_falls_with_sampling(shadows):
     """With the same seeds, and so the same lights; clusters alone have none."""
     expected = np.mean([render(shadows, "vpl", 1, seed, **SMALL) for seed in range(6)], axis=0)

@@ -57,6 +57,7 @@ import mitsuba as mi
 import manylights
 
 mi.set_variant("llvm_ad_rgb")
+mi.set_log_level(mi.LogLevel.Error)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 camera = {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}}
 scene = {"type": "scene", "camera": camera, "bulb": {"type": "point"}, "ball": {"type": "sphere"}}
