@@ -9,27 +9,27 @@
 The formula, in the order to read in:
 
 - :mod:`vpl.transport.carried_share`: the share w of virtual lights
-- ``minorant``: the Lambertian minorant of a BSDF, the diffuse part that virtual lights carry
-- ``path_tracer``: paths as Mitsuba's ``path`` traces them, minus the part that virtual lights carry
+- ``minorant``: the Lambertian minorant of a BSDF, the diffuse part carried by virtual lights
+- ``path_tracer``: the paths of Mitsuba's ``path``, minus the part carried by virtual lights
 - ``estimator``: the steps from the pilot to the image
 
 The terms of the estimator:
 
 - ``view``: camera rays, settings of their paths, streams of random numbers
-- ``roulette``: Russian roulette, and how its probabilities are chosen
-- ``gather_vertices``: vertices where virtual lights are added, which of them are lit, and both normalisations
-- ``pixel_clusters``: one light cut for the vertices of a pixel that face the same way
+- ``roulette``: Russian roulette and the choice of its probabilities
+- ``gather_vertices``: vertices where virtual lights are added, the choice of lit vertices, and both normalisations
+- ``pixel_clusters``: a light cut for the vertices of a pixel with similar normals
 - ``lattice``: stratified random numbers for the samples of a pixel
 - ``emitters``: emitter samplers for next-event estimation
-- ``spatial_cells``: cubes of space by facing, for values that are learned by place
+- ``spatial_cells``: cubes of space by facing, for values learned by place
 
 The lights and the decisions:
 
-- ``pilot``: a few whole paths, their relative variance, and the brightness of the image around them
-- ``cost_model``: every constant of the decisions, with its unit and its evidence
-- ``plan``: whether lights pay, how many, and how finely they are clustered
-- ``line_sampling``: random lines that meet surfaces with a known density, where camera paths arrive
-- ``line_hits``: surfaces that such lines meet, each counted once per crossing
-- ``surface_lights``: a virtual light wherever such a line meets a surface; kept lights
-- ``emitter_lights``: virtual lights that stand for many emitters
+- ``pilot``: a few whole paths, the relative variance, and the brightness of the image nearby
+- ``cost_model``: every constant of the decisions, with unit and evidence
+- ``plan``: whether lights pay, the number of lights, and the fineness of the clusters
+- ``line_sampling``: random lines with a known density on surfaces, drawn near the arrivals of camera paths
+- ``line_hits``: crossings of random lines with surfaces, each counted once
+- ``surface_lights``: a virtual light at each crossing of a line with a surface; kept lights
+- ``emitter_lights``: virtual lights representing many emitters
 """

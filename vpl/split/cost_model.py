@@ -1,12 +1,12 @@
-"""Cost model: every constant by which ``manylights`` decides, with its unit, its meaning and its evidence.
+"""Cost model: every constant of the decisions of ``manylights``, with unit, meaning and evidence.
 
-A pilot measures relative variances; the constants turn them into predictions of cost and of remaining variance
-(:mod:`vpl.split.plan`, :mod:`vpl.split.roulette`).  Predictions use counts and never the clock, so the same seed makes
-the same decisions on every machine.  ``benchmarks/cost_model.py`` halves and doubles each constant and prints the
-effect on variance × time; :func:`table` lists all of them.
+A pilot measures relative variances.  The constants predict cost and remaining variance (:mod:`vpl.split.plan`,
+:mod:`vpl.split.roulette`).  Predictions use counts and never the clock, so the same seed makes the same decisions on
+every machine.  ``benchmarks/cost_model.py`` halves and doubles each constant and prints the effect on variance × time.
+:func:`table` lists the constants.
 
 Costs are in units of one camera path without virtual lights.  A relative variance is the variance of one path over the
-squared brightness of its pixel.
+squared brightness of the pixel.
 """
 
 from __future__ import annotations

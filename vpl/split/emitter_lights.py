@@ -3,8 +3,8 @@
     f L = w F L + (f L - w F L)
 
 Point and spot emitters are virtual lights themselves, with w = 1.  Area emitters get virtual lights on random points,
-with the w of :mod:`vpl.transport.carried_share`.  A light cut then stands for thousands of emitters, where next-event
-estimation would draw a single one; next-event estimation keeps the second term.
+with the w of :mod:`vpl.transport.carried_share`.  A light cut then represents thousands of emitters, whereas next-event
+estimation draws a single emitter.  Next-event estimation keeps the second term.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _LEAST_POINTS = 4
 class EmitterLights:
     """Virtual lights that stand for emitters.
 
-    ``omni``: point and spot emitters, all of kind "spot"; ``carried`` (rows,) bool: area emitters that virtual lights
-    stand for.
+    ``omni``: point and spot emitters, all of kind "spot"; ``carried`` (rows,) bool: area emitters represented by
+    virtual lights.
     """
 
     emitters: Emitters
@@ -46,8 +46,8 @@ class EmitterLights:
 
     @property
     def _weight(self) -> np.ndarray:
-        """Fraction of the points on each area emitter, (rows,) float64: a mixture of proportional to power and uniform;
-        all 0 where no emitter has power."""
+        """Fraction of the points on each area emitter, (rows,) float64: a mixture of proportional to power and uniform.
+        The fractions are 0 if no emitter has power."""
         power = np.where(self.carried, self.emitters.area.power, 0)
         some = np.count_nonzero(power)
         if not some:
@@ -69,7 +69,7 @@ class EmitterLights:
         lights, weight = [self.omni], self._weight
         if weight.any():
             on_areas = area_lights(self.emitters, count, derived_seed(seed, 0), weight)
-            # With `facing`, as lights on surfaces have, so that the same kernels gather both
+            # `facing` is set as for lights on surfaces: both kinds use the same kernels
             lights.append(replace(on_areas, kind="surface", facing=on_areas.direction).without_bad()[0])
         return [ScatteredGroup.of(x, derived_seed(seed, 1, k)) for k, x in enumerate(lights) if x.count]
 

@@ -1,10 +1,10 @@
 """Estimator of ``manylights``: start (pilot, emitter sampler) → plan → lights → image.
 
-Each step takes the results of the steps before it and returns its own result; no step changes the results of another
-one but the emitter sampler, which learns from the pilot.  The same seed makes the same decisions.
+Each step takes the results of earlier steps and returns a new result.  Only the emitter sampler changes: the sampler
+learns from the pilot.  The same seed makes the same decisions.
 
-The passes of one render may share a :class:`Start`.  Each pass still draws its own lights and paths and has a plan for
-its own size.  The start is independent of the random numbers of later passes, so every pass is unbiased.
+The passes of a render may share a :class:`Start`.  Each pass still draws new lights and paths and has a plan for the
+size of the pass.  The start is independent of the random numbers of later passes, so every pass is unbiased.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from .roulette import OutgoingRadiance, best_multiple
 from .surface_lights import KeptLights, surface_lights
 from .view import PathSettings, Stream, View, ViewLights
 
-# Camera rays that are traced at a time: half of them, but at least and at most as many. New memory of a process is slow
-# to fill, which small images feel, and Dr.Jit records the kernels anew for each part
+# Smallest and largest number of camera rays per part; the target is half of the image. Filling new memory of a process
+# is slow, which matters for small images, and Dr.Jit records the kernels anew for each part
 _WAVEFRONT = 1 << 18, 1 << 20
 # Every surface blocks the light of virtual lights: light that passes a surface is traced
 _OPAQUE = SceneTraits(False, False, True, False, False, (), (), None)
@@ -53,8 +53,8 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Start:
-    """Knowledge with which a pass begins: the ``pilot``; the sampler of ``emitters``, which has learned from it; kinds
-    of lights to compare, ``options``, empty where ``refusal`` has a reason against lights."""
+    """Knowledge at the beginning of a pass: the ``pilot``; the sampler of ``emitters``, after learning from the pilot;
+    ``options``: kinds of lights to compare, empty if ``refusal`` holds a reason against lights."""
 
     pilot: Pilot
     emitters: EmitterSampler
@@ -72,7 +72,7 @@ class Decision:
     options: list[Option]
 
     def expected_light(self, lights: ViewLights) -> np.ndarray:
-        """Radiance that ``lights`` are expected to bring to each pixel of the view, (pixels,)."""
+        """Expected radiance of ``lights`` in each pixel of the view, (pixels,)."""
         kinds = bool(lights.surfaces), bool(lights.emitters)
         remains = next(x.expected for x in self.options if (x.surfaces, x.emitters) == kinds)
         return np.maximum(self.pilot.nearby(self.pilot.radiance - remains), 0)
@@ -81,7 +81,7 @@ class Decision:
 def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callable[[], bool], clock: Clock) -> Estimate:
     """Estimate the radiance of a view's camera rays; ``view.emitters`` is the sampler of ``start``.
 
-    ``kept``: lights of earlier images, None where none are kept; ``stopped``: whether to end early.
+    ``kept``: lights of earlier images, or None; ``stopped``: whether to end early.
     """
     decision = decide(view, start)
     view, roulette = with_roulette(view, decision)
@@ -98,8 +98,8 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
 def make_start(view: View, virtual_lights: bool, is_shared: bool) -> Start:
     """Trace the pilot of a view, learn from it, and measure kinds of virtual lights.
 
-    ``virtual_lights``: whether there may be any; ``is_shared``: whether passes of other sizes use the start, too, so
-    that all kinds have to be measured.
+    ``virtual_lights``: whether virtual lights are allowed; ``is_shared``: whether passes of different sizes use the
+    start, which requires measuring every kind.
     """
     pilot, refusal = learning_pilot(view), _refusal(view, virtual_lights)
     options = [] if refusal else _options(view, pilot, _evidence(view, pilot), is_shared)
@@ -107,9 +107,10 @@ def make_start(view: View, virtual_lights: bool, is_shared: bool) -> Start:
 
 
 def learning_pilot(view: View) -> Pilot:
-    """Trace the pilot, let the emitter sampler learn from it, and trace it again where the sampler learned.
+    """Trace the pilot, train the emitter sampler on the pilot, and trace the pilot again if the sampler learned.
 
-    The sampler forgets where the second pilot has the greater variance × cost: small shadows and gloss can mislead it.
+    The sampler forgets if the second pilot has the greater variance × cost: small shadows and gloss can mislead the
+    sampler.
     """
     pilot = Pilot.trace(view, ViewLights())
     rays, seed = learning_rays(view.learning_count), derived_seed(view.seed, Stream.LEARNING)
@@ -143,7 +144,7 @@ def _may_carry_emitters(view: View) -> bool:
 
 
 def _refusal(view: View, virtual_lights: bool) -> str:
-    """Reason against virtual lights that no pilot can change; empty where there is none."""
+    """Reason against virtual lights, independent of the pilot; an empty string if lights are possible."""
     if not virtual_lights:
         return "virtual_lights is off"
     if view.perturbed.everywhere:
@@ -154,16 +155,16 @@ def _refusal(view: View, virtual_lights: bool) -> str:
 
 
 def _options(view: View, pilot: Pilot, evidence: Evidence, measures_all: bool) -> list[Option]:
-    """Kinds of lights that may pay; measures the residual of lights on surfaces where it can change the choice, or
-    always."""
+    """Kinds of lights that may pay; measures the residual of lights on surfaces if the residual can change the choice,
+    or always."""
     options, assumed, emitters = [], _with_surfaces(view, pilot, False), None
     if evidence.emitters:
         emitters = view.emitter_lights([])
         traced = Pilot.trace(view, ViewLights(emitters=emitters))
         options.append(Option(False, True, traced.radiance, traced.indirect))
         assumed += _with_surfaces(view, traced, True)
-    # A measured residual only raises the price of an option: the most promising option is measured first, and another
-    # one only if it still promises more
+    # A measured residual only raises the price of an option: options are measured in the order of the assumed price,
+    # and an option is skipped once a measured option is better
     for option in sorted(assumed, key=partial(price, evidence)):
         if measures_all or may_pay(evidence, option, options):
             # The distance between lights is not known yet. With c = 0 lights carry the most
@@ -182,7 +183,7 @@ def _with_surfaces(view: View, traced: Pilot, emitters: bool) -> list[Option]:
 
 
 def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
-    """(View with Russian roulette by expected contribution, where that pays; its multiple, as a statistic)."""
+    """(View with Russian roulette by expected contribution, if roulette pays; the multiple, as a statistic)."""
     pilot, onward, model = decision.pilot, decision.pilot.onward, view.model
     if len(onward.path) == 0:
         return view, {}
@@ -204,7 +205,7 @@ def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
 
 
 def make_lights(view: View, decision: Decision, kept: KeptLights | None, clock: Clock) -> tuple[ViewLights, dict]:
-    """(Virtual lights with their trees, statistics) of a plan."""
+    """(Virtual lights with trees, statistics) of a plan."""
     surfaces, statistics = _surface_lights(view, decision, kept, clock)
     if not decision.plan.emitters:
         return ViewLights(surfaces), statistics
@@ -217,7 +218,7 @@ def make_lights(view: View, decision: Decision, kept: KeptLights | None, clock: 
 
 
 def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clock: Clock):
-    """(Light set on surfaces, None where there is none; statistics)."""
+    """(Light set on surfaces, or None; statistics)."""
     wanted, arrivals = decision.plan.light_paths, decision.pilot.arrivals
     if not wanted:
         return None, {}
@@ -253,7 +254,7 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
         dr.eval(lane)
         traced, points = _traced_part(view, lane, first, settings, lights, decision.plan, clock)
         part, opaque = traced.radiance, traced.valid
-        # Frees the memory of gather vertices that are not lit
+        # Frees the memory of unlit gather vertices
         del traced
         if points is not None:
             of_pixels = expected[first // view.samples :][: -(-len(lane) // view.samples)]
@@ -292,8 +293,8 @@ def _traced_part(
 def _gathered_part(view: View, lights: ViewLights, plan: Plan, points: LitVertices, found, expected, first, clock):
     """(Light of virtual lights at the ``points`` of some pixels, per camera ray; counters).
 
-    The error of cuts is relative to the brightness of a pixel: the radiance that paths ``found``, plus the light that
-    virtual lights are ``expected`` to bring.
+    The error of cuts is relative to the brightness of a pixel: the radiance ``found`` by paths, plus the ``expected``
+    light of virtual lights.
     """
     samples, count = view.samples, dr.width(found)
     lit = dr.zeros(mi.UnpolarizedSpectrum, count)

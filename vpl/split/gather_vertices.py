@@ -1,8 +1,9 @@
-"""Gather vertices: the vertices of camera paths where irradiance from virtual lights is added, and the choice of them.
+"""Gather vertices: the vertices of camera paths where irradiance from virtual lights is added, and the choice of lit
+vertices.
 
-A path has a *first* gather vertex and may have *later* ones.  Not every vertex is lit: of a pixel with n samples, k
-first vertices are lit, and as many later ones as their weight deserves.  :class:`LitVertices` divides the weights by
-the fractions that are lit, so the sum over lit vertices has the expectation of the sum over all vertices.
+A path has a *first* gather vertex and may have *later* ones.  Only some vertices are lit: in a pixel with n samples, k
+first vertices, and a number of later vertices in proportion to weight.  :class:`LitVertices` divides the weights by the
+lit fractions, so the sum over lit vertices has the expectation of the sum over all vertices.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ class GatherVertices:
     """Vertices of paths, one per lane.
 
     ``position``: world units; ``normal``: shading normal on the visible side; ``flat``: geometric normal; ``weight``:
-    contribution to the camera ray per irradiance from virtual lights, an unpolarized spectrum, may be negative, 0 where
-    nothing is gathered; ``depth``: edges from the camera, 0 where the lane has no vertex.
+    contribution to the camera ray per irradiance from virtual lights, an unpolarized spectrum, may be negative, 0 for
+    no vertex; ``depth``: edges from the camera, 0 for no vertex.
     """
 
     position: mi.Point3f
@@ -55,7 +56,7 @@ class GatherVertices:
 def joined(first, second):
     """Concatenate the lanes of two arrays; the caller evaluates the result.
 
-    ``dr.concat`` puts the number of lanes into its kernel, which Dr.Jit then compiles for every number of lanes.
+    ``dr.concat`` puts the number of lanes into the kernel: Dr.Jit would compile a kernel for every number of lanes.
     """
     if dr.depth_v(first) > 1:
         return type(first)(*(joined(x, y) for x, y in zip(first, second, strict=True)))
@@ -69,11 +70,11 @@ def joined(first, second):
 
 @dataclass
 class SecondVertices:
-    """Second vertices of paths: the vertex after the first one that scatters or gathers; one per lane.
+    """Second vertices of paths, one per lane: the vertex after the first scattering or gathering vertex.
 
-    ``position``: world units; ``normal``: geometric normal on the side where the path arrived; ``weight``: contribution
-    per irradiance with w = 1, 0 where virtual lights carry nothing; ``throughput`` of the path up to the vertex;
-    ``before``: radiance that the path had found before.  The last three are means over channels.
+    ``position``: world units; ``normal``: geometric normal on the side of arrival; ``weight``: contribution per
+    irradiance with w = 1, 0 where virtual lights carry nothing; ``throughput`` of the path up to the vertex;
+    ``before``: radiance found by the path before the vertex.  The last three are means over channels.
     """
 
     position: mi.Point3f
@@ -90,10 +91,10 @@ class SecondVertices:
 
 @dataclass
 class Gathered:
-    """Gather vertices that paths have met so far, one record per lane.
+    """Gather vertices of paths up to now, a record per lane.
 
-    ``first``; ``second``; ``later``: one of the later gather vertices, drawn by weight; ``later_level``: sum of the
-    weights of all later ones, mean over channels.
+    ``first``; ``second``; ``later``: a later gather vertex, drawn by weight; ``later_level``: sum of the weights of the
+    later vertices, mean over channels.
     """
 
     first: GatherVertices
@@ -107,14 +108,14 @@ class Gathered:
         return cls(GatherVertices.none(count), SecondVertices.none(), GatherVertices.none(count), mi.Float(0))
 
     def add(self, vertex: GatherVertices, is_first: mi.Bool, sample: mi.Float) -> None:
-        """Record a vertex; ``sample``: a uniform number that decides whether it replaces the later one."""
+        """Record a vertex; ``sample``: a uniform number for the choice of the later vertex."""
         self.first = select_record(is_first, vertex, self.first)
         level = dr.select(is_first, 0, channel_mean(dr.abs(vertex.weight)))
         self.later_level += level
         self.later = select_record(sample * self.later_level < level, vertex, self.later)
 
     def finish(self) -> None:
-        """Give the later vertex the weight of all later ones: its weight over the probability of drawing it."""
+        """Divide the weight of the drawn later vertex by the probability of the draw."""
         level = self.later_level
         self.later.weight *= dr.select(level > 0, level / channel_mean(dr.abs(self.later.weight)), 0)
 
@@ -123,8 +124,8 @@ class Gathered:
 class LitVertices:
     """Gather vertices that virtual lights light.
 
-    ``vertices``: their weights over the fraction of the vertices that is lit; ``rays``: the camera ray of each, UInt32;
-    ``alone``: number of later vertices, which come last and form clusters of their own.
+    ``vertices``: weights divided by the lit fraction; ``rays``: the camera ray of each vertex, UInt32; ``alone``:
+    number of later vertices, at the end; each later vertex is a cluster.
     """
 
     vertices: GatherVertices
@@ -133,14 +134,14 @@ class LitVertices:
 
     @classmethod
     def of(cls, first: GatherVertices, later: GatherVertices, samples: int, most: int, seed: int) -> LitVertices:
-        """Choose at most ``most`` first vertices of every pixel of ``samples`` rays, and later ones by their weight."""
+        """Choose at most ``most`` first vertices of every pixel of ``samples`` rays, and later vertices by weight."""
         kept, number = min(most, samples), dr.opaque(mi.UInt32, samples)
         sample = dr.arange(mi.UInt32, dr.width(first.weight)) % number
         # Evenly among the samples of a pixel
         lit = mi.UInt64(sample) * dr.opaque(mi.UInt64, kept) % mi.UInt64(number) >= dr.opaque(mi.UInt64, samples - kept)
         rays = dr.compress(lit & (dr.max(dr.abs(first.weight)) > 0))
         later_rays, factor = drawn_later(first, later, samples, kept, seed)
-        # kept of samples first vertices are lit, so each stands for samples / kept of them
+        # Only kept of samples first vertices are lit, so each represents samples / kept vertices
         stands_for = dr.opaque(mi.Float, samples / kept)
         picked = first.select(rays, stands_for).and_then(later.select(later_rays, factor))
         return cls(picked, joined(rays, later_rays), len(later_rays))
@@ -155,8 +156,8 @@ def drawn_later(
 ) -> tuple[mi.UInt32, mi.Float]:
     """Draw later vertices of each pixel in proportion to their weight.
 
-    Their expected number is ``most`` times the fraction of the pixel's total weight that later vertices have.  Returns
-    (camera rays, ascending; factors of the weights, the inverse of the expected number of times that each is drawn).
+    The expected number is ``most`` times the fraction of later vertices in the total weight of the pixel.  Returns
+    (camera rays, ascending; factors of the weights: the inverse of the expected number of draws of each vertex).
     Systematic sampling along each pixel of ``samples`` consecutive rays, from a random start.
     """
     levels = [channel_mean(dr.abs(x.weight)) for x in (first, later)]

@@ -1,9 +1,9 @@
 """Stratified random numbers for vertices that scatter: a lattice over the samples of a pixel at each vertex.
 
-Rank-1 lattices with a random shift of the unit square, so that every single number is uniform [Cranley and Patterson
-1976; Sloan and Joe 1994, "Lattice Methods for Multiple Integration"].  Each dimension, vertex and pixel takes the
-points in a random order of its own: with a common order, products of two dimensions would have up to twice the variance
-of independent numbers.
+Rank-1 lattices with a random shift of the unit square, so every single number is uniform [Cranley and Patterson 1976;
+Sloan and Joe 1994, "Lattice Methods for Multiple Integration"].  Each dimension, vertex and pixel takes the points in
+an independent random order: with a common order, products of two dimensions would have up to twice the variance of
+independent numbers.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ import numpy as np
 from ..core.arrays import upload
 from ..core.sampling import HASH_ROUNDS, derived_seed
 
-# Multipliers of a hash in which every bit depends on all input bits [Wellons 2018, "Prospecting for hash functions"]
+# Multipliers of a hash with full avalanche: every bit depends on every input bit [Wellons 2018, "Prospecting for hash
+# functions"]
 _MIXING = (0x7FEB352D, 0x846CA68B)
 # 2^32 over the golden ratio, made odd: far from any simple fraction
 _STEP = 0x9E3779B9
-# Largest number of orders in the table and of its entries (1 MB), but at least one order: two dimensions share an order
-# and its start with a probability of one over the entries. Multipliers that are tried for a lattice
+# Largest number of orders and of entries (1 MB) in the table, with a minimum of 1 order; two dimensions share an order
+# and a start with a probability of 1 / entries. Number of candidate multipliers of a lattice
 _ORDERS, _ENTRIES, _TRIED = 256, 1 << 18, 64
 
 
@@ -57,7 +58,7 @@ def lattice_multiplier(count: int) -> int:
 
 @lru_cache(maxsize=8)
 def _orders(count: int) -> np.ndarray:
-    """Random permutations of ``count`` points, one after the other; fixed, as a hash function is."""
+    """Random permutations of ``count`` points, in sequence; fixed, like a hash function."""
     rows = np.tile(np.arange(count, dtype=np.uint32), (max(min(_ORDERS, _ENTRIES // count), 1), 1))
     return np.random.default_rng(0).permuted(rows, axis=1).reshape(-1)
 
@@ -67,14 +68,14 @@ def _fraction(bits):
 
 
 class Lattice:
-    """Numbers for paths; ``lane`` (UInt32): of each path, where ``samples`` consecutive lanes belong to a pixel."""
+    """Numbers for paths; ``lane`` (UInt32): lane of each path; ``samples`` consecutive lanes belong to a pixel."""
 
     def __init__(self, lane, samples: int, seed: int):
-        # Evaluated, so that counted and chosen lanes use the same kernel
+        # Evaluated: counted and chosen lanes use the same kernel
         dr.eval(lane)
         self._samples = dr.opaque(mi.UInt32, samples)
         self._pixel, self._number = lane // self._samples, lane % self._samples
-        # Derived, because the numbers of vertices are added to it
+        # Derived, because vertex numbers are added to the seed
         self._seed = dr.opaque(mi.UInt32, derived_seed(seed, 0))
         orders = _orders(samples)
         self._orders, self._rows = upload(mi.UInt32, orders), dr.opaque(mi.UInt32, len(orders) // samples)
@@ -83,9 +84,9 @@ class Lattice:
         self._steps = [dr.opaque(mi.UInt32, step % 2**32) for step in steps]
 
     def at(self, vertex):
-        """Numbers of a path at its ``vertex`` (UInt32, counted): (number, pair, number, pair) in [0, 1)."""
+        """Numbers of a path at a ``vertex`` (UInt32, counted): (number, pair, number, pair) in [0, 1)."""
         found = []
-        # One good hash; cheap hashes derive the rest from it
+        # A single good hash; cheap hashes derive the remaining bits
         orders, shifts = mi.sample_tea_32(self._pixel, self._seed + vertex, HASH_ROUNDS)
         for stream in range(4):
             point = self._point(_mixed(orders, stream))
@@ -99,7 +100,7 @@ class Lattice:
         return tuple(found)
 
     def _point(self, bits):
-        """Number of the point that a sample takes: random ``bits`` choose an order and its start."""
+        """Number of the point of a sample: random ``bits`` choose an order and a start in the order."""
         order, begin = dr.mul_hi(bits, self._rows), dr.mul_hi(bits * self._rows, self._samples)
         place = begin + self._number
         place = dr.select(place < self._samples, place, place - self._samples)

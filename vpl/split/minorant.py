@@ -1,8 +1,8 @@
-"""Lambertian minorant of a BSDF: the diffuse part that virtual lights carry.
+"""Lambertian minorant of a BSDF: the diffuse part carried by virtual lights.
 
-The minorant F of a BSDF is a constant reflected radiance per irradiance.  F depends on the point and on the side of the
-surface alone, so a virtual light at x2 and a camera path that meets x2 agree on F.  The estimator stays unbiased for
-any F.  F close to the diffuse lobe leaves the least variance to trace.
+The minorant F of a BSDF is a constant reflected radiance per irradiance.  F depends only on the point and the side of
+the surface, so a virtual light at x2 and a camera path through x2 agree on F.  The estimator stays unbiased for any F.
+F close to the diffuse lobe leaves the least variance to trace.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _PAIRS = len(_DIRECTIONS) - 1
 
 
 def side_of(si: mi.SurfaceInteraction3f) -> mi.Float:
-    """+1 or -1: the sign that turns the shading normal to the side of the geometric surface where a ray arrived."""
+    """+1 or -1: factor of the shading normal for the geometric side of arrival of a ray."""
     arrived = dr.dot(si.n, si.to_world(si.wi))
     return dr.mulsign(dr.mulsign(mi.Float(1), arrived), dr.dot(si.n, si.sh_frame.n))
 
@@ -44,9 +44,9 @@ def minorant_of(
 
     - where a lane is not ``active``;
     - on ``perturbed`` shapes: no BSDF sample goes above the surface but below the perturbed normal, so a virtual light
-      there would carry light that the traced part never subtracts;
-    - for a BSDF without a diffuse lobe: its samples rarely go where its value is as low as the minorant, and would
-      subtract the minorant as fireflies.
+      there would carry light never subtracted by the traced part;
+    - for a BSDF without a diffuse lobe: BSDF samples rarely go to directions with a value as low as the minorant, and
+    would subtract the minorant as fireflies.
     """
     active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & ~perturbed.at(si, active)
     context, turned = mi.BSDFContext(), mi.SurfaceInteraction3f(si)
