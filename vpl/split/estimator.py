@@ -163,8 +163,8 @@ def _options(view: View, pilot: Pilot, evidence: Evidence, measures_all: bool) -
         traced = Pilot.trace(view, ViewLights(emitters=emitters))
         options.append(Option(False, True, traced.radiance, traced.indirect))
         assumed += _with_surfaces(view, traced, True)
-    # A measured residual only raises the price of an option: options are measured in the order of the assumed price,
-    # and an option is skipped once a measured option is better
+    # A measured residual only raises the price of an option: options are tried in the order of the assumed price, and
+    # an option is measured only if still better than earlier options
     for option in sorted(assumed, key=partial(price, evidence)):
         if measures_all or may_pay(evidence, option, options):
             # The distance between lights is not known yet. With c = 0 lights carry the most

@@ -1,16 +1,16 @@
-"""Surfaces that random lines meet, each counted once per crossing.
+"""Crossings of random lines with surfaces, each counted once.
 
 Single precision places a hit on a large shape up to some 1e-7 of the size of the shape beside the true surface: a
 millimetre on a planet of ten kilometres.  Three consequences matter to virtual lights:
 
 - A ray that continues behind a hit meets the same surface again.  Between two crossings of a primitive in the same
-  direction, a line must cross it in the other direction.  So a hit of the same primitive as the hit before, on the same
-  side, is no other crossing.
-- A line may find a surface outside of its box that lies inside, and the other way round.  So lines begin and end
-  outside of their boxes by more than the error, and hits inside count.  The distance is random, because distances along
-  a ray to a large shape are multiples of the error.
-- The next ray that arrives finds the surface elsewhere and may end before the light.  So a light knows the uncertainty
-  of its position, and shadow rays end above the surface by so much.
+  direction, a line must cross it in the other direction.  A repeated hit of a primitive on the same side is therefore
+  no new crossing.
+- A line may find a surface outside of the box although the surface lies inside, or inside although the surface lies
+  outside.  Lines therefore begin and end outside of the box by more than the error, and hits inside count.  The
+  distance is random, because distances along a ray to a large shape are multiples of the error.
+- The next arriving ray finds the surface elsewhere and may end before the light.  A light therefore stores the
+  uncertainty of its position, and shadow rays end above the surface by the uncertainty.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from ..core.loops import recorded_once
 from ..lights.emitters import registered_shapes
 from .line_sampling import Lines
 
-# Largest distance between a surface and a point found on it, as a fraction of the extent of its shape or triangle: two
+# Largest distance between a surface and a point found on it, as a fraction of the extent of the shape or triangle: two
 # units in the last place
 _UNCERTAINTY = 2.0**-22
-# Step behind a surface that is met again, as a fraction of the rest of the line; doubled each time
+# Step behind a surface after a repeated hit, as a fraction of the rest of the line; doubled each time
 _FIRST_STEP = 1e-6
-# Surfaces that a line may meet: ends an endless row of hits at one place
+# Largest number of hits of a line: ends an endless row of hits at a single place
 _MOST_LAYERS = 1024
 
 
@@ -39,8 +39,8 @@ _MOST_LAYERS = 1024
 class LineHits:
     """Crossings of lines with surfaces.
 
-    ``ray``: begins shortly before each surface, evaluated; ``position`` (n, 3) float32: where the line meets the
-    surface; ``uncertainty`` (n,) float32: of that position along the normal.  World units.
+    ``ray``: begins shortly before each surface, evaluated; ``position`` (n, 3) float32: crossing of line and surface;
+    ``uncertainty`` (n,) float32: uncertainty of ``position`` along the normal.  World units.
     """
 
     ray: mi.Ray3f
@@ -53,19 +53,19 @@ class LineHits:
 
 
 def hits_of(scene, lines: Lines, scene_size: float, generator) -> LineHits:
-    """All crossings of ``lines`` with surfaces inside their boxes, line by line; ``scene_size``: world units."""
+    """Crossings of ``lines`` with surfaces inside the boxes, line by line; ``scene_size``: world units."""
     margin = _UNCERTAINTY * scene_size
     before = (margin * (1 + generator.random(len(lines.length)))).astype(np.float32)
     origin, direction = (
         upload_vectors(mi.Vector3f, x) for x in (lines.origin - before[:, None] * lines.direction, lines.direction)
     )
     segments = origin, direction, upload(mi.Float, lines.length + before + np.float32(margin))
-    # The same kernel counts the crossings and finds them
+    # The same kernel counts and records the crossings
     number = _meet(scene, segments, dr.zeros(mi.UInt32, len(before)), False, _Found.none(1))
     found = _Found.none(int(dr.sum(number)[0]))
     if dr.width(found.line):
         _meet(scene, segments, dr.prefix_reduce(dr.ReduceOp.Add, number), True, found)
-    # Position and box as the density sees them
+    # Uses the position and box of the density
     row = np.flatnonzero(lines.hold(download(found.line), download(found.position)))
     found = dr.gather(_Found, found, upload(mi.UInt32, row))
     ray = mi.Ray3f(found.start, dr.gather(mi.Vector3f, direction, found.line))
@@ -95,7 +95,7 @@ class _Found:
 
 
 def _uncertainty(scene, found: _Found, scene_size: float) -> np.ndarray:
-    """Uncertainty of positions, (n,) float32, where it exceeds Mitsuba's own offset of rays; 0 elsewhere."""
+    """Uncertainty of positions, (n,) float32, if above Mitsuba's offset of rays; 0 elsewhere."""
     position, shape = download(found.position), download(found.shape)
     offset = mi.math.RayEpsilon * (1 + np.abs(position).max(1, initial=0))
     uncertainty = np.zeros(len(position), np.float32)
@@ -127,7 +127,7 @@ def _longest_edges(mesh, triangle: mi.UInt32) -> np.ndarray:
 @recorded_once
 @dr.syntax
 def _meet(scene, lines, first, find: bool, found: _Found):
-    """Number of surfaces that each of the ``lines`` (origin, direction, length) crosses.
+    """Number of surface crossings of each of the ``lines`` (origin, direction, length).
 
     With ``find``, writes them to ``found``, for each line from the index ``first`` on.
     """
@@ -158,7 +158,7 @@ def _meet(scene, lines, first, find: bool, found: _Found):
 
 @dataclass
 class _Primitive:
-    """Primitive that a line met, and from which side."""
+    """Primitive and side of a hit."""
 
     shape: mi.UInt32
     instance: mi.UInt32
@@ -172,7 +172,7 @@ class _Primitive:
 
     @classmethod
     def of(cls, si, direction) -> _Primitive:
-        """The primitive that a ray met at ``si``."""
+        """The primitive hit by a ray at ``si``."""
         shape, instance = (dr.reinterpret_array(mi.UInt32, pointer) for pointer in (si.shape, si.instance))
         return cls(shape, instance, mi.UInt32(si.prim_index), dr.dot(si.n, direction) < 0)
 

@@ -1,17 +1,17 @@
-"""Random lines through the space where camera paths arrive, which meet surfaces there with a known density (NumPy).
+"""Random lines near the arrivals of camera paths, with a known density on surfaces (NumPy).
 
 Virtual lights are wanted where the second vertices of camera paths lie.  These *arrivals* are sorted into an octree,
-and a box surrounds the arrivals in each leaf.  A box is drawn, and then a line through the box so that all lines
-through it are equally likely: from a uniform point on its surface, inwards by the cosine.  By the formulas of Cauchy
-and Crofton, a line through a convex body of surface area S is expected to hit each side of a surface of area A inside
-the body A / S times, whatever the shape and orientation of the surface.  So points on all kinds of shapes are drawn
-with a known density by ray tracing alone, and few of them far from the arrivals.
+and a box surrounds the arrivals in each leaf.  A box is drawn, and then a line from the uniform distribution of lines
+through the box: from a uniform point on the surface of the box, inwards by the cosine.  By the formulas of Cauchy and
+Crofton, a line through a convex body of surface area S is expected to hit each side of a surface of area A inside the
+body A / S times, for any shape and orientation of the surface.  Ray tracing alone thus draws points on any kind of
+shape with a known density, and few points far from the arrivals.
 
-Camera paths arrive at one side of most surfaces.  With M the mean normal of the arrivals in a box, a line is reversed
-with probability |M| if it runs along M.  Of all lines that hit a side with normal n, those that run against M are a
-fraction (1 + cos(n, M)) / 2, so the density on that side is A / S (1 + n·M).
+Camera paths usually arrive at a single side of a surface.  With M the mean normal of the arrivals in a box, a line is
+reversed with probability |M| if it runs along M.  A fraction (1 + cos(n, M)) / 2 of the lines through a side with
+normal n runs against M, so the density on the side is A / S (1 + n·M).
 
-Parents of the leaves and the whole scene are drawn now and then, too, so the density is positive on all surfaces.
+Parents of the leaves and the whole scene are drawn with a small probability, so the density is positive everywhere.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ import numpy as np
 
 from ..core.morton import interleave
 
-# Largest number of arrivals in a leaf; largest depth of the octree, as many levels as a Morton code has bits per axis
+# Largest number of arrivals in a leaf; largest depth of the octree: the number of bits per axis of a Morton code
 _LARGEST_LEAF, _LEVELS = 16, 20
 # Fraction of the lines through parents of leaves and through the whole scene: keeps the density positive everywhere
 _PARENT_SHARE, _SCENE_SHARE = 0.15, 0.05
-# Margin of a box around its arrivals, as a fraction of the leaf; largest |M|, below 1 so that both sides are met
+# Margin of a box around the arrivals, as a fraction of the leaf; largest |M|, below 1 to reach both sides
 _MARGIN, _LARGEST_TURN = 0.1, 0.9
 # The number of a node is its Morton code behind a leading 1: the first number of each level
 _FIRST_OF_LEVEL = 8 ** np.arange(_LEVELS + 1, dtype=np.uint64)
@@ -54,8 +54,8 @@ class Lines:
 class Boxes:
     """Boxes in nodes of an octree.
 
-    ``number`` (n,) of the node, sorted, and its ``level``; ``low``, ``size`` (n, 3): world units; ``turn`` (n, 3): M;
-    ``chance`` (n,): probability of being drawn.
+    ``number`` (n,) of the node, sorted; ``level`` of the node; ``low``, ``size`` (n, 3): world units; ``turn`` (n, 3):
+    M; ``chance`` (n,): probability of being drawn.
     """
 
     number: np.ndarray
@@ -75,8 +75,8 @@ class Boxes:
 class ArrivalOctree:
     """Octree over arrivals: positions (n, 3), unit normals (n, 3), weights (n,) with a positive sum.
 
-    ``scene_low``, ``scene_size``: a cube that holds all surfaces, world units.  The octree has a random position, so
-    that its planes do not coincide with walls.
+    ``scene_low``, ``scene_size``: a cube around every surface, world units.  The octree has a random position, so the
+    planes do not coincide with walls.
     """
 
     def __init__(self, position, normal, weight, scene_low, scene_size: float, generator):
@@ -133,7 +133,7 @@ class ArrivalOctree:
         return found
 
     def _found(self, boxes: Boxes, position):
-        """Level by level, the box that may hold each position, and whether it does."""
+        """Level by level, the candidate box of each position, and whether the box holds the position."""
         finest = self._finest(position)
         for level in np.unique(boxes.level):
             number = finest >> np.uint64(3 * (_LEVELS - level))
@@ -150,7 +150,7 @@ class ArrivalOctree:
         turn *= _LARGEST_TURN / np.maximum(chance, np.finfo(np.float64).tiny)[:, None]
         level = np.searchsorted(_FIRST_OF_LEVEL, number, side="right") - 1
         boxes = Boxes(number, level, low, high - low, turn, chance)
-        # Within its node, a box extends beyond the arrivals by the distance between them
+        # Within the node, a box extends beyond the arrivals by the distance between arrivals
         margin = (_MARGIN * self._size * 0.5**level)[:, None] + (high - low) / np.sqrt(count)[:, None]
         corner, size = self._corner(boxes), (self._size * 0.5**level)[:, None]
         boxes.low = np.maximum(low - margin, corner)

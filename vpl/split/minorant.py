@@ -46,7 +46,7 @@ def minorant_of(
     - on ``perturbed`` shapes: no BSDF sample goes above the surface but below the perturbed normal, so a virtual light
       there would carry light never subtracted by the traced part;
     - for a BSDF without a diffuse lobe: BSDF samples rarely go to directions with a value as low as the minorant, and
-    would subtract the minorant as fireflies.
+      would subtract the minorant as fireflies.
     """
     active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & ~perturbed.at(si, active)
     context, turned = mi.BSDFContext(), mi.SurfaceInteraction3f(si)

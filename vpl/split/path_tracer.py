@@ -1,22 +1,21 @@
-"""Traced part of the split: camera paths as Mitsuba's ``path`` traces them, minus the light that virtual lights carry.
+"""Traced part of the split: the camera paths of Mitsuba's ``path``, minus the light carried by virtual lights.
 
-Let x1 be the first vertex with a minorant F1, x2 the next vertex, and f the BSDFs.  The radiance that x1 receives from
-x2 has the factor
+Let x1 be the first vertex with a minorant F1, x2 the next vertex, and f the BSDFs.  The radiance from x2 to x1 has the
+factor
 
     f1 f2 = w F1 F2  +  (f1 f2 - w F1 F2),      w = 1 / (1 + c² cosθ1 cosθ2 / d²).
 
 Virtual lights carry the first term: x1 is a *gather vertex*, with the weight β F1 for a path of throughput β.  The path
 carries w β F1 F2 (``path.carried``) to x2 and subtracts it there from β f1 f2, in next-event estimation and in the
-throughput with which the path leaves x2.  The difference may be negative.  What leaves x2 may be gathered at x2 and at
-later vertices in the same way.
+outgoing throughput.  The difference may be negative.  Light leaving x2 may be gathered at x2 and at later vertices in
+the same way.
 
-Where virtual lights stand for emitters as well, the light that a gather vertex receives straight from an emitter is
-split with the same w, and the path subtracts w β F1 from next-event estimation at x1 and from emission that it meets
-next.
+If virtual lights represent emitters, direct light at a gather vertex is split with the same w.  The path subtracts w β
+F1 from next-event estimation at x1 and from the emission at the next vertex.
 
 The loop in :func:`trace_paths` has one section per term: hit, emission, subtraction, Russian roulette, gather vertex,
-next-event estimation, BSDF sampling.  The kernel also finds the irradiance of virtual lights, by paths from which
-nothing is subtracted, and the surfaces where virtual lights are placed.
+next-event estimation, BSDF sampling.  The kernel also finds the irradiance of virtual lights, by paths without
+subtraction, and the surfaces for placing virtual lights.
 """
 
 from __future__ import annotations
@@ -45,9 +44,8 @@ from .view import Edge, FirstEdge, Gathering, PathSettings, State, View
 class Path(Edge):
     """Paths on their current edges.
 
-    ``depth``: edges before; ``eta``: as in ``path``; ``scattered``: number of vertices that scattered; ``valid``:
-    whether the path met a surface that counts in the film's alpha; ``carried``: β F1 before x2, w β F1 F2 at x2;
-    ``cosine``: cosθ1.
+    ``depth``: edges before; ``eta``: as in ``path``; ``scattered``: number of scattering vertices; ``valid``: whether
+    the film's alpha counts the path; ``carried``: β F1 before x2, w β F1 F2 at x2; ``cosine``: cosθ1.
     """
 
     depth: mi.UInt32
@@ -59,7 +57,7 @@ class Path(Edge):
 
     @classmethod
     def of(cls, first: FirstEdge) -> Path:
-        """Paths on their first edges: copies, because the loop changes them."""
+        """Paths on the first edges: copies, because the loop changes the arrays."""
         fields = (type(value)(value) for value in vars(first).values())
         carried = dr.zeros(mi.UnpolarizedSpectrum, dr.width(first.throughput))
         return cls(*fields, mi.UInt32(0), mi.Float(1), mi.UInt32(0), mi.Bool(False), carried, mi.Float(1))
@@ -69,9 +67,9 @@ class Path(Edge):
 class Hit:
     """Surfaces that paths hit.
 
-    ``si``; ``bsdf`` with its ``flags``; ``side``, ``minorant``: see :mod:`vpl.split.minorant`; ``hidden``: whether it
-    is an emitter that the camera must not see; ``goes_on``: whether the path may continue; ``smooth``: whether it
-    continues at a BSDF with a density.
+    ``si``; ``bsdf`` with its ``flags``; ``side``, ``minorant``: see :mod:`vpl.split.minorant`; ``hidden``: whether the
+    surface is an emitter hidden from the camera; ``goes_on``: whether the path may continue; ``smooth``: whether the
+    path continues at a BSDF with a density.
     """
 
     si: mi.SurfaceInteraction3f
@@ -100,17 +98,17 @@ class Hit:
 
     @property
     def is_diffuse(self) -> mi.Bool:
-        """Whether the BSDF has no other lobe, so that the minorant describes all directions."""
+        """Whether the BSDF has only a diffuse lobe: the minorant then describes every direction."""
         other_lobes = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.DiffuseReflection)
         return (self.flags & other_lobes) == 0
 
 
 @dataclass
 class Contributions:
-    """Contributions that paths have found.
+    """Contributions found by paths.
 
-    ``radiance``: their sum; ``drawn``: one of them, drawn by its share of ``level``, the sum of absolute values;
-    ``length``: edges of the path that brought it.
+    ``radiance``: sum; ``drawn``: a contribution, drawn in proportion to absolute value; ``length``: edges of the path
+    of ``drawn``; ``level``: sum of absolute values.
     """
 
     radiance: mi.UnpolarizedSpectrum
@@ -137,9 +135,9 @@ class Contributions:
 class Traced:
     """Result of :func:`trace_paths`, one record per lane, evaluated.
 
-    ``radiance``; ``drawn``: one of its contributions over the probability of drawing it, from a path of ``length``
-    edges; ``valid``: whether a surface counts in the film's alpha; ``edges`` of the path without the last one;
-    ``gathered``: gather vertices.
+    ``radiance``; ``drawn``: a contribution over the probability of the draw, from a path of ``length`` edges;
+    ``valid``: whether the film's alpha counts the path; ``edges`` of the path but the last; ``gathered``: gather
+    vertices.
     """
 
     radiance: mi.UnpolarizedSpectrum
@@ -160,8 +158,8 @@ def trace_paths(
 ) -> Traced:
     """Trace paths to their ends.
 
-    ``lattice``: numbers that choose an emitter, a point on it, a lobe and a direction at vertices that scatter;
-    ``sampler``: all other random numbers.
+    ``lattice``: numbers for the choice of emitter, point, lobe and direction at scattering vertices; ``sampler``: the
+    remaining random numbers.
     """
     context, count = mi.BSDFContext(), dr.width(first.throughput)
     path, found, gathered = Path.of(first), Contributions.none(count), Gathered.none(count)
@@ -193,7 +191,7 @@ def trace_paths(
         sample = emitters.sample(hit.si, path.cell, chosen, member, place, hit.smooth)
         lobe = dr.select(hit.smooth, lobe, sampler.next_1d())
         turn = dr.select(hit.smooth, turn, sampler.next_2d())
-        # One call: kernels hold the code of all materials for each
+        # A single call: each call adds the code of every material to the kernel
         toward = hit.si.to_local(sample.direction)
         value, density, turned, bsdf_weight = hit.bsdf.eval_pdf_sample(
             context, hit.si, toward, lobe, turn, path.active & ~hit.hidden
@@ -229,7 +227,7 @@ def trace_camera_rays(view: View, lane: mi.UInt32, settings: PathSettings, *stre
 
 
 def _less_carried(path: Path, met: MetEmitter, settings: PathSettings):
-    """β for emission that was met, minus w β F1 where a virtual light stands for the emitter."""
+    """β for emission on the path, minus w β F1 where a virtual light represents the emitter."""
     if met.nearness is None:
         return path.throughput
     w = emitter_share(settings.emitters_squared_c, met.nearness, path.cosine)
@@ -243,7 +241,8 @@ def emitter_share(squared_c, nearness, cosine):
 
 
 def _carry(path: Path, hit: Hit, settings: PathSettings, radiance, gathered: Gathered):
-    """Turn ``path.carried`` from β F1 into w β F1 F2 at x2, 0 elsewhere; record second vertices; return where x2 is."""
+    """Turn ``path.carried`` from β F1 into w β F1 F2 at x2, 0 elsewhere; record second vertices; return the mask of
+    x2."""
     si = hit.si
     cosine = dr.abs(dr.dot(si.n, path.ray.d))
     w = carried_share(settings.squared_c, path.cosine * cosine / dr.square(si.t))
@@ -253,7 +252,7 @@ def _carry(path: Path, hit: Hit, settings: PathSettings, radiance, gathered: Gat
     outward = si.n * dr.mulsign(mi.Float(1), -dr.dot(si.n, path.ray.d))
     means = (channel_mean(x) for x in (path.carried, path.throughput, radiance))
     second = connects | (hit.smooth & (path.scattered == 1))
-    # On the ray, as virtual lights: on large shapes, Mitsuba's own point lies beside it
+    # On the ray, like virtual lights: on large shapes, Mitsuba's point lies beside the ray
     arrival = SecondVertices(path.ray(si.t), outward, *means)
     gathered.second = select_record(second, arrival, gathered.second)
     path.carried = dr.select(connects, path.carried * w, 0)
@@ -261,10 +260,10 @@ def _carry(path: Path, hit: Hit, settings: PathSettings, radiance, gathered: Gat
 
 
 def _end_at_vertex(path: Path, hit: Hit, connects, settings: PathSettings, sample) -> None:
-    """Russian roulette by the residual that is left to trace and by its expected contribution."""
+    """Russian roulette by the residual and by the expected contribution of the residual."""
     reflected = path.throughput * hit.minorant
     residual = residual_survival(reflected - path.carried, reflected, connects & hit.is_diffuse)
-    # Not before the path met a surface that counts in alpha: a path that only passed masks has yet to find one
+    # Only after the first surface that counts in alpha: a path may pass masks before
     judged = hit.smooth & (path.scattered > 0) & path.valid
     facing = hit.si.sh_frame.n * hit.side
     expected = settings.outgoing.survival(hit.si.p, facing, path.throughput, path.importance, residual)
@@ -276,7 +275,7 @@ def _end_at_vertex(path: Path, hit: Hit, connects, settings: PathSettings, sampl
 
 
 def _gather(path: Path, hit: Hit, settings: PathSettings, gathered: Gathered, sample):
-    """Record gather vertices: (where there is one, its weight β F1 minus the part that virtual lights carry to it)."""
+    """Record gather vertices: (mask, weight β F1 minus the part carried to the vertex by virtual lights)."""
     si, seeks = hit.si, hit.smooth & (path.state == State.SEEKING)
     gathers = seeks | (hit.smooth & (settings.gathering == Gathering.EVERYWHERE))
     gathers &= agrees(si, hit.side) | (settings.gathering == Gathering.PLACING)
@@ -289,7 +288,7 @@ def _gather(path: Path, hit: Hit, settings: PathSettings, gathered: Gathered, sa
 
 
 def _lit(path: Path, hit: Hit, sample: EmitterSample, height, value, density, weight, settings: PathSettings, sampler):
-    """Factor of the sampled emitters' light: β f, minus the parts that virtual lights carry.
+    """Factor of the sampled emitters' light: β f, minus the parts carried by virtual lights.
 
     ``height``: cosine of the direction; ``value``, ``density``: of the BSDF; ``weight`` of the gather vertex.
     """
@@ -299,7 +298,7 @@ def _lit(path: Path, hit: Hit, sample: EmitterSample, height, value, density, we
     if sample.nearness is not None:
         w = emitter_share(settings.emitters_squared_c, sample.nearness, cosine)
         value -= dr.select(settings.emitters_carried, weight * (w * cosine), 0)
-        # Few shadow rays where little is left
+        # Few shadow rays where the residual is small
         survival = residual_survival(value, full, settings.emitters_carried)
         value = dr.select(sampler.next_1d() < survival, value / survival, 0)
     mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, density))
@@ -309,11 +308,11 @@ def _lit(path: Path, hit: Hit, sample: EmitterSample, height, value, density, we
 def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight):
     """Continue along a BSDF sample ``bs`` with its weight; returns the survival probability by the residual.
 
-    ``gathers``, ``weight``: whether the vertex is a gather vertex, and its weight, which the path carries on.
+    ``gathers``, ``weight``: mask and weights of gather vertices, carried on by the path.
     """
     full = path.throughput * mi.unpolarized_spectrum(bsdf_weight)
     path.delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    # As in `path`, by the sampled direction, even where the path ends
+    # Like `path`, by the sampled direction, even if the path ends
     null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     path.valid |= path.active & hit.si.is_valid() & ~hit.hidden & ~null
     path.cosine, path.density, path.eta = dr.abs(bs.wo.z), bs.pdf, path.eta * bs.eta
@@ -335,7 +334,7 @@ def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight):
 
 def _end_at_direction(path: Path, hit: Hit, survival, settings: PathSettings, sample) -> None:
     """Russian roulette by ``survival``, the residual of the direction, and by the throughput, as in ``path``."""
-    # Where the BSDF is 0, its minorant may still have to be subtracted
+    # Even if the BSDF is 0, the minorant may need subtraction
     largest = dr.maximum(dr.max(dr.abs(path.throughput)), dr.max(dr.abs(path.carried)))
     survival *= throughput_survival(largest, path.eta, path.depth >= settings.rr_depth)
     path.active = hit.goes_on & (largest > 0) & (sample < survival)
@@ -344,7 +343,7 @@ def _end_at_direction(path: Path, hit: Hit, survival, settings: PathSettings, sa
 
 
 def _pass_hidden(path: Path, hit: Hit, first: FirstEdge) -> None:
-    """Let paths continue behind emitters that the camera must not see, as if nothing were there."""
+    """Let paths continue behind emitters hidden from the camera, without scattering."""
     passes = hit.hidden & hit.si.is_valid()
     path.active |= passes
     path.throughput = dr.select(passes, first.throughput, path.throughput)

@@ -1,4 +1,4 @@
-"""Pilot: a few whole paths that show where virtual lights are wanted, how bright the image is, and how noisy."""
+"""Pilot: a few whole paths for the density of virtual lights, the brightness of the image and the relative variance."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ from .view import Gathering, Stream, View, ViewLights
 
 @dataclass(frozen=True)
 class Arrivals:
-    """Second vertices with a minorant, of paths whose first vertices have one, too.
+    """Second vertices with a minorant, of paths with a minorant at the first vertex.
 
-    ``position``, ``normal`` (n, 3): on the side where the path arrived; ``weight`` (n,) float64: contribution per
-    irradiance; ``radiance`` (n,) float64: radiance that the path
-    brought from there.
+    ``position``, ``normal`` (n, 3): on the side of arrival; ``weight`` (n,) float64: contribution per irradiance;
+    ``radiance`` (n,) float64: radiance of the path from the vertex.
     """
 
     position: np.ndarray
@@ -33,8 +32,8 @@ class Arrivals:
 
 @dataclass(frozen=True)
 class Onward:
-    """All second vertices: ``position``, ``normal`` (m, 3); (m,): ``path`` of each; ``throughput`` up to it; ``sent``:
-    radiance that it sent back; ``edges`` beyond it."""
+    """Second vertices: ``position``, ``normal`` (m, 3); (m,): ``path`` of each vertex; ``throughput`` up to the vertex;
+    ``sent``: radiance sent back; ``edges`` beyond the vertex."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -46,11 +45,11 @@ class Onward:
 
 @dataclass(frozen=True)
 class Pilot:
-    """Paths in pairs of neighbouring samples, mostly of one pixel.
+    """Paths in pairs of neighbouring samples, usually of the same pixel.
 
-    ``pixel``, ``radiance`` (n,): of each path; ``indirect`` (n,): part of the radiance that came through arrivals.
-    Where virtual lights carry a part, values may be negative.  ``vertices``: positions and normals (k, 3) of first and
-    second vertices; ``size``: width of the image and number of pixels.
+    ``pixel``, ``radiance`` (n,): of each path; ``indirect`` (n,): part of the radiance through arrivals.  Values may be
+    negative if virtual lights carry a part.  ``vertices``: positions and normals (k, 3) of first and second vertices;
+    ``size``: width of the image and number of pixels.
     """
 
     arrivals: Arrivals
@@ -64,7 +63,7 @@ class Pilot:
 
     @classmethod
     def trace(cls, view: View, lights: ViewLights) -> Pilot:
-        """Trace pairs of paths all over the image, always the same ones, without the light that ``lights`` carry."""
+        """Trace pairs of paths over the whole image, always the same paths, without the light carried by ``lights``."""
         lane = view.pairs(view.model.pilot_rays)
         settings = view.settings(lights, Gathering.AT_FIRST)
         traced = trace_camera_rays(view, upload(mi.UInt32, lane), settings, Stream.PILOT)
@@ -82,7 +81,7 @@ class Pilot:
 
     @property
     def brightness(self) -> np.ndarray:
-        """Mean radiance around each path, (n,), estimated from the other paths."""
+        """Mean radiance around each path, (n,), estimated from the remaining paths."""
         return self._of_others[0]
 
     def nearby(self, values: np.ndarray) -> np.ndarray:
@@ -95,7 +94,7 @@ class Pilot:
 
 
 def _second_vertices(second: SecondVertices, radiance: np.ndarray, edges: np.ndarray):
-    """(Arrivals, all second vertices, radiance (n,) through arrivals) of paths."""
+    """(Arrivals, second vertices, radiance (n,) through arrivals) of paths."""
     position, normal, weight, throughput, before = (download(x) for x in vars(second).values())
     beyond = np.maximum(radiance - np.nan_to_num(before), 0)
     known = np.isfinite(position).all(1)
@@ -130,16 +129,14 @@ def relative_variance(values: np.ndarray, brightness: np.ndarray, model: CostMod
 
 
 def error_scale(brightness: np.ndarray, model: CostModel) -> np.ndarray:
-    """Denominator of relative errors (n,) where an image has a ``brightness`` (n,)."""
+    """Denominator of relative errors (n,) for a ``brightness`` (n,) of the image."""
     level = np.sqrt(brightness**2 + model.black * np.mean(brightness) ** 2)
     return np.maximum(level, np.finfo(np.float64).tiny ** 0.5)
 
 
-# ---------------------- Means around pixels ----------------------
-#
-# The image is divided into four blocks, each block into four again, down to single pixels. The mean of a block combines
-# its own values with that of the larger block, which counts as a number of values: more of them, the noisier values
-# are.
+# ---------------------- Means around pixels ---------------------- The image is divided into four blocks, each block
+# into four again, down to single pixels. The mean of a block combines the values of the block with the mean of the
+# larger block. The weight of the larger block is a number of values, and grows with the variance of the values.
 
 
 def means_of_others(
@@ -148,7 +145,7 @@ def means_of_others(
     """Mean around each of ``values`` (n,), in pairs, without the value itself and its neighbour.
 
     ``at``: pixel of each value, of ``count`` pixels in rows of ``width``.  Returns (means (n,), for each size of blocks
-    the number of values that the mean of the larger block counts as).
+    the equivalent number of values of the mean of the larger block).
     """
     number = len(values)
     beside = np.arange(number) ^ 1

@@ -1,9 +1,9 @@
-"""Light from virtual lights at gather vertices: one light cut for the vertices of a pixel that face the same way.
+"""Light from virtual lights at gather vertices: a light cut for the vertices of a pixel with similar normals.
 
-These vertices form a cluster.  Bounds on its box and its cone of normals choose one light cut for the whole cluster, as
+These vertices form a cluster.  Bounds on the box and the cone of normals choose a light cut for the whole cluster, as
 in Multidimensional Lightcuts [MDLC].  For each pair of the cluster and a node of the cut, a vertex is drawn by weight
-and a light of the node by intensity, anew for every pair.  So neighbouring pixels share no representative lights, and
-the error is uncorrelated noise, which averages out over samples and which a denoiser recognises.
+and a light of the node by intensity, anew for every pair.  Neighbouring pixels therefore share no representative
+lights.  The error is uncorrelated noise: samples average the noise out, and a denoiser recognises noise.
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ class Receivers:
 
 
 class PixelClusters:
-    """Clusters of lit vertices (at least one) by pixel and facing; each later vertex is a cluster of its own.
+    """Clusters of lit vertices (at least one) by pixel and facing; each later vertex is a separate cluster.
 
     ``samples``: camera rays of a pixel, side by side.
     """
 
     def __init__(self, lit: LitVertices, samples: int):
         vertices, rays, alone = lit.vertices, lit.rays, lit.alone
-        # Shape (3, n), in which NumPy is several times faster
+        # Shape (3, n): NumPy is several times faster
         position, normal = (np.stack([download(x) for x in vector]) for vector in (vertices.position, vertices.normal))
         pixel = download(rays).astype(np.int64) // samples
         key = pixel * FACINGS + facing(normal.T)
@@ -82,7 +82,7 @@ class PixelClusters:
         self.cluster = np.repeat(np.arange(len(first)), size)
         cosine = np.minimum.reduceat((normal * axis.take(self.cluster, 1)).sum(0), first)
         self.pixel = pixel[order[first]]
-        # Rounded down by 16 units in the last place, so that the cone holds every normal
+        # Rounded down by 16 units in the last place, so the cone holds every normal
         box = 0.5 * (low + high), 0.5 * (high - low), axis
         self.receivers = Receivers.of(*(x.T for x in box), np.maximum(cosine - 2e-6, -1))
         self.first, self.size = upload(mi.UInt32, first), upload(mi.UInt32, size)
@@ -126,7 +126,7 @@ class PixelClusters:
 def light_clusters(transport: Transport, clusters: PixelClusters, allowed: np.ndarray, max_cut: int, seed: int, result):
     """Add the light of virtual lights at the clusters to ``result``, per camera ray; returns the number of shadow rays.
 
-    ``allowed`` (clusters,): largest bound of a pair, as a contribution to the sum over the samples of its pixel.
+    ``allowed`` (clusters,): largest bound of a pair, as a contribution to the sum over the samples of the pixel.
     """
     with np.errstate(over="ignore"):  # a cluster without weight may have any error
         allowed = allowed / np.maximum(clusters.weight, np.finfo(np.float64).tiny)
