@@ -1,7 +1,6 @@
 """Traced part of the split: the camera paths of Mitsuba's ``path``, minus the light carried by virtual lights.
 
-Let x1 be the first vertex with a minorant F1, x2 the next vertex, and f the BSDFs.  The radiance from x2 to x1 has the
-factor
+Let x1 be the first vertex with a minorant F1, x2 the next vertex, and f the BSDFs.  The radiance from x2 to x1 has
 
     f1 f2 = w F1 F2  +  (f1 f2 - w F1 F2),      w = 1 / (1 + c² cosθ1 cosθ2 / d²).
 
@@ -135,9 +134,8 @@ class Contributions:
 class Traced:
     """Result of :func:`trace_paths`, one record per lane, evaluated.
 
-    ``radiance``; ``drawn``: a contribution over the probability of the draw, from a path of ``length`` edges;
-    ``valid``: whether the film's alpha counts the path; ``edges`` of the path but the last; ``gathered``: gather
-    vertices.
+    ``radiance``; ``drawn``: a contribution over its probability, from a path of ``length`` edges; ``valid``: whether
+    the film's alpha counts the path; ``edges`` without the last; ``gathered``: gather vertices.
     """
 
     radiance: mi.UnpolarizedSpectrum
@@ -241,8 +239,7 @@ def emitter_share(squared_c, nearness, cosine):
 
 
 def _carry(path: Path, hit: Hit, settings: PathSettings, radiance, gathered: Gathered):
-    """Turn ``path.carried`` from β F1 into w β F1 F2 at x2, 0 elsewhere; record second vertices; return the mask of
-    x2."""
+    """Turn ``path.carried`` from β F1 into w β F1 F2 at x2, 0 elsewhere; record second vertices; return the x2 mask."""
     si = hit.si
     cosine = dr.abs(dr.dot(si.n, path.ray.d))
     w = carried_share(settings.squared_c, path.cosine * cosine / dr.square(si.t))

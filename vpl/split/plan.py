@@ -1,7 +1,7 @@
-"""Plan: whether virtual lights pay, how many there are, and how finely they are clustered.
+"""Plan: whether virtual lights pay, the number of lights, and the fineness of the clusters.
 
-An :class:`Option` is a choice of light kinds.  :func:`price` predicts its variance × cost by the cost model;
-:func:`choose` takes the option with the least product, or no lights.
+An :class:`Option` is a choice of light kinds.  :func:`price` predicts the variance × cost of an option by the cost
+model; :func:`choose` takes the option with the least product, or no lights.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ _TINY = np.finfo(np.float64).tiny
 class Plan:
     """Decision for an image.
 
-    ``light_paths``: number of lines that draw virtual lights on surfaces, 0 for none; ``emitters``: whether virtual
-    lights stand for emitters; ``error``: bound of the cuts, as a fraction of the pixel; ``vertices`` of a pixel that
-    are lit; ``variance``: relative variance of a camera path that remains; ``reason`` in words.
+    ``light_paths``: number of lines for drawing virtual lights on surfaces, 0 for none; ``emitters``: whether virtual
+    lights represent emitters; ``error``: bound of the cuts, as a fraction of the pixel; ``vertices``: lit vertices per
+    pixel; ``variance``: remaining relative variance of a camera path; ``reason`` in words.
     """
 
     light_paths: int
@@ -42,9 +42,9 @@ class Plan:
 class Option:
     """Kinds of virtual lights: on ``surfaces``, for ``emitters``, or both.
 
-    Values (n,) of a pilot's paths: ``traced``: radiance without lights on surfaces; ``indirect``: part of it that
-    lights on surfaces may carry; ``residual``: measured radiance besides the light that lights on surfaces carry, None
-    where it was not measured.
+    Values (n,) of a pilot's paths: ``traced``: radiance without lights on surfaces; ``indirect``: part of ``traced``
+    available to lights on surfaces; ``residual``: measured radiance without the part carried by lights on surfaces,
+    None if not measured.
     """
 
     surfaces: bool
@@ -55,17 +55,17 @@ class Option:
 
     @property
     def expected(self) -> np.ndarray:
-        """Expected radiance (n,) besides the light that virtual lights carry."""
+        """Expected radiance (n,) without the part carried by virtual lights."""
         return self.traced - self.indirect * self.surfaces
 
     @property
     def concentration(self) -> float:
-        """Mean square of the indirect light over its squared mean."""
+        """Mean square of the indirect light over the squared mean."""
         total = np.sum(self.indirect)
         return len(self.indirect) * np.sum(self.indirect**2) / total**2 if total else 0.0
 
     def variance(self, evidence: Evidence) -> float:
-        """Relative variance of a path that remains: assumed, or measured where it is much larger than assumed."""
+        """Remaining relative variance of a path: the assumed value, or a much larger measured value."""
         traced, model = evidence.variance(self.traced), evidence.model
         if not self.surfaces:
             return traced
@@ -78,8 +78,8 @@ class Option:
 class Evidence:
     """Measurements of a pilot for an image of ``paths`` camera paths, ``samples`` for a pixel.
 
-    ``radiance`` (n,) of the pilot's paths, in pairs; ``direct`` (n,): without the light that lights on surfaces may
-    carry; ``brightness`` (n,) of the image around; ``emitters``: whether lights may stand for many emitters.
+    ``radiance`` (n,) of the pilot's paths, in pairs; ``direct`` (n,): without the part available to lights on surfaces;
+    ``brightness`` (n,) of the image nearby; ``emitters``: whether lights may represent many emitters.
     """
 
     radiance: np.ndarray
@@ -122,7 +122,7 @@ def price(evidence: Evidence, option: Option) -> float:
 
 
 def may_pay(evidence: Evidence, option: Option, others: list[Option]) -> bool:
-    """Whether the lights of an option are predicted to pay, and more than those of all ``others``."""
+    """Whether the lights of an option are predicted to pay, and to pay more than every option of ``others``."""
     least = evidence.model.pays_below * evidence.variance(evidence.radiance)
     return price(evidence, option) <= min([least, *(price(evidence, other) for other in others)])
 

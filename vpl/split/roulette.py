@@ -1,13 +1,14 @@
-"""Russian roulette: which paths go on, with what probability, and how the pilot chooses the probability.
+"""Russian roulette: survival probabilities of paths, chosen by the pilot.
 
-Three rules end paths.  A path that goes on is divided by its probability, so no rule biases the image.
+Three rules end paths.  The throughput of a surviving path is divided by the survival probability, so no rule biases the
+image.
 
-1. **Residual.**  Where virtual lights carry most of the throughput, little is left to trace: a path goes on with the
-   fraction that is left (:func:`residual_survival`).
-2. **Expected contribution.**  A path goes on with the probability m E, where E is its expected contribution relative to
-   the brightness of its pixel.  The multiple m has the least variance × cost (:func:`best_multiple`).  [Vorba and
-   Křivánek 2016, "Adjoint-driven Russian roulette"; Rath et al.  2022, "EARS: efficiency-aware Russian roulette", eq.
-   14: the best probability is proportional to the root of variance over cost.]
+1. **Residual.**  Where virtual lights carry most of the throughput, the residual is small: a path survives with the
+   residual fraction (:func:`residual_survival`).
+2. **Expected contribution.**  A path survives with the probability m E.  E is the expected contribution relative to the
+   brightness of the pixel.  The multiple m has the least variance × cost (:func:`best_multiple`).  [Vorba and Křivánek
+   2016, "Adjoint-driven Russian roulette"; Rath et al. 2022, "EARS: efficiency-aware Russian roulette", eq. 14: the
+   best probability is proportional to the root of variance over cost.]
 3. **Throughput.**  The rule of Mitsuba's ``path`` from ``rr_depth`` on (:func:`throughput_survival`).
 """
 
@@ -25,7 +26,7 @@ from .spatial_cells import SpatialCells
 
 # Least probability of rule 1: the minorant and w describe the residual of a single direction only roughly
 _LEAST_RESIDUAL = 0.02
-# Multiples that are tried, powers of two at half steps: from 1/8, below which every path would end early, to 32
+# Candidate multiples, powers of two at half steps, from 1/8 to 32: below 1/8, every path would end early
 _MULTIPLES = 2.0 ** np.arange(-3, 5.5, 0.5)
 
 
@@ -34,7 +35,8 @@ class OutgoingRadiance:
     """Radiance that surfaces send back to paths, learned from a pilot without regard to direction.
 
     ``cells``; ``radiance``: root mean square of each cell, mean over channels; ``known``: whether anything was learned;
-    ``least_survival``: see :class:`vpl.split.cost_model.CostModel`.  Opaque arrays, so that Dr.Jit compiles one kernel.
+    ``least_survival``: see :class:`vpl.split.cost_model.CostModel`.  The arrays are opaque: Dr.Jit compiles a single
+    kernel.
     """
 
     cells: SpatialCells
@@ -53,10 +55,10 @@ class OutgoingRadiance:
     def learned(
         cls, position: np.ndarray, normal: np.ndarray, radiance: np.ndarray, model: CostModel
     ) -> tuple[OutgoingRadiance, np.ndarray]:
-        """Learn from vertices (n, 3) that sent back ``radiance`` (n,).
+        """Learn from vertices (n, 3) with ``radiance`` (n,) sent back.
 
-        Returns also the root mean square (n,) that the other vertices of its cell predict for each vertex: a prediction
-        that includes the vertex itself would be too good.
+        Returns also the root mean square (n,) predicted for each vertex by the remaining vertices of the cell: a
+        prediction including the vertex would be too good.
         """
         cells, cell = SpatialCells.around(position, normal, model.roulette_cells)
         size = int(cell.max()) + 1
@@ -69,10 +71,10 @@ class OutgoingRadiance:
         return cls(cells, upload(mi.Float, rms), dr.opaque(mi.Bool, True), least), predicted
 
     def survival(self, position, normal, throughput, importance, residual):
-        """Probability by rule 2 of going on from vertices; by rule 1, ``residual``, where nothing is known.
+        """Survival probability at vertices by rule 2; by rule 1, ``residual``, where nothing is known.
 
-        ``throughput`` with which the path arrives; ``importance``: m over the brightness of the pixel; ``residual``:
-        fraction of the throughput that is left to trace.
+        ``throughput`` of the arriving path; ``importance``: m over the brightness of the pixel; ``residual``: fraction
+        of the throughput left to trace.
         """
         radiance = dr.gather(mi.Float, self.radiance, self.cells.at(position, normal))
         expected = residual * channel_mean(dr.abs(throughput)) * radiance * importance
@@ -80,14 +82,14 @@ class OutgoingRadiance:
 
 
 def residual_survival(residual, full, applies):
-    """Probability by rule 1: the fraction of the spectrum ``full`` that is ``residual``; 1 where it does not apply."""
+    """Probability by rule 1: the ratio of the spectra ``residual`` and ``full``; 1 where the rule does not apply."""
     left = dr.max(dr.abs(residual)) / dr.max(dr.abs(full))
     return dr.select(applies & dr.isfinite(left), dr.clip(left, _LEAST_RESIDUAL, 1), 1)
 
 
 def throughput_survival(largest, eta, applies):
-    """Probability by rule 3, as Mitsuba's ``path``; ``largest``: component of the throughput; 1 where it does not
-    apply."""
+    """Probability by rule 3, like Mitsuba's ``path``; ``largest``: component of the throughput; 1 where the rule does
+    not apply."""
     return dr.select(applies, dr.minimum(largest * dr.square(eta), 0.95), 1)
 
 
@@ -96,9 +98,9 @@ def best_multiple(
 ) -> float:
     """The multiple m of rule 2 with the least variance × cost at second vertices; infinite where none pays.
 
-    ``expected`` (n,): expected contributions with m = 1 of the paths that reach a second vertex; ``brought`` (n,):
-    their actual contributions, both relative to the image; ``edges`` (n,): edges beyond the second vertex; ``paths``:
-    number of all paths; ``variance``: relative variance of a path without rule 2.
+    ``expected`` (n,): expected contributions with m = 1 of the paths with a second vertex; ``brought`` (n,): actual
+    contributions, both relative to the image; ``edges`` (n,): edges beyond the second vertex; ``paths``: total number
+    of paths; ``variance``: relative variance of a path without rule 2.
     """
     best, least = np.inf, model.roulette_gain * variance * (model.first_edges + edges.sum() / paths)
     for multiple in _MULTIPLES:

@@ -14,18 +14,18 @@ import numpy as np
 
 from ..core.arrays import download, upload
 
-# Directions that a surface may face: along three axes, to two ends
+# Facings of a surface: along three axes, to two ends
 FACINGS = 6
 # Largest number of cubes along the longest side of the box around the vertices: finer cubes hold too few vertices
 _FINEST_GRID = 32
-# Fraction of the vertices at each end of an axis that may lie outside of the grid: outliers must not set its size
+# Fraction of the vertices at each end of an axis outside of the grid: outliers must not set the grid size
 _OUTLIERS = 0.005
 # The 26 cubes around a cube, as offsets in a padded grid
 _AROUND = [cube for cube in itertools.product(range(3), repeat=3) if cube != (1, 1, 1)]
 
 
 def facing(normal: np.ndarray) -> np.ndarray:
-    """Direction, 0 to 5, that normals (n, 3) face: the axis of the largest component, and its sign."""
+    """Facing of normals (n, 3), 0 to 5: the axis and the sign of the largest component."""
     x, y, z = np.abs(normal).T
     is_x, is_y = (x >= y) & (x >= z), y >= z
     below = np.where(is_x, normal[:, 0], np.where(is_y, normal[:, 1], normal[:, 2])) < 0
@@ -45,7 +45,7 @@ class SpatialCells:
     """A grid of cubes with a numbered cell for each occupied pair of cube and facing.
 
     ``low``: corner of the grid; ``size``: side of a cube, both world units; ``resolution``: cubes along each axis;
-    ``table``: number of the cell for each cube and facing, from 1 on; 0 where no vertex was.  All opaque.
+    ``table``: number of the cell for each cube and facing, from 1 on; 0 without vertices.  All opaque.
     """
 
     low: mi.Point3f

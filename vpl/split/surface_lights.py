@@ -1,12 +1,12 @@
-"""Virtual lights on surfaces where camera paths arrive, each with the irradiance that one path finds there.
+"""Virtual lights on surfaces where camera paths arrive, each with the irradiance found by a single path.
 
 Random lines (:mod:`vpl.split.line_sampling`) meet surfaces (:mod:`vpl.split.line_hits`) with a known density.  Each hit
 on a surface with a minorant becomes a light: irradiance × minorant over the density.  The irradiance comes from
-next-event estimation and one path that starts at the light.  No path starts at an emitter, so the method needs no
-adjoint BSDFs, no correction for shading normals and no emission sampling, and an environment lights a room through its
-windows as in ``path``.
+next-event estimation and a single path from the light.  No path starts at an emitter, so the method needs no adjoint
+BSDFs, no correction for shading normals and no emission sampling.  An environment lights a room through the windows as
+in ``path``.
 
-Lines go to the cells from which a pilot's paths brought radiance: lights are wanted where they are seen and bright.
+Lines go to cells with radiance in a pilot's paths: lights matter where visible and bright.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from .pilot import Arrivals
 from .roulette import OutgoingRadiance
 from .view import FirstEdge, Gathering, PathSettings, State, Stream, View, ViewLights
 
-# Arrivals of average radiance that each leaf has besides its own: a leaf holds 16 arrivals at most
+# Number of prior arrivals of average radiance in each leaf: a leaf holds up to 16 arrivals
 _PRIOR = 2.0
 # Emitter samples of a light in scenes of many emitters: with one, a light near a lamp was a bright blotch
 _EMITTER_SAMPLES = 4
-# Lights of all seeds that are kept together, some 400 bytes each
+# Largest number of kept lights over every seed, some 400 bytes each
 _MOST_KEPT = 1 << 21
 
 
@@ -60,9 +60,9 @@ class SurfaceLights:
 
 
 def surface_lights(view: View, arrivals: Arrivals, count: int, announce_tree: Callable[[], None]) -> SurfaceLights:
-    """The lights that ``count`` lines meet, with their trees; calls ``announce_tree`` before building the trees."""
-    # A path from a light lacks the two edges between camera and light; it is no camera path, so nothing is known of its
-    # expected contribution
+    """The lights at the crossings of ``count`` lines, with trees; calls ``announce_tree`` before building the trees."""
+    # A path from a light lacks the two edges between camera and light; the expected contribution is unknown, because
+    # the path is no camera path
     rules = replace(view.rules, max_depth=view.rules.max_depth - 2, rr_depth=1)
     settings = replace(view, rules=rules, outgoing=OutgoingRadiance.unknown()).settings(ViewLights())
     seed = derived_seed(view.seed, Stream.SURFACE_LIGHTS)
@@ -75,10 +75,10 @@ def surface_lights(view: View, arrivals: Arrivals, count: int, announce_tree: Ca
 
 
 def _by_sign(lights: VirtualLights) -> list[tuple[VirtualLights, float]]:
-    """Positive and negative parts of intensities as lights of their own: (lights, sign), without empty parts.
+    """Positive and negative parts of intensities as separate lights: (lights, sign), without empty parts.
 
-    Surfaces whose reflectance is negative somewhere send negative light.  ``path`` adds it, and the traced part
-    subtracts the share of virtual lights from it.
+    Surfaces with a negative reflectance send negative light.  ``path`` adds negative light, and the traced part
+    subtracts the share of virtual lights.
     """
     parts = [
         (replace(lights, intensity=np.maximum(sign * lights.intensity, 0)).without_bad()[0], sign) for sign in (1, -1)
@@ -87,11 +87,11 @@ def _by_sign(lights: VirtualLights) -> list[tuple[VirtualLights, float]]:
 
 
 def _drawn_lights(scene, emitters: EmitterSampler, arrivals: Arrivals, count: int, settings: PathSettings, seed: int):
-    """(Lights that ``count`` lines meet, octree of the lines)."""
+    """(Lights at the crossings of ``count`` lines, octree of the lines)."""
     generator = np.random.default_rng(seed)
     box = bounding_box(scene)
     low, extent = np.array(box.min, np.float64), np.array(box.extents(), np.float64)
-    # A little larger, so that no surface lies on the sides of the cube
+    # A little larger, so no surface lies on the sides of the cube
     size = 1.001 * max(float(extent.max()), np.finfo(np.float32).tiny)
     octree = ArrivalOctree(
         arrivals.position, arrivals.normal, arrivals.weight, low + 0.5 * (extent - size), size, generator
@@ -106,7 +106,7 @@ def _drawn_lights(scene, emitters: EmitterSampler, arrivals: Arrivals, count: in
 
 
 def _importance(octree: ArrivalOctree, arrivals: Arrivals) -> np.ndarray:
-    """Fraction of the lights for each leaf: its number of arrivals times the root mean square of their radiance."""
+    """Fraction of the lights for each leaf: number of arrivals times root mean square radiance."""
     leaf, size = octree.leaf_of_point, len(octree.leaf_weight)
     number = np.bincount(leaf, minlength=size)
     squared = np.bincount(leaf, arrivals.radiance**2, size)
@@ -119,8 +119,8 @@ def _importance(octree: ArrivalOctree, arrivals: Arrivals) -> np.ndarray:
 def _lights_at(scene, emitters: EmitterSampler, hits: LineHits, settings: PathSettings, seed: int) -> VirtualLights:
     """A light at every hit on a surface with a minorant; intensities are minorant × irradiance.
 
-    Mitsuba's point at a hit may lie beside the line.  The light lies on the line, where the density of lines is known;
-    its irradiance is found at Mitsuba's point, as ``path`` finds it.
+    Mitsuba's point at a hit may lie beside the line.  The light lies on the line, where the density of lines is known.
+    The irradiance is computed at Mitsuba's point, as in ``path``.
     """
     if hits.count == 0:
         return VirtualLights.of("surface", [], [], [])
@@ -138,12 +138,12 @@ def _lights_at(scene, emitters: EmitterSampler, hits: LineHits, settings: PathSe
 
 
 def _places_with_minorants(scene, emitters, rays, settings: PathSettings, seed: int):
-    """(Points where rays meet a surface with a minorant, minorants, indices of the rays), evaluated.
+    """(Points of rays on surfaces with a minorant, minorants, indices of the rays), evaluated.
 
-    Normals lie on the side that was met.
+    Normals lie on the side of arrival.
 
-    Uses the kernel of :func:`vpl.split.path_tracer.trace_paths`: another one with the code of all materials would take
-    long to compile.
+    Uses the kernel of :func:`vpl.split.path_tracer.trace_paths`: a second kernel with the code of every material would
+    take long to compile.
     """
     count = dr.width(rays.o)
     depth, gathering = dr.opaque(mi.UInt32, 2), dr.opaque(mi.UInt32, Gathering.PLACING)
@@ -161,7 +161,7 @@ def _places_with_minorants(scene, emitters, rays, settings: PathSettings, seed: 
 
 
 def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: int):
-    """Irradiance of each place by one path: (unpolarized spectrum, edges of the path that found it)."""
+    """Irradiance of each place by a single path: (unpolarized spectrum, edges of the path)."""
     count = places.count
     cell = emitters.cell(places.position, places.facing) + dr.opaque(mi.UInt32, 0, count)
     sampler = independent_sampler(derived_seed(seed, 0), count)
@@ -188,12 +188,12 @@ def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: i
 
 
 class KeptLights:
-    """Surface lights by what they depend on besides the scene, such as a seed, of one scene at a time.
+    """Surface lights of a single scene at a time, by key: the parameters besides the scene, for example a seed.
 
-    Their density is positive on every surface, so they light other cameras without bias, with fewer lights where the
-    first camera did not look.  A scene counts as the same while everything that Mitsuba prints and lists as a parameter
-    of its objects, without sensors and integrator, is the same: see
-    :func:`vpl.core.parameters.fingerprint_without_camera`. ``most``: largest number of lights that are kept.
+    The density is positive on every surface, so the lights serve further cameras without bias, with fewer lights
+    outside of the first camera's view.  A scene counts as unchanged while the printed text and the parameters of the
+    objects are equal, without sensors and integrator: see :func:`vpl.core.parameters.fingerprint_without_camera`.
+    ``most``: largest number of kept lights.
     """
 
     def __init__(self):

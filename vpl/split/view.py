@@ -1,4 +1,4 @@
-"""View: the camera rays of one image or pass, the lights that light them, and the settings of their paths."""
+"""View: the camera rays of one image or pass, the virtual lights, and the path settings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .cost_model import CostModel
 from .emitters.base import EmitterSampler
 from .roulette import OutgoingRadiance
 
-# c of paths that virtual lights carry nothing of, world units: beyond every distance, and its square is finite
+# c of paths without a carried part, world units: beyond every distance, with a finite square
 _WHOLE = 1e15
 
 
@@ -33,7 +33,7 @@ class Stream(IntEnum):
 
 
 class State:
-    """Position of a path relative to its first gather vertex x1: plain integers, which Dr.Jit compares with arrays."""
+    """Position of a path relative to its first gather vertex x1: plain integers, for comparison with Dr.Jit arrays."""
 
     SEEKING = 1  # before x1
     CONNECTING = 2  # on the edge from a gather vertex to the next vertex
@@ -65,7 +65,7 @@ class PathSettings:
     """Settings of :func:`trace_paths`, opaque on the device unless stated.
 
     ``max_depth``, ``rr_depth``: as in ``path``; ``squared_c``: c², world units²; ``gathering``: a :class:`Gathering`;
-    ``emitters_carried``: whether virtual lights stand for emitters, with ``emitters_squared_c``; ``outgoing``: for
+    ``emitters_carried``: whether virtual lights represent emitters, with ``emitters_squared_c``; ``outgoing``: for
     Russian roulette; ``perturbed``: shapes without a minorant; ``hide_emitters``: a Python bool.
     """
 
@@ -107,7 +107,7 @@ class FirstEdge(Edge):
 
     @classmethod
     def of_camera(cls, ray, importance, active) -> FirstEdge:
-        """Rays that begin at no surface, such as camera rays."""
+        """Rays without a surface at the origin, for example camera rays."""
         density = dr.opaque(mi.Float, 1.0, dr.width(ray.d))
         return cls.of(ray.o, ray, ones(len(density)), density, True, State.SEEKING, mi.UInt32(0), importance, active)
 
@@ -115,7 +115,7 @@ class FirstEdge(Edge):
     def of(cls, vertex, ray, throughput, density, delta: bool, state: int, cell, importance, active) -> FirstEdge:
         """Rays whose directions have a ``density``."""
         count = dr.width(ray.d)
-        # Arrays of full width, opaque and distinct, give one kernel for all uses
+        # Arrays of full width, opaque and distinct, give a single kernel for every use
         wide = dr.opaque(mi.Float, 0.0, count)
         ray = mi.Ray3f(ray.o + wide, ray.d + wide, ray.time + wide)
         ray.maxt = dr.largest(mi.Float) + wide
@@ -137,9 +137,9 @@ class FirstEdge(Edge):
 
 @dataclass(frozen=True)
 class ViewLights:
-    """Virtual lights on ``surfaces`` and those that stand for ``emitters``; None where there are none.
+    """Virtual lights on ``surfaces`` and virtual lights representing ``emitters``; None for no lights.
 
-    The smallest distance of each set is its c, see :mod:`vpl.transport.carried_share`.
+    The smallest distance of each set is the c of the set, see :mod:`vpl.transport.carried_share`.
     """
 
     surfaces: LightSet | None = None
@@ -155,11 +155,11 @@ class ViewLights:
 class View:
     """Camera rays of one image or pass.
 
-    ``scene``; ``emitters``: its emitter sampler; ``perturbed``: its shapes without a minorant; ``rules`` of the paths;
-    ``ray``, ``active``: of the camera, evaluated, the ``samples`` of a pixel side by side; ``width`` of the image in
-    pixels; ``seed``; ``importance``: of radiance in each pixel, and ``outgoing`` radiance of surfaces, for Russian
-    roulette; ``learning_count``: number of camera rays by which the emitter sampler sizes its learning; ``model``:
-    constants of the decisions.
+    ``scene``; ``emitters``: emitter sampler; ``perturbed``: shapes without a minorant; ``rules`` of the paths; ``ray``,
+    ``active``: of the camera, evaluated, the ``samples`` of a pixel side by side; ``width`` of the image in pixels;
+    ``seed``; ``importance`` of radiance in each pixel and ``outgoing`` radiance of surfaces: for Russian roulette;
+    ``learning_count``: number of camera rays, for the size of the emitter sampler's learning; ``model``: constants of
+    the decisions.
     """
 
     scene: mi.Scene
@@ -193,18 +193,19 @@ class View:
         return np.minimum(first[:, None] + [0, 1], self.count - 1).reshape(-1)
 
     def light_set(self, groups: list[LightGroup], spacing: float) -> LightSet:
-        """The light set of ``groups`` whose lights have a typical distance ``spacing``, world units; sets its c."""
+        """The light set of ``groups`` with a typical distance ``spacing`` between lights, world units; sets the c of
+        the set."""
         return LightSet(groups, self.model.c_per_spacing * spacing, self.rules.max_depth, 0, 0, {})
 
     def emitter_lights(self, groups: list[LightGroup]) -> LightSet:
-        """The light set that stands for emitters; ``groups`` may be empty where only its c is needed."""
+        """The light set representing emitters; ``groups`` may be empty if only c is needed."""
         lights = self.emitters.lights
         return self.light_set(groups, lights.spacing(lights.points(self.count, self.model)))
 
     def settings(self, lights: ViewLights, least: int = Gathering.NOWHERE) -> PathSettings:
         """Settings of paths of which ``lights`` carry a part; without lights, vertices are gathered by ``least``."""
-        # Lights that stand for emitters alone are gathered at x1 only: at the few later vertices that are lit, they
-        # would add more variance than they take away
+        # Without lights on surfaces, lights representing emitters are gathered at x1 only: at the few lit later
+        # vertices, the lights would add more variance than the lights remove
         gathering = Gathering.EVERYWHERE if lights.surfaces else Gathering.AT_FIRST if lights.emitters else least
         longest = dr.opaque(mi.UInt32, int(min(self.rules.max_depth, 0xFFFFFFFF)))
         squared_c, of_emitters = (

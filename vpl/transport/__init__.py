@@ -8,8 +8,8 @@ In the order to read in:
 - ``bounds``: upper bounds of the contribution of a cluster of lights to a point or a cluster of points
   [LC section 4.1; IC section 4]
 - ``evaluation``: shades and traces pairs of a point and a light (``evaluate_pairs``), lists of lights in step
-  (``sum_lights``), and all lights (``sum_all_lights``, the oracle of all methods); ``Transport``: the scene, the traits
-  of its surfaces, the lights
+  (``sum_lights``), and every light (``sum_all_lights``, the oracle of every method); ``Transport``: the scene, the
+  traits of surfaces, the lights
 
 Data: surfaces of :mod:`vpl.points`, lights of :mod:`vpl.lights` -> radiance and shadow rays per pair or per point.
 """

@@ -1,11 +1,12 @@
 """Upper bounds on what a cluster of lights can contribute to a gather point [LC section 4.1; IC section 4].
 
-bound = material × geometry × intensity, each factor at its largest over the cluster, and visibility taken as 1.
+bound = material × geometry × intensity, with the largest value of each factor over the cluster, and a visibility of 1.
 
 Departure from the papers: the largest cosine between an axis and the vectors to a box is bounded without rotating the
-box.  With c the vector to the box centre and e its half extents, the largest component along a unit axis n is exactly
-z = n·c + |n|·e, the distance from the axis is at least ρ = |c - (n·c) n| - |e|, so that the cosine is at most
-z / sqrt(z² + ρ²) and at most z / d with d the distance to the box.  It is as tight for small boxes and costs half.
+box.  With c the vector to the box centre and e the half extents of the box, the largest component along a unit axis n
+is exactly z = n·c + |n|·e, and the least distance from the axis is ρ = |c - (n·c) n| - |e|.  Upper bounds of the cosine
+are z / sqrt(z² + ρ²) and z / d with d the distance to the box.  The bound is equally tight for small boxes, at half the
+cost.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def cosine_less_angle(cosine, cone_cosine):
 
 
 def _nearest_cosine(cosine, cone_cosine):
-    """The larger cosine where an axis is only known to lie in a cone (None: it is exact)."""
+    """The larger cosine where an axis is only known to lie in a cone (None: the axis is exact)."""
     return cosine if cone_cosine is None else cosine_less_angle(cosine, cone_cosine)
 
 

@@ -1,12 +1,12 @@
-"""Contribution of one virtual light to one gather point, and its visibility: the only place for both.
+"""Contribution of a virtual light to a gather point, and the visibility of the light: the only place for both.
 
-Opaque surfaces block.  Null surfaces, which let light pass unscattered (masks, thin glass), dim the light of oriented
-and environment lights by their transmission, and count as an edge of the path, as in Mitsuba's ``path``.  Null surfaces
-block point lights, spots and directional emitters, because ``path`` counts no path through them, and surface lights,
-because ``manylights`` traces the light that passes.
+Opaque surfaces block.  Null surfaces (masks, thin glass) let light pass unscattered: the transmission dims the light of
+oriented and environment lights, and each null surface counts as an edge of the path, as in Mitsuba's ``path``.  Null
+surfaces block point lights, spots and directional emitters, because ``path`` counts no path through null surfaces, and
+surface lights, because ``manylights`` traces the passing light.
 
-Emitters that are no virtual lights are sampled in :mod:`vpl.direct`, whose modules trace their own shadow rays: every
-surface blocks these, and BSDF samples find the light through masks and glass, as in ``path``.
+The modules of :mod:`vpl.direct` sample the remaining emitters and trace separate shadow rays.  Every surface blocks the
+separate shadow rays, and BSDF samples find the light through masks and glass, as in ``path``.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from .carried_share import carried_share
 def contribution(kind: str, surface, light: Light, smallest_distance, active=True):
     """Radiance that leaves a surface due to an unoccluded light: BSDF × cosine × geometry × intensity.
 
-    ``surface``: see :mod:`vpl.points.surfaces`, Lambertian for surface lights, whose contribution is multiplied by w;
-    ``smallest_distance``: the clamp, or c for surface lights.  Values that are not finite count as zero.
+    ``surface``: see :mod:`vpl.points.surfaces`, Lambertian for surface lights (contribution multiplied by w);
+    ``smallest_distance``: the clamp, or c for surface lights.  Infinite and NaN values count as zero.
     """
     to_light, factor = geometry(kind, surface.interaction.p, light, smallest_distance)
     if kind == "surface":
@@ -35,7 +35,7 @@ def contribution(kind: str, surface, light: Light, smallest_distance, active=Tru
 
 
 def shadow_ray(kind: str, interaction, light):
-    """Ray from a surface to a light that ends just before it; for lights at infinity it has no end.
+    """Ray from a surface to just before a light; endless for lights at infinity.
 
     It ends above the surface of a surface light by the uncertainty of the light's position.
     """
@@ -47,7 +47,7 @@ def shadow_ray(kind: str, interaction, light):
 
 
 def transmittance(scene, traits, kind: str, ray, most, active):
-    """Fraction of light that reaches the ray's origin: 0 or 1, or a spectrum where surfaces are partly transparent.
+    """Fraction of light reaching the ray's origin: 0 or 1, or a spectrum for partly transparent surfaces.
 
     ``most``: surfaces that it may pass, UInt32.  Lanes that are not ``active`` give 0.
     """
@@ -60,20 +60,20 @@ def transmittance(scene, traits, kind: str, ray, most, active):
         return passed
     through = active & (passed == 0) & (most > 0)
     if traits.open_scene is not None:
-        # Few blocked rays meet an open surface at all, and a scene of only those is tested quickly
+        # Few blocked rays meet an open surface at all, and a scene of only open surfaces is tested quickly
         through &= traits.open_scene.ray_test(ray, through)
     return passed + _through_null_surfaces(scene, traits, ray, most, through)
 
 
 @dr.syntax
 def _through_null_surfaces(scene, traits, ray, most, active):
-    """Walk from surface to surface while they let light pass unscattered, past ``most`` of them."""
+    """Walk from surface to surface while surfaces let light pass unscattered, past ``most`` surfaces."""
     ray, left = mi.Ray3f(ray), mi.UInt32(most)
     active = mi.Bool(active)
     passed = dr.select(active, mi.UnpolarizedSpectrum(1), 0)
     while dr.hint(active, exclude=[traits]):
         hit = scene.ray_intersect_preliminary(ray, active=active)
-        # Most surfaces are opaque: only those that are not are worth a full intersection record
+        # Surfaces are usually opaque: only the remaining surfaces need a full intersection record
         crossed = active & hit.is_valid() & (left > 0) & traits.is_null(hit.shape)
         passed = dr.select(active & hit.is_valid() & ~crossed, 0, passed)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, crossed)

@@ -1,4 +1,4 @@
-"""Evaluation of what was chosen: here and only here pairs of a gather point and a light are shaded and traced."""
+"""Evaluation of chosen pairs: the only place for shading and tracing pairs of a gather point and a light."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from ..points.camera_paths import SceneTraits
 from ..points.surfaces import Batch, Surface
 from .contribution import contribution, shadow_ray, transmittance
 
-# Lights whose contributions one kernel adds up in single precision; between kernels sums are in double precision
+# Largest number of lights summed by a kernel in single precision; sums over kernels are in double precision
 _LIGHTS_PER_KERNEL = 4096
-# Shadow rays of a kernel of all points and some lights: no render can be stopped before its kernel has ended
+# Largest number of shadow rays of a kernel: no render can be stopped before the end of a kernel
 _RAYS_PER_KERNEL = 1 << 26
 
 
 @dataclass(frozen=True)
 class Transport:
-    """Context of all that is evaluated: the ``scene``, the ``traits`` of its surfaces, and the ``lights`` of a render.
+    """Context of evaluation: the ``scene``, the ``traits`` of the surfaces, and the ``lights`` of a render.
 
-    Functions that work on the lights of one kind take their ``group`` besides.
+    Functions for lights of a single kind take a ``group`` in addition.
     """
 
-    scene: object
+    scene: mi.Scene
     traits: SceneTraits
     lights: LightSet
 
@@ -35,9 +35,8 @@ class Transport:
 def evaluate_pairs(transport: Transport, group: LightGroup, surface, light, scale, seen=None):
     """Shade one (surface, light) pair per lane and trace its shadow ray, unless nothing would arrive.
 
-    ``light``: lights gathered from ``group``; ``scale``: factor on their intensity; ``seen``: lanes whose light is
-    taken to arrive without a ray (None: none).  Returns (radiance with visibility, mask of the lanes whose ray was
-    traced).
+    ``light``: lights gathered from ``group``; ``scale``: factor on their intensity; ``seen``: lanes with visibility 1
+    without a ray (None: no lane).  Returns (radiance with visibility, mask of the lanes whose ray was traced).
     """
     value = unoccluded(transport.lights, group, surface, light) * scale
     arrives = dr.any(value > 0)
@@ -51,8 +50,8 @@ def evaluate_pairs(transport: Transport, group: LightGroup, surface, light, scal
 def evaluate_representatives(transport: Transport, group: LightGroup, batch: Batch, rows, light, intensity):
     """Shade and trace pairs of ``rows`` of a batch and lights of a group, each of which stands for a cluster.
 
-    ``light``: their indices; ``intensity``: of the clusters, the mean over channels.  However the pairs were chosen,
-    this is the same kernel, compiled once.  Returns as :func:`evaluate_pairs`, evaluated.
+    ``light``: indices of the lights; ``intensity``: of the clusters, the mean over channels.  Every method of choosing
+    pairs uses the same kernel, compiled once.  Returns as :func:`evaluate_pairs`, evaluated.
     """
     dr.eval(rows, light, intensity)
     value, traced = evaluate_pairs(transport, group, batch.surfaces_at(rows), *group.standing_for(light, intensity))
@@ -61,11 +60,12 @@ def evaluate_representatives(transport: Transport, group: LightGroup, batch: Bat
 
 
 def evaluate_one_of(transport: Transport, group: LightGroup, surface, candidates: list, number):
-    """Shade several lights that stand for the same cluster, and trace the ray of one, drawn by unoccluded contribution.
+    """Shade several representative lights of a cluster, and trace the ray of a single light, drawn by unoccluded
+    contribution.
 
-    ``candidates``: (light, factor on its intensity) pairs, any of which alone would do; ``number``: UInt32 that differs
-    wherever a draw is to.  Their mean, in expectation, with the visibility of one: resampled importance sampling
-    [Talbot et al. 2005].  Returns as :func:`evaluate_pairs`.
+    ``candidates``: (light, factor on its intensity) pairs, each sufficient alone; ``number``: UInt32, distinct for
+    independent draws.  The expectation is the mean of the candidates, with the visibility of a single light: resampled
+    importance sampling [Talbot et al. 2005].  Returns as :func:`evaluate_pairs`.
     """
     (light, scale), *others = candidates
     if not others:
@@ -82,18 +82,18 @@ def evaluate_one_of(transport: Transport, group: LightGroup, surface, candidates
         light = select_record(taken, other, light)
     arrives = strength > 0
     passed = _visibility(transport, group, surface, light, arrives)
-    # The strength of the light that was drawn cancels, but for its colour
+    # The strength of the drawn light cancels, except for the colour
     share = total / (strength * len(candidates))
     return dr.select(arrives, value * passed * share, 0), arrives
 
 
 def probe_visibility(transport: Transport, group: LightGroup, surface: Surface, light, active=True):
-    """Fraction of light that arrives, (surface, light) pair by pair, where the unoccluded contribution is not 0.
+    """Fraction of arriving light for each (surface, light) pair with a nonzero unoccluded contribution.
 
-    Returns (fraction, mask of the lanes for which it was asked).
+    Returns (fraction, mask of the traced lanes).
     """
     traced = dr.any(unoccluded(transport.lights, group, surface, light) > 0) & active
-    # Always of several channels: all() and any() over those of one would run over the lanes
+    # Always of several channels: all() and any() over a single channel would run over the lanes
     return mi.UnpolarizedSpectrum(_visibility(transport, group, surface, light, traced)), traced
 
 
@@ -161,7 +161,7 @@ def mean_radiance(transport: Transport, batch: Batch, seed: int, count: int = 1 
         points = dr.opaque(mi.UInt32, batch.count)
         row = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(points)), points - 1)
         index = choice.row(sampler.next_1d())
-        # Drawn by intensity, each of them stands for all
+        # Drawn by intensity, each light represents the whole group
         everything = dr.opaque(mi.Float, float(group.lights.scalar_intensity.sum()), count)
         value, _ = evaluate_representatives(transport, group, batch, row, mi.UInt32(index), everything)
         total += float(download(value).mean(dtype="float64"))

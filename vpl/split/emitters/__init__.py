@@ -1,8 +1,8 @@
-"""Emitter samplers: how next-event estimation chooses an emitter, and with what density.
+"""Emitter samplers: the choice of an emitter for next-event estimation, and the density.
 
-- ``base``: the interface of all samplers, their results, the uniform sampler, irradiance by a sampler
-- ``learned``: emitters and regions of the environment, chosen by what a pilot's vertices see of them
-- ``tree``: many emitters, chosen through a tree over them
+- ``base``: interface and results of samplers, the uniform sampler, irradiance by a sampler
+- ``learned``: emitters and regions of the environment, chosen by visibility from a pilot's vertices
+- ``tree``: many emitters, chosen through a tree
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ _FEWEST_IN_TREE = 64
 def emitter_sampler(scene, rays: int) -> EmitterSampler:
     """The sampler that suits a scene, with about ``rays`` rays to learn by.
 
-    :class:`TreeEmitters` where there are 64 emitters or more, all of kinds that arrays can hold;
-    :class:`UniformEmitters` for a single emitter with a place; :class:`LearnedEmitters` elsewhere.
+    :class:`TreeEmitters` for 64 emitters or more, if arrays can hold every emitter; :class:`UniformEmitters` for a
+    single emitter with a position; :class:`LearnedEmitters` otherwise.
     """
     count = len(scene.emitters())
     if count > 1 or scene.environment() is not None:
@@ -29,7 +29,7 @@ def emitter_sampler(scene, rays: int) -> EmitterSampler:
 
 
 def _tree(scene, rays: int) -> TreeEmitters | None:
-    """The tree over the emitters; None where a tree cannot hold them."""
+    """The tree over the emitters; None if a tree cannot hold the emitters."""
     try:
         emitters = read_emitters(scene)
     except ValueError:

@@ -21,9 +21,9 @@ class EmitterSample:
     """Sampled directions to emitters, one per lane.
 
     ``direction``: unit vector; ``weight``: unoccluded radiance over the density; ``density``: 1 / sr, 1 for points and
-    directions, which ``is_point`` marks; ``ray``: shadow ray.  ``nearness``: cosine at the emitter over the squared
-    distance, 0 for points, infinite where no virtual light stands for the emitter; None where no virtual light stands
-    for any emitter.
+    directions; ``is_point``: mask of points and directions; ``ray``: shadow ray.  ``nearness``: cosine at the emitter
+    over the squared distance, 0 for points, infinite if no virtual light represents the emitter; None if no virtual
+    light represents any emitter.
     """
 
     direction: mi.Vector3f
@@ -39,15 +39,15 @@ class EmitterSample:
         return EmitterSample(self.direction, weight, self.density * probability, self.is_point, self.ray, self.nearness)
 
     def arriving(self, scene, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """The weight where the emitter is visible, 0 elsewhere: traces a shadow ray where the weight matters."""
+        """The weight where the emitter is visible, 0 elsewhere: traces a shadow ray for nonzero weights."""
         possible = active & (dr.max(self.weight) > 0) & (self.density > 0)
         return dr.select(possible & ~scene.ray_test(self.ray, possible), self.weight, 0)
 
 
 @dataclass
 class MetEmitter:
-    """Emitters that rays met: ``radiance``; ``density`` with which the sampler draws the direction, 1 / sr;
-    ``nearness``: see :class:`EmitterSample`."""
+    """Emitters hit by rays: ``radiance``; ``density`` of the direction under the sampler, 1 / sr; ``nearness``: see
+    :class:`EmitterSample`."""
 
     radiance: mi.UnpolarizedSpectrum
     density: mi.Float
@@ -57,7 +57,7 @@ class MetEmitter:
 class EmitterSampler(Protocol):
     """Choice of emitters for next-event estimation.
 
-    ``lights``: virtual lights that may stand for the emitters, None where none can.
+    ``lights``: virtual lights representing the emitters, or None.
     """
 
     lights: EmitterLights | None
@@ -69,12 +69,13 @@ class EmitterSampler(Protocol):
     def sample(self, si, cell, chosen, member, place, active) -> EmitterSample:
         """Sample a direction to an emitter for each vertex ``si``.
 
-        ``chosen``, ``member``, ``place``: uniform numbers that choose a source, a part of it, and a point on the part.
+        ``chosen``, ``member``, ``place``: uniform numbers for the choice of a source, a part of the source, and a point
+        on the part.
         """
         raise NotImplementedError
 
     def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
-        """Emission that a ray from ``vertex`` met at ``si``; ``has_density``: whether its direction has a density."""
+        """Emission at the hit ``si`` of a ray from ``vertex``; ``has_density``: whether the direction has a density."""
         raise NotImplementedError
 
     def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> bool:
@@ -140,7 +141,7 @@ class Places:
         return dr.width(self.position)
 
     def interaction(self) -> mi.SurfaceInteraction3f:
-        """Surface interactions with the fields that emitters and rays need."""
+        """Surface interactions with the fields required by emitters and rays."""
         si = dr.zeros(mi.SurfaceInteraction3f, self.count)
         si.p, si.n, si.sh_frame = self.position, self.normal, mi.Frame3f(self.facing)
         return si
@@ -152,8 +153,8 @@ def irradiance_from_emitters(scene, emitters: EmitterSampler, places: Places, ce
     """Irradiance straight from emitters by next-event estimation with ``samples`` samples for each of the ``places``.
 
     Returns, evaluated: the irradiance, an unpolarized spectrum, weighted for multiple importance sampling with
-    cosine-distributed directions; and the mean over channels of the unoccluded irradiance, without that weight.
-    Virtual lights and learning samplers share this kernel, because compiling it takes a good part of a first render.
+    cosine-distributed directions; and the mean over channels of the unoccluded irradiance, without the weight.  Virtual
+    lights and learning samplers share this kernel, because compiling it takes a good part of a first render.
     """
     si, sampler, number = places.interaction(), independent_sampler(seed, places.count), mi.UInt32(0)
     wanted = dr.opaque(mi.UInt32, samples)

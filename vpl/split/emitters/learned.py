@@ -1,9 +1,9 @@
 """Emitters chosen by spatial cell, from the light of each that a pilot's vertices receive.
 
 Vertices in a cell trace a few rays to every source of light; neighbouring cells count as well.  A fraction of the
-samples keeps the usual probabilities, which are all that cells without vertices have.  Sources are the emitters one by
-one, and regions of the environment (:mod:`vpl.direct.environment_regions`), so that a room that sees the sky through a
-window samples the window.
+samples keeps the usual probabilities; cells without vertices use only the usual probabilities.  Sources are single
+emitters and regions of the environment (:mod:`vpl.direct.environment_regions`): a room lit by the sky through a window
+samples the window.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from .base import EmitterSample, MetEmitter, Places, irradiance_from_emitters
 
 # Rays to learn by, as a fraction of the camera rays: learning may take a few percent of a render
 _LEARNING_SHARE = 0.25
-# Rays from a cell to each source; largest number of rays of all cells, which bounds memory (some 100 bytes a ray)
+# Rays from a cell to each source; largest total number of rays, a bound of memory (some 100 bytes a ray)
 _RAYS_EACH, _MOST_RAYS = 2, 1 << 20
-# Largest number of rays that the neighbours of a cell count as; rays that the prior visibility counts as
+# Weight of the neighbours of a cell and of the prior visibility, as equivalent numbers of rays; the first is a maximum
 _NEIGHBOURS, _PRIOR = 4.0, 1.0
-# Regions of the environment; columns of the radiance table that they are made from
+# Regions of the environment; columns of the radiance table for building regions
 _REGIONS, _COLUMNS = 256, 512
-# Fraction of the samples that keep Mitsuba's probabilities: a cell may see emitters that its pilot vertices did not
+# Fraction of the samples with Mitsuba's probabilities: a cell may see emitters invisible from the pilot vertices
 _USUAL_SHARE = 0.2
 
 
@@ -41,14 +41,14 @@ def learning_rays(paths: int) -> int:
 class CellChoice:
     """Probabilities of sources by spatial cell; before :meth:`learn`, the same everywhere.
 
-    ``usual`` (n,) float64: probabilities where nothing is known, which sum to 1; ``share``: fraction of the samples
-    that use them in every cell; ``ignored``: indices of sources that are not learned.
+    ``usual`` (n,) float64: probabilities where nothing is known, with sum 1; ``share``: fraction of the samples drawn
+    by ``usual`` in every cell; ``ignored``: indices of sources without learning.
     """
 
     def __init__(self, usual: np.ndarray, share: float, ignored: np.ndarray):
         self.count, self._stride = len(usual), dr.opaque(mi.UInt32, len(usual) + 1)
         self._usual, self._share, self._ignored = usual, share, ignored
-        # While it learns, every source has a cell of its own, where only that source is drawn
+        # During learning, every source has a cell, and the cell draws only the source
         self._learns = dr.opaque(mi.Bool, False)
         self.forget()
 
@@ -66,13 +66,13 @@ class CellChoice:
     def forget(self) -> None:
         """Return to the usual probabilities everywhere."""
         self._cells = SpatialCells.none()
-        # Twice, because Dr.Jit compiles other kernels for arrays of one entry
+        # Twice, because Dr.Jit compiles different kernels for arrays of a single entry
         self._use(np.stack([self._usual, self._usual]))
 
     def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int, look: Callable) -> bool:
         """Learn from vertices (n, 3) with at most about ``rays`` rays; returns whether anything was learned.
 
-        ``look(places, cell)``: :func:`vpl.split.emitters.base.irradiance_from_emitters` with one sample each.
+        ``look(places, cell)``: :func:`vpl.split.emitters.base.irradiance_from_emitters` with a single sample each.
         """
         each = _RAYS_EACH * self.count
         most = min(rays, _MOST_RAYS) // each
@@ -90,7 +90,7 @@ class CellChoice:
         vertex = dr.gather(mi.UInt32, first, row) + number
         position, normal = (upload_vectors(mi.Point3f, x[order]) for x in (position, normal))
         facing = mi.Normal3f(dr.gather(mi.Point3f, normal, vertex))
-        # Two distinct arrays of normals, as virtual lights have, so that both use the same kernel
+        # Two distinct arrays of normals, as for virtual lights: both use the same kernel
         places = Places(dr.gather(mi.Point3f, position, vertex), facing + dr.opaque(mi.Float, 0.0), facing)
         dr.eval(places, source)
         self._learns = dr.opaque(mi.Bool, True)
@@ -108,7 +108,7 @@ class CellChoice:
     def _shares(self, unoccluded: np.ndarray, seen: np.ndarray) -> np.ndarray:
         """Probabilities (cells + 1, sources) from unoccluded irradiance and visibility (cells, sources, rays).
 
-        They are proportional to the root mean square of the light that arrived.  Row 0 is for unknown cells.
+        Proportional to the root mean square of the arriving light.  Row 0 is for unknown cells.
         """
         possible = np.nan_to_num(unoccluded, posinf=0) ** 2
         possible[:, self._ignored] = 0
@@ -131,7 +131,7 @@ class CellChoice:
         ``guess``: prior mean, with the weight of ``_PRIOR`` rays.
         """
         neighbours, total = self._cells.neighbours(), _PRIOR * guess
-        # Row 0 stands for neighbours that do not exist
+        # Row 0 represents missing neighbours
         padded = np.concatenate([np.zeros((1, self.count)), _RAYS_EACH * power])
         for neighbour in neighbours.T:
             total += padded[neighbour]
@@ -163,12 +163,12 @@ class CellChoice:
 
 
 def _share(found: np.ndarray, possible: np.ndarray, axes: tuple) -> np.ndarray:
-    """Fraction of the rays with unoccluded light that found light, over some axes, which are kept."""
+    """Fraction of the rays with unoccluded light that found light, over some axes; keeps the axes."""
     return np.count_nonzero(found, axes, keepdims=True) / np.maximum(np.count_nonzero(possible, axes, keepdims=True), 1)
 
 
 class CellEmitters:
-    """Part that all samplers with a :class:`CellChoice` share; ``_scene``, ``choice``: set by the subclass."""
+    """Shared part of the samplers with a :class:`CellChoice`; ``_scene``, ``choice``: set by the subclass."""
 
     choice: CellChoice
 
@@ -190,9 +190,9 @@ class CellEmitters:
 
 
 class LearnedEmitters(CellEmitters):
-    """Emitters one by one, and regions of the environment.
+    """Learned choice among single emitters and regions of the environment.
 
-    Before anything is learned, the probability of an emitter is proportional to its ``sampling_weight``, as in Mitsuba.
+    Before anything is learned, the probability of an emitter is proportional to ``sampling_weight``, as in Mitsuba.
     """
 
     # No virtual lights stand for emitters
@@ -218,8 +218,8 @@ class LearnedEmitters(CellEmitters):
         alike[: self._count] = weight / weight.sum()
         ignored = alike[: self._count] == 0
         if self._regions:
-            # Regions are learned instead of the whole environment. Where nothing is known, the environment draws for
-            # itself, because its own samples are better spread
+            # Regions are learned instead of the whole environment. Where nothing is known, the environment draws
+            # directions, because the environment's samples are better stratified
             ignored[self._environment_number] = True
         self.choice = CellChoice(alike, _USUAL_SHARE, np.flatnonzero(ignored))
 
@@ -229,8 +229,8 @@ class LearnedEmitters(CellEmitters):
         emitter = dr.gather(mi.EmitterPtr, self._emitters, dr.minimum(source, self._count - 1))
         ds, weight = emitter.sample_direction(si, place, of_emitter)
         weight = finite_or_zero(mi.unpolarized_spectrum(weight)) & of_emitter
-        # A ray without an end for infinite emitters: Mitsuba 3.9.1 places them outside of the scene's bounding box,
-        # which leaves out rectangles
+        # A ray without an end for infinite emitters: Mitsuba 3.9.1 places infinite emitters outside of the scene's
+        # bounding box, and the box ignores rectangles
         far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
         ray = dr.select(far, si.spawn_ray(ds.d), si.spawn_ray_to(ds.p))
         direction, density, delta = ds.d, ds.pdf, ds.delta & of_emitter
@@ -254,12 +254,12 @@ class LearnedEmitters(CellEmitters):
         sample = self._draw(si, source, member, place, active)
         if not self._regions:
             return sample.chosen_with(probability)
-        # The environment and its regions may draw the same direction: its density is the sum of both
+        # The environment and its regions may draw the same direction: the density is the sum of both densities
         of_region = active & (source >= self._count)
         of_environment = of_region | (active & (source == self._environment_number))
         # The density that the emitter returned with its sample: asked for the density of a direction at the edge of the
-        # sun, Mitsuba 3.9.1 returns that of the sky, a hundred thousand times less. Regions that draw such a direction
-        # find the radiance of the sky, too, so the sun loses a thousandth of its light at most
+        # sun, Mitsuba 3.9.1 returns the density of the sky, a hundred thousand times less. Regions also find the
+        # radiance of the sky in these directions, so the sun loses no more than a thousandth of the light
         own = dr.select(of_region, self._own_density(si, sample.direction, of_region), sample.density)
         both = self._environment_density(cell, sample.direction, own, of_environment)
         return sample.chosen_with(dr.select(of_environment, both / sample.density, probability))
@@ -271,7 +271,7 @@ class LearnedEmitters(CellEmitters):
         return finite_or_zero(self._environment.pdf_direction(origin, ds, active))
 
     def _environment_density(self, cell, direction, own, active):
-        """Density of a direction to the environment; ``own``: density with which the environment itself draws it."""
+        """Density of a direction to the environment; ``own``: density under the environment's sampling."""
         # A branch, as in `_draw`: cell 0 draws no region, also while emitters are learned, when it is the first
         # emitter's
         by_region = dr.if_stmt(
@@ -283,12 +283,12 @@ class LearnedEmitters(CellEmitters):
         return by_region + own * self.choice.probability(cell, mi.UInt32(self._environment_number), active)
 
     def _region_density(self, cell, direction):
-        """Density with which a direction is drawn through its region."""
+        """Density of a direction drawn through a region."""
         region, density = self._regions.find(direction, True)
         return density * self.choice.probability(cell, self._count + region, True)
 
     def _density_met(self, origin, cell, direction):
-        """Density of a direction in which a ray met the environment."""
+        """Density of the direction of a ray to the environment."""
         return self._environment_density(cell, direction, self._own_density(origin, direction, True), True)
 
     def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
@@ -318,8 +318,8 @@ class LearnedEmitters(CellEmitters):
 def _reproducible_order(emitters: list) -> np.ndarray:
     """Sort emitters by class, bounding box and printed properties: (n,) indices.
 
-    Mitsuba 3.9.1 lists the shapes of a scene, and with them their emitters, in an order that differs from one loading
-    of a file to the next.  With the order of the list, the same seed would give another image each time.
+    Mitsuba 3.9.1 lists the shapes of a scene, and thus the emitters, in an order that differs between loads of the same
+    file.  With the order of the list, the same seed would give another image each time.
     """
 
     def key(number: int):

@@ -24,11 +24,11 @@ from .learned import CellChoice, CellEmitters
 
 # Largest number of clusters; their number grows with the root of the rays to learn by, as does the number of cells
 _MOST_CLUSTERS, _CLUSTERS_BY_RAYS = 256, 0.25
-# Fraction of the samples that draw from the root: a cell may receive light that its pilot vertices did not
+# Fraction of the samples that draw from the root: a cell may receive light invisible from the pilot vertices
 _ROOT_SHARE = 0.2
-# Fraction of the draws from the root that are uniform over the emitters: near ones may be hidden or shine elsewhere
+# Fraction of the draws from the root that are uniform over the emitters: near emitters may be hidden or shine elsewhere
 _UNIFORM_SHARE = 0.1
-# Least fraction of the draws from the root that goes to located emitters, and to distant ones, where there are both
+# Least fraction of the draws from the root for located emitters, and for distant emitters, in scenes with both
 _LEAST_SHARE = 0.1
 # Floats of a node's record in device memory: two vectors of four
 _RECORD = 8
@@ -44,8 +44,8 @@ class EmitterTree:
 
     From the root down, a child is drawn in proportion to its intensity over the squared distance [Conty Estevez and
     Kulla 2018, "Importance sampling of many lights with adaptive tree splitting"].  The tree lies in preorder, so the
-    way down to a known emitter, and with it the probability of drawing it, needs no record of turns.  ``clusters``:
-    number of subtrees that a learned choice may begin with, at most ``most_clusters``.
+    path to a known emitter, and the probability of drawing the emitter, need no record of turns.  ``clusters``: number
+    of subtrees at the beginning of a learned choice, limited by ``most_clusters``.
     """
 
     def __init__(self, position: np.ndarray, radius: np.ndarray, intensity: np.ndarray, most_clusters: int):
@@ -58,7 +58,7 @@ class EmitterTree:
         low, high = tree.records[:, BOX_MIN].astype(np.float64), tree.records[:, BOX_MAX].astype(np.float64)
         records = np.zeros((len(tree.records), _RECORD), np.float32)
         records[:, 0:3], variance = moments_below(tree, position, intensity)
-        # Squared distance below which no vertex counts as closer: emitters extend beyond their positions
+        # Least squared distance of a vertex: emitters extend beyond a single position
         records[:, 3] = _LEAST_DISTANCE**2 * variance + largest_below(tree, radius) ** 2
         leaf = tree.escape == np.arange(len(tree.records)) + 1
         records[:, 4] = tree.records[:, INTENSITY]
@@ -147,20 +147,20 @@ def _cut(escape: np.ndarray, intensity: np.ndarray, size: np.ndarray, most: int)
 
 
 class TreeEmitters(CellEmitters):
-    """Point, spot and area emitters, environment and directional ones.
+    """Choice among point, spot, area, environment and directional emitters.
 
     The probabilities of clusters of located emitters, and of each distant emitter, are learned by spatial cell.  A
-    fraction of the samples everywhere, and all samples in cells where nothing is known, draw from the root of the tree,
-    which prefers near and bright emitters; distant emitters share a fixed fraction of these samples.
+    fraction of the samples draws from the root of the tree, which prefers near and bright emitters; in cells without
+    knowledge, every sample does.  Distant emitters share a fixed fraction of the draws from the root.
 
     ``emitters``: each with a constant radiance; ``rays``: approximate number of rays to learn by; ``lights``: virtual
-    lights that may stand for the emitters, None where none can.
+    lights representing the emitters, or None.
     """
 
     def __init__(self, scene, emitters: Emitters, rays: int):
         self._scene, self._emitters, self._environment = scene, emitters, emitters.environment
         omni = VirtualLights.concatenate([emitters.points, emitters.spots])
-        # One kernel for both: the cone of a point emitter holds all directions
+        # A single kernel for both: the cone of a point emitter holds every direction
         omni.kind = "spot"
         self._omni, self._areas = DeviceLights(omni) if omni.count else None, emitters.area.count
         self._first_area = omni.count
@@ -169,7 +169,7 @@ class TreeEmitters(CellEmitters):
         boxes = [shape.bbox() for shape in shapes]
         lights = EmitterLights(emitters, omni, np.array([has_true_normals(shape) for shape in shapes], bool))
         self.lights = lights if lights.any else None
-        # One entry more, because Dr.Jit compiles other kernels for arrays of one entry
+        # An additional entry, because Dr.Jit compiles different kernels for arrays of a single entry
         self._is_carried = upload(mi.UInt32, np.append(lights.carried, False))
         center = np.array([np.array(box.center()) for box in boxes], np.float64).reshape(-1, 3)
         radius = np.array([0.5 * np.linalg.norm(np.array(box.extents())) for box in boxes], np.float64)
@@ -187,7 +187,7 @@ class TreeEmitters(CellEmitters):
         self.choice = CellChoice(usual, _ROOT_SHARE, np.array([len(usual) - 1]))
 
     def _located_share(self, intensity: float) -> float:
-        """Fraction of the draws from the root that goes to located emitters, whose intensities sum to ``intensity``."""
+        """Fraction of the draws from the root that goes to located emitters, with a total of ``intensity``."""
         if not self._distant:
             return 1.0
         # By unoccluded irradiance, with located emitters at half the radius of the scene
@@ -208,7 +208,7 @@ class TreeEmitters(CellEmitters):
     def _draw(self, source, position, number, member, active):
         """Draw an emitter of each source by two uniform numbers.
 
-        Returns (whether it is located, its row in the tree, its index among the distant emitters).
+        Returns (mask of located emitters, row in the tree, index among the distant emitters).
         """
         distant = mi.UInt32(max(self._distant - 1, 0))
         usual = source == self._clusters + self._distant
