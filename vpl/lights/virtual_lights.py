@@ -1,4 +1,4 @@
-"""Virtual lights: what is stored of them, how a kernel fetches them, and how their light arrives at a place."""
+"""Virtual lights: stored columns, device records, and the geometry of light arriving at a point."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 
 from ..core.arrays import carries_light, upload, usable
 
-# Kinds of virtual light. "point" and "spot" radiate from a point that the scene really has and are never clamped;
-# "oriented" lights stand for a piece of surface, and so do "surface" lights, which taper off near them: what they lack
-# is traced. "directional" and "environment" lights lie at infinity; the latter
-# stand for a piece of sky that a camera path could reach, the former for an emitter that it could not.
+# Kinds of virtual light. "point" and "spot" lights radiate from a real point of the scene and are never clamped.
+# "oriented" and "surface" lights represent a piece of surface; "surface" lights taper off nearby, and paths trace the
+# missing light. "directional" and "environment" lights lie at infinity: an "environment" light represents a piece of
+# sky within reach of a camera path, a "directional" light an emitter out of reach.
 KINDS = ("point", "spot", "oriented", "directional", "environment", "surface")
 
 AT_INFINITY = ("directional", "environment")
@@ -24,16 +24,16 @@ _COLUMNS = ("position", "direction", "intensity", "depth", "cone", "facing", "un
 
 @dataclass
 class VirtualLights:
-    """Lights of one kind, as NumPy arrays of n rows.
+    """Lights of a single kind, as NumPy arrays of n rows.
 
     ``position`` (n, 3) float32, world units (None for lights at infinity);
-    ``direction`` (n, 3) float32: surface normal, spot axis, or the direction in which the light travels;
-    ``intensity`` (n, 3) float32: radiant intensity of points and spots, exitant flux / pi of oriented lights (their
-    radiance times area), irradiance of lights at infinity;
-    ``depth`` (n,) uint32: edges of the light path that ends in the light, 0 for lights that stand for an emitter;
+    ``direction`` (n, 3) float32: surface normal, spot axis, or the travel direction of the light;
+    ``intensity`` (n, 3) float32: radiant intensity of points and spots, exitant flux / pi of oriented lights
+    (radiance times area), irradiance of lights at infinity;
+    ``depth`` (n,) uint32: edges of the light path up to the light, 0 for lights representing an emitter;
     ``cone`` (n, 2) float32: cut-off angle and beam angle of spots in radians, (pi, pi) elsewhere;
-    ``facing`` (n, 3) float32: of lights on surfaces, the vector to whose side alone they shine, such as a shading
-    normal (None: they shine wherever ``direction`` lets them);
+    ``facing`` (n, 3) float32: normal of the lit half-space of lights on surfaces, for example a shading normal (None:
+    only ``direction`` limits the light);
     ``uncertainty`` (n,) float32: of the position of lights on surfaces along ``direction``, world units (None: 0).
     """
 
@@ -81,8 +81,8 @@ class VirtualLights:
         return VirtualLights(parts[0].kind, *joined)
 
     def without_bad(self) -> tuple[VirtualLights, int]:
-        """Drop lights that carry nothing, and those with a value that is not finite (an intensity that is negative or
-        above ``LARGEST_VALUE``); returns how many of the latter."""
+        """Drop lights without intensity and lights with an invalid value (not finite, or an intensity that is negative or
+        above ``LARGEST_VALUE``); returns the number of lights with an invalid value."""
         finite = usable(self.intensity).all(1) & np.isfinite(self.direction).all(1)
         if self.position is not None:
             finite &= np.isfinite(self.position).all(1)
@@ -92,19 +92,19 @@ class VirtualLights:
 
 @dataclass
 class Light:
-    """Lights in a kernel: one per lane.  Units as in :class:`vpl.lights.virtual_lights.VirtualLights`."""
+    """Lights in a kernel, a light per lane.  Units as in :class:`vpl.lights.virtual_lights.VirtualLights`."""
 
-    position: object
-    direction: object
-    intensity: object
-    depth: object
-    cone: object
-    facing: object = None
-    uncertainty: object = None
+    position: mi.Point3f
+    direction: mi.Vector3f
+    intensity: mi.Color3f
+    depth: mi.UInt32
+    cone: mi.Vector2f
+    facing: mi.Vector3f | None = None
+    uncertainty: mi.Float | None = None
 
 
 class DeviceLights:
-    """Virtual lights of one kind on the device, as packed records that one gather fetches."""
+    """Virtual lights of a single kind on the device, as packed records."""
 
     def __init__(self, lights: VirtualLights):
         records = np.zeros((lights.count, _RECORD), np.float32)
@@ -149,12 +149,17 @@ def spot_falloff(cosine, cone):
 
 
 def geometry(kind: str, position, light: Light, smallest_distance):
-    """Direction to the light and the factor by which its intensity arrives there.
+    """Direction to the light, and the ratio of arriving irradiance to intensity.
 
-    Returns (unit vector from ``position`` to the light, factor).  The factor is 1/d² for points, times the falloff for
-    spots, cos/d² with d not smaller than ``smallest_distance`` for oriented lights ([IC] section 5: clamping), cos/d²
-    for surface lights, and 1 for lights at infinity.  It is 0 where a light does not face ``position``, and for one
-    exactly there, which has no direction.
+    Returns (unit vector from ``position`` to the light, factor).  The factor is
+
+    - 1/d² for points, times the falloff for spots;
+    - cos/d² for oriented lights, with d clamped to at least ``smallest_distance`` ([IC] section 5);
+    - cos/d² for surface lights;
+    - 1 for lights at infinity.
+
+    The factor is 0 where a light does not face ``position``, and for a light exactly at ``position``, because the
+    direction is undefined.
     """
     if kind in AT_INFINITY:
         return -light.direction, mi.Float(1)

@@ -134,9 +134,10 @@ def error_scale(brightness: np.ndarray, model: CostModel) -> np.ndarray:
     return np.maximum(level, np.finfo(np.float64).tiny ** 0.5)
 
 
-# ---------------------- Means around pixels ---------------------- The image is divided into four blocks, each block
-# into four again, down to single pixels. The mean of a block combines the values of the block with the mean of the
-# larger block. The weight of the larger block is a number of values, and grows with the variance of the values.
+# ---------------------- Means around pixels ----------------------
+# The image is divided into four blocks, each block into four again, down to single pixels. The mean of a block combines
+# the values of the block with the mean of the larger block. The weight of the larger block is a number of values, and
+# grows with the variance of the values.
 
 
 def means_of_others(
