@@ -81,8 +81,8 @@ class VirtualLights:
         return VirtualLights(parts[0].kind, *joined)
 
     def without_bad(self) -> tuple[VirtualLights, int]:
-        """Drop lights without intensity and lights with an invalid value (not finite, or an intensity that is negative or
-        above ``LARGEST_VALUE``); returns the number of lights with an invalid value."""
+        """Drop lights without intensity and lights with an invalid value (not finite, or a negative intensity or an
+        intensity above ``LARGEST_VALUE``); returns the number of lights with an invalid value."""
         finite = usable(self.intensity).all(1) & np.isfinite(self.direction).all(1)
         if self.position is not None:
             finite &= np.isfinite(self.position).all(1)

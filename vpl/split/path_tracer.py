@@ -1,6 +1,7 @@
 """Traced part of the split: the camera paths of Mitsuba's ``path``, minus the light carried by virtual lights.
 
-Let x1 be the first vertex with a minorant F1, x2 the next vertex, and f the BSDFs.  The radiance from x2 to x1 has
+Let x1 be the first vertex with a minorant F1, x2 the next vertex, and f the BSDFs.  The radiance from x2 to x1 has the
+factor
 
     f1 f2 = w F1 F2  +  (f1 f2 - w F1 F2),      w = 1 / (1 + c² cosθ1 cosθ2 / d²).
 
@@ -44,7 +45,7 @@ class Path(Edge):
     """Paths on their current edges.
 
     ``depth``: edges before; ``eta``: as in ``path``; ``scattered``: number of scattering vertices; ``valid``: whether
-    the film's alpha counts the path; ``carried``: β F1 before x2, w β F1 F2 at x2; ``cosine``: cosθ1.
+    the path met a surface counted in the film's alpha; ``carried``: β F1 before x2, w β F1 F2 at x2; ``cosine``: cosθ1.
     """
 
     depth: mi.UInt32
@@ -134,8 +135,8 @@ class Contributions:
 class Traced:
     """Result of :func:`trace_paths`, one record per lane, evaluated.
 
-    ``radiance``; ``drawn``: a contribution over its probability, from a path of ``length`` edges; ``valid``: whether
-    the film's alpha counts the path; ``edges`` without the last; ``gathered``: gather vertices.
+    ``radiance``; ``drawn``: a contribution over its probability, from a path of ``length`` edges; ``valid``: whether a
+    surface counts in the film's alpha; ``edges`` without the last; ``gathered``: gather vertices.
     """
 
     radiance: mi.UnpolarizedSpectrum

@@ -135,6 +135,7 @@ def error_scale(brightness: np.ndarray, model: CostModel) -> np.ndarray:
 
 
 # ---------------------- Means around pixels ----------------------
+#
 # The image is divided into four blocks, each block into four again, down to single pixels. The mean of a block combines
 # the values of the block with the mean of the larger block. The weight of the larger block is a number of values, and
 # grows with the variance of the values.

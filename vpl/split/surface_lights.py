@@ -6,7 +6,7 @@ next-event estimation and a single path from the light.  No path starts at an em
 BSDFs, no correction for shading normals and no emission sampling.  An environment lights a room through the windows as
 in ``path``.
 
-Lines go to cells with radiance in a pilot's paths: lights matter where visible and bright.
+Lines go to cells that sent radiance to a pilot's paths: lights matter where visible and bright.
 """
 
 from __future__ import annotations

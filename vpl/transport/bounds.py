@@ -4,9 +4,9 @@ bound = material × geometry × intensity, with the largest value of each factor
 
 Departure from the papers: the largest cosine between an axis and the vectors to a box is bounded without rotating the
 box.  With c the vector to the box centre and e the half extents of the box, the largest component along a unit axis n
-is exactly z = n·c + |n|·e, and the least distance from the axis is ρ = |c - (n·c) n| - |e|.  Upper bounds of the cosine
-are z / sqrt(z² + ρ²) and z / d with d the distance to the box.  The bound is equally tight for small boxes, at half the
-cost.
+is exactly z = n·c + |n|·e, and a lower bound of the distance from the axis is ρ = |c - (n·c) n| - |e|.  Upper bounds of
+the cosine are z / sqrt(z² + ρ²) and z / d with d the distance to the box.  The bound is equally tight for small boxes,
+at half the cost.
 """
 
 from __future__ import annotations

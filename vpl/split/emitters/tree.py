@@ -58,7 +58,7 @@ class EmitterTree:
         low, high = tree.records[:, BOX_MIN].astype(np.float64), tree.records[:, BOX_MAX].astype(np.float64)
         records = np.zeros((len(tree.records), _RECORD), np.float32)
         records[:, 0:3], variance = moments_below(tree, position, intensity)
-        # Least squared distance of a vertex: emitters extend beyond a single position
+        # Lower bound of the squared distance of a vertex: emitters extend beyond a single position
         records[:, 3] = _LEAST_DISTANCE**2 * variance + largest_below(tree, radius) ** 2
         leaf = tree.escape == np.arange(len(tree.records)) + 1
         records[:, 4] = tree.records[:, INTENSITY]
@@ -187,7 +187,7 @@ class TreeEmitters(CellEmitters):
         self.choice = CellChoice(usual, _ROOT_SHARE, np.array([len(usual) - 1]))
 
     def _located_share(self, intensity: float) -> float:
-        """Fraction of the draws from the root that goes to located emitters, with a total of ``intensity``."""
+        """Fraction of the draws from the root that goes to located emitters, with the total ``intensity``."""
         if not self._distant:
             return 1.0
         # By unoccluded irradiance, with located emitters at half the radius of the scene
