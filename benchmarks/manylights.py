@@ -9,7 +9,7 @@ Each part runs both integrators in turn, each with the better of the samplers ``
 - ``product``: variance between passes × seconds of a pass.  Variance is relative to the squared reference (without
   reference: mean of all passes) plus a hundredth of its squared mean, without the worst 0.1% of the pixels.  The
   product is proportional to the time for a given error.  Bias: excess of the mean over that of ``path``, with its
-  standard error.  Sets: spread of the mean of the image between passes, each of which has its own light set.
+  standard error.  Plain: the ratio of the variances of all pixels.  Sets: spread of the mean of the image between passes, each of which has its own light set.
 - ``denoised``: error of one pass through Open Image Denoise against the reference, without the noise of the reference,
   and the time of ``path`` for equal error.
 - ``timed``: variance × time of ``--passes`` images that ``manylights.render`` ends after ``--seconds``, first passes
@@ -78,7 +78,7 @@ def scale_of(name: str, images: list, width: int, view: int = 0) -> np.ndarray:
 def product(names, width: int, seconds: float, passes: int, views: int) -> dict:
     """Print variance × time and the ratio, from the cameras of the scenes or from ``views`` random cameras of each."""
     print(f"product, {width} wide, {passes} passes of about {seconds:g} s; variance × time, with samples of a pass")
-    print(f"{'scene':18s} {'path':>22s} {'manylights':>22s}   ratio   bias                sets")
+    print(f"{'scene':18s} {'path':>22s} {'manylights':>22s}   ratio   plain   bias                sets")
     numbers = range(1, views + 1) if views else (0,)
     rows = {
         f"{name} {view}" if view else name: product_of(name, width, seconds, passes, view)
@@ -107,6 +107,7 @@ def product_of(name: str, width: int, seconds: float, passes: int, view: int) ->
     best = {kind: min((r for r in rivals if r.kind == kind), key=lambda r: r.product(scale)) for kind in KINDS}
     values = [best[kind].product(scale) for kind in KINDS]
     ratio = values[0] / values[1]
+    plain = best["path"].product(scale, 0) / best["manylights"].product(scale, 0)
     (ours, error), (theirs, their_error) = best["manylights"].mean(), best["path"].mean()
     sets = np.std([image.mean() for image in best["manylights"].images], ddof=1) / ours
     columns = [
@@ -118,11 +119,17 @@ def product_of(name: str, width: int, seconds: float, passes: int, view: int) ->
     label = f"{name} {view}" if view else name
     excess, uncertain = ours / theirs - 1, np.hypot(error / ours, their_error / theirs)
     print(
-        f"{label:18s} {columns[0]:>22s} {columns[1]:>22s} {ratio:7.2f}   {excess:+.2%} ± {uncertain:.2%}"
+        f"{label:18s} {columns[0]:>22s} {columns[1]:>22s} {ratio:7.2f} {plain:7.2f}   {excess:+.2%} ± {uncertain:.2%}"
         f"{sets:12.2%}   {best['manylights'].integrator.statistics.get('plan')}",
         flush=True,
     )
-    more = {"speedup": ratio, "bias": excess, "bias_deviation": uncertain, "set_deviation": sets}
+    more = {
+        "speedup": ratio,
+        "plain_speedup": plain,
+        "bias": excess,
+        "bias_deviation": uncertain,
+        "set_deviation": sets,
+    }
     return row | {quantity: float(value) for quantity, value in more.items()}
 
 

@@ -34,6 +34,7 @@ UNITS = {
     "lights": "number of lights",
     "load_seconds": "s",
     "memory": "GiB at the peak, above the loaded scene where `path` has none",
+    "plain_speedup": "as speedup, by the variances of all pixels",
     "product": "relative variance times s",
     "product_ratio": "product over that of the chosen number of light paths",
     "rate": "shadow rays over matrix entries",

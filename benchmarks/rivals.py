@@ -88,11 +88,11 @@ class Rival:
         self.images.append(image)
         self.seconds.append(seconds)
 
-    def product(self, scale: np.ndarray) -> float:
-        """Variance × seconds of a pass."""
+    def product(self, scale: np.ndarray, trimmed: float = TRIMMED) -> float:
+        """Variance × seconds of a pass, without the fraction ``trimmed`` of the pixels with the largest errors."""
         error = np.var(self.images, axis=0, ddof=1) / scale
         error = np.sort(error.mean(-1).ravel())
-        return error[: int(len(error) * (1 - TRIMMED))].mean() * float(np.median(self.seconds))
+        return error[: int(len(error) * (1 - trimmed))].mean() * float(np.median(self.seconds))
 
     def mean(self) -> tuple[float, float]:
         """Mean of the image over passes, and its standard error."""
