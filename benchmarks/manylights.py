@@ -9,7 +9,8 @@ Each part runs both integrators in turn, each with the better of the samplers ``
 - ``product``: variance between passes × seconds of a pass.  Variance is relative to the squared reference (without
   reference: mean of all passes) plus a hundredth of its squared mean, without the worst 0.1% of the pixels.  The
   product is proportional to the time for a given error.  Bias: excess of the mean over that of ``path``, with its
-  standard error.  Plain: the ratio of the variances of all pixels.  Sets: spread of the mean of the image between passes, each of which has its own light set.
+  standard error.  Plain: the ratio of the variances of all pixels.  Sets: spread of the mean of the image between
+  passes, each of which has its own light set.
 - ``denoised``: error of one pass through Open Image Denoise against the reference, without the noise of the reference,
   and the time of ``path`` for equal error.
 - ``timed``: variance × time of ``--passes`` images that ``manylights.render`` ends after ``--seconds``, first passes

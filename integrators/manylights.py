@@ -77,8 +77,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
 
     - Single pixels may be negative while samples are few, because the traced part is a difference.
     - Caustics: the pilot compares relative variances without the largest 0.1% of the errors.  For a glass ball under a
-      small lamp it chooses virtual lights, which halve the time for that error, while ``path`` needs a quarter of the
-      time of ``manylights`` for an equal plain variance.
+      small lamp it chooses virtual lights, which reduce that variance but leave a larger plain variance than ``path``.
     - Samplers: the sensor's sampler places samples in the pixel, on the lens and in time.  The plugin stratifies the
       choice of emitters and directions.  ``multijitter`` instead of ``independent``, Mitsuba's default, reduces the
       variance by 2% (bistro_interior), 8% (kitchen) or 23% (cornell).
