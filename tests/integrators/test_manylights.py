@@ -338,7 +338,7 @@ def test_few_pixels_and_samples(size, spp, max_depth):
 
 def test_images_of_several_parts_have_the_mean_of_path(monkeypatch):
     """Of 34, 34 and 32 pixels."""
-    monkeypatch.setattr("integrators.manylights._WAVEFRONT", (1000, 1000))
+    monkeypatch.setattr("vpl.split.estimator._WAVEFRONT", (1000, 1000))
     assert_image_of_path(closed_box({"light": area_light()}, 10), max_depth=4)
 
 

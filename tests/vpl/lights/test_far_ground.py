@@ -15,7 +15,7 @@ from vpl.core.sampling import independent_sampler
 from vpl.lights.emission import ParallelRays, bounding_sphere
 from vpl.lights.emitters import read_emitters
 from vpl.lights.focus import Focus, spacing
-from vpl.lights.tracing import PathSettings, trace_lights
+from vpl.lights.tracing import LightPathSettings, trace_lights
 
 LIGHTS = {
     "lamp": lamp_behind_the_camera,
@@ -121,7 +121,7 @@ def test_a_warning_names_how_few_lights_matter(wide, monkeypatch):
         lamp["lamp"] = wall([0, 50, 0], [1, 0, 0], 90, 1e4) | {"emitter": {"type": "area", "radiance": rgb(1.0)}}
     scene = mi.load_dict({"type": "scene", "ground": wall([0, -1, 0], [1, 0, 0], -90, 1e4), **lamp})
     focus = Focus.of(np.random.default_rng(0).uniform(-1, 1, (100, 3)), bounding_sphere(scene))
-    found = trace_lights(scene, read_emitters(scene), 20_000, 0, PathSettings(3, 5, 1.0), focus).lights
+    found = trace_lights(scene, read_emitters(scene), 20_000, 0, LightPathSettings(3, 5, 1.0), focus).lights
     assert bool(logged) == wide
     if wide:
         assert f"of {found.count} virtual lights are effective" in logged[0] and "vpl_count" in logged[0]
