@@ -117,6 +117,12 @@ class GatheringIntegrator(mi.SamplingIntegrator):
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Render as Mitsuba does.  Raises RuntimeError while another thread renders with the same sensor."""
+        if dr.flag(dr.JitFlag.FreezingScope):
+            # Before anything else: an error within Mitsuba's render can abort a process that records
+            raise RuntimeError(
+                f"{type(self).__name__} cannot be recorded by dr.freeze, as it reads results of kernels while it "
+                "renders: call mi.render outside of frozen functions"
+            )
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         _hear_interruptions()
         with exclusive(sensor=sensor, integrator=self):
@@ -137,11 +143,6 @@ class GatheringIntegrator(mi.SamplingIntegrator):
                 if medium is not None:
                     raise ValueError(
                         "the camera is inside a participating medium; many-light integrators support surfaces only"
-                    )
-                if dr.flag(dr.JitFlag.FreezingScope):
-                    raise RuntimeError(
-                        f"{type(self).__name__} cannot be recorded by dr.freeze, as it reads results of kernels while "
-                        "it renders: call mi.render outside of frozen functions"
                     )
                 self.check_scene(scene)
                 share_code(scene)

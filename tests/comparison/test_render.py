@@ -280,6 +280,7 @@ def test_a_participating_medium_is_refused_by_name(name):
 
 
 @pytest.mark.parametrize("name", ["manylights", "lightcuts"])
+@pytest.mark.stress  # Dr.Jit may abort the process when an error ends a recording
 def test_frozen_functions_are_refused_by_name(scene, name):
     plugin = mi.load_dict({"type": name})
 
