@@ -111,18 +111,22 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         """Raise ValueError for a scene with a participating medium."""
         refuse_media(scene)
 
+    def _refuse_recording(self):
+        """Raise RuntimeError while ``dr.freeze`` records."""
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise RuntimeError(
+                f"{type(self).__name__} cannot be recorded by dr.freeze, as it reads results of kernels while it "
+                "renders: call mi.render outside of frozen functions"
+            )
+
     def aov_names(self):
         """Names of the channels that ``sample`` returns in addition to the radiance."""
         return list(self.aovs)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Render as Mitsuba does.  Raises RuntimeError while another thread renders with the same sensor."""
-        if dr.flag(dr.JitFlag.FreezingScope):
-            # Before anything else: an error within Mitsuba's render can abort a process that records
-            raise RuntimeError(
-                f"{type(self).__name__} cannot be recorded by dr.freeze, as it reads results of kernels while it "
-                "renders: call mi.render outside of frozen functions"
-            )
+        # Before anything else: an error within Mitsuba's render can abort a process that records
+        self._refuse_recording()
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         _hear_interruptions()
         with exclusive(sensor=sensor, integrator=self):
@@ -144,6 +148,8 @@ class GatheringIntegrator(mi.SamplingIntegrator):
                     raise ValueError(
                         "the camera is inside a participating medium; many-light integrators support surfaces only"
                     )
+                # Wrappers such as `moment` do not call `render`
+                self._refuse_recording()
                 self.check_scene(scene)
                 share_code(scene)
                 return self._sample(scene, sampler, mi.Ray3f(ray), active)
