@@ -1,14 +1,16 @@
 """Samples per pixel of the next pass of a render: passes take about two seconds.
 
-Passes in parts can be stopped between parts. They are longer if starting a pass is slow: the start takes a quarter of
-the pass, up to about ten seconds, or up to twice the time of the start.
+Passes in parts can be stopped between parts. They grow: a pass takes about as long as all passes before it together, up
+to ten seconds. They are longer than two seconds, too, if starting a pass is slow: the start takes a quarter of the
+pass, up to about ten seconds, or up to twice the time of the start.
 
 Sizes are powers of two, from 4 if the number of pixels allows: Mitsuba compiles a single kernel for these sizes, but
 other kernels for sizes between, and, with some film filters, below 4. Starting a pass in parts takes longer than that,
-so its size may be 2, and the last pass may have any size. The first pass is small, as its cost is unknown. Each later
-pass has the size of the pass before it, or grows by a factor that the measured time allows. The first pass with a
-kernel includes compilation, so its time is an upper bound of the cost: growing by it is safe. Shrinking requires a
-second pass of equal size; so does growth that risks twice the time, for passes that are slow to start.
+so its size may be 2, and the last pass has the size that fills the remaining time. The first pass is small, as its cost
+is unknown. Each later pass has the size of the pass before it, or grows by a factor that the measured time allows. The
+first pass with a kernel includes compilation, so its time is an upper bound of the cost: growing by it is safe.
+Shrinking requires a second pass of equal size; so does growth that risks twice the time, for passes that are slow to
+start.
 """
 
 import math
@@ -38,6 +40,7 @@ class PassSizes:
         self._least = USUAL if USUAL * pixels <= FIRST_SAMPLES else 1
         self._current, self._seconds, self._asked = fixed or self._least, {}, None
         self._known = {}  # size -> seconds of the last pass; not of the first pass, which compiles
+        self._spent = 0.0  # seconds of all passes
         self._before = None  # number of passes from a checkpoint; None until the first call
 
     def next(self, passes, elapsed):
@@ -72,6 +75,7 @@ class PassSizes:
         repeated = self._asked in self._seconds
         # The first pass of a size may have compiled kernels
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
+        self._spent += seconds
         if not compiles:
             before = self._known.get(self._asked, seconds)
             if not 1 / CHANGED < seconds / max(before, 1e-6) < CHANGED:
@@ -101,9 +105,15 @@ class PassSizes:
         return grown
 
     def _in_time(self, size, left):
-        """Return the largest size, up to `size`, of a pass within `left` seconds. If there is none, return the least
+        """Return the size, about `size` samples, of a pass within `left` seconds. If there is none, return the least
         size if `left` is at least half of its time, otherwise 0."""
         least = size if self._fixed else min(size, self._least)
+        line = self._line()
+        if self._in_parts and not self._many and not self._fixed and line:
+            filling = int((left - line[0]) / line[1])
+            # A single last pass, instead of several ever smaller ones
+            if least <= filling <= self._largest and filling < (size if self._spp else 2 * size):
+                return filling
         while size > least and self._expected(size) > left:
             size = max(least, _power_of_two(size - 1))
         return size if self._expected(size) <= 2 * left else 0
@@ -113,11 +123,12 @@ class PassSizes:
         if not self._in_parts:
             return PASS_SECONDS
         line, seconds = self._line(), self._seconds[self._asked]
+        growing = max(min(self._spent, MOST_SECONDS), PASS_SECONDS)
         if line:
-            return max(min(line[0] / START_SHARE, MOST_SECONDS), (1 + LEAST_REST) * line[0], PASS_SECONDS)
+            return max(min(line[0] / START_SHARE, MOST_SECONDS), (1 + LEAST_REST) * line[0], growing)
         # The start may take all the time
         most = MOST_SECONDS if seconds < MOST_SECONDS else (1 + LEAST_REST) * seconds
-        return max(min(seconds / START_SHARE, most), PASS_SECONDS)
+        return max(min(seconds / START_SHARE, most), growing)
 
     def _expected(self, size):
         """Return the expected seconds of a pass: those of an earlier pass of this size, or by `_line`, or, if that is

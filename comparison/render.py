@@ -71,8 +71,8 @@ def render(
     pass_spp: int | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> tuple[mi.TensorXf, Took]:
-    """Render a scene in passes of about two seconds, or ten with `manylights`; return the image, a `mi.TensorXf` of
-    shape (height, width, channels) as of `mi.render`, and the cost (`Took`).
+    """Render a scene in passes; return the image, a `mi.TensorXf` of shape (height, width, channels) as of `mi.render`,
+    and the cost (`Took`). Passes take about two seconds, with `manylights` up to ten.
 
     `scene`: a `mi.Scene`, or the path of a scene file. `integrator`: a `mi.Integrator` or the name of a plugin, by
     default the scene's. `sensor`: an index, or "all" for a list of (image, cost) over all sensors. The first limit that
