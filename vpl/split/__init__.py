@@ -9,7 +9,7 @@
 The formula, in the order to read in:
 
 - :mod:`vpl.transport.carried_share`: the share w of virtual lights
-- ``minorant``: the Lambertian minorant of a BSDF, the diffuse part carried by virtual lights
+- :mod:`vpl.transport.minorant`: the Lambertian minorant of a BSDF
 - ``path_tracer``: the paths of Mitsuba's ``path``, minus the part carried by virtual lights
 - ``estimator``: the steps from the pilot to the image
 

@@ -30,6 +30,13 @@ class CostModel:
 
     # ---------------------- Pilot ----------------------
     pilot_rays: int = _constant(1 << 15, "camera rays", "Largest size of a pilot.", _SENSITIVITY)
+    pilot_share: float = _constant(
+        1 / 16,
+        "1 / camera ray",
+        "Largest size of a pilot for a camera ray: a pilot is traced up to four times.",
+        "benchmarks/manylights.py --parts cost",
+        most=1,
+    )
     learned_cost: float = _constant(
         1.15,
         "paths",

@@ -242,7 +242,7 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
 def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Callable[[], bool], clock: Clock):
     """(Radiance, valid, statistics) of the camera rays, traced in parts of whole pixels of about the same size."""
     settings = view.settings(lights)
-    expected = decision.expected_light(lights) if lights.all else None
+    gatherer = Gatherer.of(view, lights, decision) if lights.all else None
     radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
     parts = max(round(view.count / np.clip(view.count / 2, *_WAVEFRONT)), 1)
     most = -(-view.pixels // parts) * view.samples
@@ -257,8 +257,7 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
         # Frees the memory of unlit gather vertices
         del traced
         if points is not None:
-            of_pixels = expected[first // view.samples :][: -(-len(lane) // view.samples)]
-            light, counts = _gathered_part(view, lights, decision.plan, points, part, of_pixels, first, clock)
+            light, counts = gatherer.light(points, part, first, clock)
             part += light
             for name, number in counts.items():
                 statistics[name] = statistics.get(name, 0) + number
@@ -290,29 +289,48 @@ def _traced_part(
     return traced, LitVertices.of(gathered.first, gathered.later, view.samples, plan.vertices, seed)
 
 
-def _gathered_part(view: View, lights: ViewLights, plan: Plan, points: LitVertices, found, expected, first, clock):
-    """(Light of virtual lights at the ``points`` of some pixels, per camera ray; counters).
+@dataclass(frozen=True)
+class Gatherer:
+    """Virtual lights at gather vertices, with an error of cuts relative to the brightness of each pixel.
 
-    The error of cuts is relative to the brightness of a pixel: the radiance ``found`` by paths, plus the ``expected``
-    light of virtual lights.
+    ``transports``: one for each set of lights; ``expected``: expected radiance of the lights in each pixel, (pixels,);
+    ``darkest``: least brightness that errors are relative to.
     """
-    samples, count = view.samples, dr.width(found)
-    lit = dr.zeros(mi.UnpolarizedSpectrum, count)
-    dr.eval(lit)
-    if points.count == 0:
-        return lit, {}
-    clusters = PixelClusters(points, samples)
-    clock.begin(Stage.CUTS)
-    traced = np.nan_to_num(download(channel_mean(found)), posinf=0, neginf=0)
-    level = np.maximum(traced, 0).reshape(-1, samples).mean(1) + expected
-    level = np.maximum(level, view.model.dark_pixel * level.mean())
-    # Of the sum over the samples of a pixel
-    allowed = plan.error * samples * level[clusters.pixel]
-    shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, first)
-    traits = replace(_OPAQUE, nearest_hits=has_large_curves(view.scene))
-    for number, carrying in enumerate(lights.all):
-        transport, stream = Transport(view.scene, traits, carrying), derived_seed(seed, 1, number)
-        shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit)
-    clock.stop()
-    counts = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}
-    return lit, counts | {"later": points.alone}
+
+    view: View
+    plan: Plan
+    transports: list[Transport]
+    expected: np.ndarray
+    darkest: float
+
+    @classmethod
+    def of(cls, view: View, lights: ViewLights, decision: Decision) -> Gatherer:
+        """For the lights of a plan."""
+        traits = replace(_OPAQUE, nearest_hits=has_large_curves(view.scene))
+        transports = [Transport(view.scene, traits, carrying) for carrying in lights.all]
+        darkest = view.model.dark_pixel * max(float(np.mean(decision.pilot.radiance)), 0.0)
+        return cls(view, decision.plan, transports, decision.expected_light(lights), darkest)
+
+    def light(self, points: LitVertices, found, first: int, clock: Clock) -> tuple[mi.UnpolarizedSpectrum, dict]:
+        """(Light at the ``points``, per camera ray; counters) for a part of the image, from the ray ``first`` on.
+
+        The brightness of a pixel is the radiance ``found`` by paths plus the expected light of virtual lights.
+        """
+        view, samples, count = self.view, self.view.samples, dr.width(found)
+        lit = dr.zeros(mi.UnpolarizedSpectrum, count)
+        dr.eval(lit)
+        if points.count == 0:
+            return lit, {}
+        clusters = PixelClusters(points, samples)
+        clock.begin(Stage.CUTS)
+        traced = np.nan_to_num(download(channel_mean(found)), posinf=0, neginf=0).reshape(-1, samples).mean(1)
+        brightness = np.maximum(traced, 0) + self.expected[first // samples :][: len(traced)]
+        # Of the sum over the samples of a pixel
+        allowed = self.plan.error * samples * np.maximum(brightness, self.darkest)[clusters.pixel]
+        shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, first)
+        for number, transport in enumerate(self.transports):
+            stream = derived_seed(seed, 1, number)
+            shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit)
+        clock.stop()
+        counts = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}
+        return lit, counts | {"later": points.alone}

@@ -30,10 +30,10 @@ from ..core.loops import recorded_once
 from ..core.sampling import derived_seed, independent_sampler
 from ..direct.emitter_sampling import power_heuristic
 from ..transport.carried_share import carried_share
+from ..transport.minorant import agrees, is_diffuse, minorant_of, side_of
 from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
 from .gather_vertices import Gathered, GatherVertices, SecondVertices
 from .lattice import Lattice
-from .minorant import agrees, minorant_of, side_of
 from .roulette import residual_survival, throughput_survival
 from .view import Edge, FirstEdge, Gathering, PathSettings, State, View
 
@@ -67,9 +67,9 @@ class Path(Edge):
 class Hit:
     """Surfaces that paths hit.
 
-    ``si``; ``bsdf`` with its ``flags``; ``side``, ``minorant``: see :mod:`vpl.split.minorant`; ``hidden``: whether the
-    surface is an emitter hidden from the camera; ``goes_on``: whether the path may continue; ``smooth``: whether the
-    path continues at a BSDF with a density.
+    ``si``; ``bsdf`` with its ``flags``; ``side``, ``minorant``: see :mod:`vpl.transport.minorant`; ``hidden``: whether
+    the surface is an emitter hidden from the camera; ``goes_on``: whether the path may continue; ``smooth``: whether
+    the path continues at a BSDF with a density.
     """
 
     si: mi.SurfaceInteraction3f
@@ -98,9 +98,8 @@ class Hit:
 
     @property
     def is_diffuse(self) -> mi.Bool:
-        """Whether the BSDF has only a diffuse lobe: the minorant then describes every direction."""
-        other_lobes = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.DiffuseReflection)
-        return (self.flags & other_lobes) == 0
+        """Whether the BSDF has only a diffuse lobe."""
+        return is_diffuse(self.flags)
 
 
 @dataclass

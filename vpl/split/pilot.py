@@ -64,10 +64,11 @@ class Pilot:
     @classmethod
     def trace(cls, view: View, lights: ViewLights) -> Pilot:
         """Trace pairs of paths over the whole image, always the same paths, without the light carried by ``lights``."""
-        lane = view.pairs(view.model.pilot_rays)
+        model = view.model
+        lane = view.pairs(min(model.pilot_rays, int(model.pilot_share * view.learning_count)))
         settings = view.settings(lights, Gathering.AT_FIRST)
         traced = trace_camera_rays(view, upload(mi.UInt32, lane), settings, Stream.PILOT)
-        return cls.of(traced, lane // view.samples, (view.width, view.pixels), view.model)
+        return cls.of(traced, lane // view.samples, (view.width, view.pixels), model)
 
     @classmethod
     def of(cls, traced: Traced, pixel: np.ndarray, size: tuple[int, int], model: CostModel) -> Pilot:

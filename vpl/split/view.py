@@ -187,8 +187,8 @@ class View:
         return -(-self.count // self.samples)
 
     def pairs(self, most: int) -> np.ndarray:
-        """Indices of at most ``most`` rays in pairs of neighbours, evenly over the image."""
-        pairs = max(min(most, self.count // 4) // 2, 1)
+        """Indices of at most ``most`` rays in pairs of neighbours, evenly over the image; at least one pair."""
+        pairs = max(min(most, self.count) // 2, 1)
         first = np.arange(pairs) * self.count // pairs // 2 * 2
         return np.minimum(first[:, None] + [0, 1], self.count - 1).reshape(-1)
 

@@ -22,12 +22,12 @@ from vpl.points.surfaces import LambertianSurface
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
 from vpl.split.lattice import Lattice, lattice_multiplier
 from vpl.split.line_sampling import ArrivalOctree
-from vpl.split.minorant import agrees, minorant_of, side_of
 from vpl.split.pixel_clusters import PixelClusters, Receivers
 from vpl.split.view import View
 from vpl.transport.bounds import contribution_bound
 from vpl.transport.carried_share import carried_geometry_term, carried_share
 from vpl.transport.contribution import contribution
+from vpl.transport.minorant import agrees, minorant_of, side_of
 
 
 def points(columns):

@@ -34,13 +34,20 @@ def agrees(si: mi.SurfaceInteraction3f, side: mi.Float) -> mi.Bool:
     return si.wi.z * side > 0
 
 
+def is_diffuse(flags: mi.UInt32) -> mi.Bool:
+    """Whether a BSDF with these flags has only a diffuse lobe: the minorant then describes every direction."""
+    other_lobes = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.DiffuseReflection)
+    return (flags & other_lobes) == 0
+
+
 @dr.syntax
 def minorant_of(
     si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, side: mi.Float, perturbed: Perturbed, active: mi.Bool
 ) -> mi.UnpolarizedSpectrum:
     """Minorant F of a BSDF (1 / sr): the least value over three fixed pairs of directions on one side.
 
-    ``side``: see :func:`side_of`.  F is 0
+    A BSDF with only a diffuse lobe has the same value in all directions, and is evaluated for a single pair.  ``side``:
+    see :func:`side_of`.  F is 0
 
     - where a lane is not ``active``;
     - on ``perturbed`` shapes: no BSDF sample goes above the surface but below the perturbed normal, so a virtual light
@@ -48,10 +55,11 @@ def minorant_of(
     - for a BSDF without a diffuse lobe: BSDF samples rarely go to directions with a value as low as the minorant, and
       would subtract the minorant as fireflies.
     """
-    active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & ~perturbed.at(si, active)
+    flags = bsdf.flags()
+    active &= mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection) & ~perturbed.at(si, active)
     context, turned = mi.BSDFContext(), mi.SurfaceInteraction3f(si)
     # Inactive lanes skip the loop
-    pair = dr.select(active, mi.UInt32(0), _PAIRS)
+    pair = dr.select(active, dr.select(is_diffuse(flags), mi.UInt32(_PAIRS - 1), 0), _PAIRS)
     least = dr.full(mi.UnpolarizedSpectrum, dr.inf, dr.width(active))
     # A loop in the kernel holds the code of every material once instead of three times
     while dr.hint(pair < _PAIRS, exclude=[si, context, perturbed, turned]):
