@@ -66,6 +66,8 @@ def ratios_of(name: str, constants: list[str], options) -> dict:
     The key "default" repeats the defaults: its ratio shows the spread of the times.
     """
     scene, default, found = scenes.load(name, options.width), CostModel(), {}
+    # The first renders of a process are slower: memory is new
+    Measured(scene, default, options.spp, 1)
     usual = Measured(scene, default, options.spp, options.passes)
     mean = np.mean(usual.images, axis=0)
     scale = mean**2 + default.black * mean.mean() ** 2

@@ -15,6 +15,8 @@ Each part runs both integrators in turn, each with the better of the samplers ``
   and the time of ``path`` for equal error.
 - ``timed``: variance × time of ``--passes`` images that ``manylights.render`` ends after ``--seconds``, first passes
   included, with the sampler ``independent``.
+- ``cost``: CPU seconds of a sample over those of ``path``, see :mod:`benchmarks.sample_cost`; alone and without
+  ``--scenes``, also in scenes where virtual lights gain little.
 - ``lights``: variance × time of ``manylights`` with fewer and more light paths than it chooses.
 - ``cold``: seconds and peak memory of the first render of a process, 16 samples per pixel, with an empty kernel cache.
 """
@@ -36,12 +38,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
-from benchmarks import results, scenes  # noqa: E402
+from benchmarks import results, sample_cost, scenes  # noqa: E402
 from benchmarks.rivals import DEPTH, KINDS, SAMPLERS, TRIMMED, Rival, Timed, load, measure_in_turn  # noqa: E402
 from benchmarks.views import move_cameras  # noqa: E402
 
 NAMES = (*scenes.NAMES, "classroom", "hall")
-PARTS = ("product", "timed", "denoised", "lights", "cold")
+# Scenes where virtual lights gain little: leaves, equal emitters, gloss, masks, no noise
+HARD = ("foliage", "lamp_grid", "glossy", "veils", "furnace")
+PARTS = ("product", "timed", "denoised", "cost", "lights", "cold")
 # Light paths, as multiples of the chosen number
 SWEEP = (1 / 4, 1 / 2, 1, 2, 4)
 COLD_SPP = 16
@@ -244,7 +248,7 @@ def main() -> None:
     """Run the parts that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS)
-    parser.add_argument("--scenes", nargs="+", default=list(NAMES), metavar="NAME")
+    parser.add_argument("--scenes", nargs="+", metavar="NAME")
     parser.add_argument("--width", type=int, default=256, metavar="PIXELS")
     parser.add_argument("--seconds", type=float, default=2.5, help="of one pass, or image, about (default: 2.5)")
     parser.add_argument("--passes", type=int, default=6, help="of each (default: 6)")
@@ -254,12 +258,14 @@ def main() -> None:
     results.check_json_option(parser, options)
     if options.views < 0:
         parser.error(f"--views is {options.views}: allowed are 0 and above")
-    names = scenes.available(options.scenes)
+    usual = (*NAMES, *HARD) if options.parts == ["cost"] else NAMES
+    names = scenes.available(options.scenes or usual)
     width, seconds, passes = options.width, options.seconds, options.passes
     parts = {
         "product": lambda: product(names, width, seconds, passes, options.views),
         "timed": lambda: timed(names, width, seconds, passes),
         "denoised": lambda: denoised(names, 256, seconds, passes),
+        "cost": lambda: sample_cost.cost(names, width, passes),
         "lights": lambda: lights(names, width, seconds, passes),
         "cold": lambda: cold(names, width),
     }

@@ -24,11 +24,14 @@ UNITS = {
     "bounds": "upper bounds computed per pixel",
     "columns": "columns of the light matrix per slice",
     "cost": "sum of cluster sizes, relative to the root of the tree",
+    "cost_ratio": "CPU seconds over those of `path`",
     "cpu_seconds": "s of processor time, all threads",
     "cut": "clusters or pairs per pixel",
     "depth": "levels of the tree",
+    "edges": "mean number of edges of a path",
     "error": "property `error`",
     "fewer_rays": "shadow rays of the other method over those of this one, at equal error",
+    "gathered_seconds": "s for clusters and cuts",
     "hidden": "whether the noise of the reference exceeds the error",
     "light_paths": "light paths of a render",
     "lights": "number of lights",
@@ -50,6 +53,8 @@ UNITS = {
     "shared_seconds": "s for lights, trees and gather points",
     "slowdown": "seconds over those with one sample per pixel",
     "speedup": "time of the other method over that of this one, at equal error",
+    "start_seconds": "s for pilot, lights and trees",
+    "traced_seconds": "s for the traced part",
     "tree_seconds": "s",
 }
 

@@ -18,7 +18,8 @@ NAMES = (
 # Heights at a width of 256, from the aspect ratios of the references
 _HEIGHTS = {
     "cornell": 256, "glossy": 256, "everything8003": 256, "bistro_interior": 192, "kitchen_lamps": 192,
-    "kitchen_windows": 192, "forest_lights": 192, "concourse": 192, "veils": 192,
+    "kitchen_windows": 192, "forest_lights": 192, "concourse": 192, "veils": 192, "foliage": 192,
+    "lamp_grid": 192,
 }  # fmt: skip
 
 
