@@ -92,6 +92,11 @@ def scaled(model: CostModel, name: str, factor: float):
     return max(round(value), 1) if isinstance(getattr(model, name), int) else min(value, most)
 
 
+def row_of(pair: list) -> dict:
+    """Row of a result file, of the ratios with half and double the value; 1 where the images are the same."""
+    return {name: {"product_ratio": ratio or 1.0} for name, ratio in zip(("half", "double"), pair, strict=True)}
+
+
 def main() -> None:
     """Measure the constants that are asked for."""
     names = [one.name for one in fields(CostModel) if one.name not in FIXED]
@@ -114,9 +119,7 @@ def main() -> None:
         pairs = [of_scene[constant] for of_scene in found.values()]
         means = [scenes.geometric_mean([pair[k] or 1.0 for pair in pairs]) for k in range(len(FACTORS))]
         print(f"{constant:24s}" + "".join(f"{mean:8.2f}" for mean in means))
-        rows[constant] = {
-            f"times {factor:g}": {"product_ratio": mean} for factor, mean in zip(FACTORS, means, strict=True)
-        }
+        rows[constant] = row_of(means) | {name: row_of(of_scene[constant]) for name, of_scene in found.items()}
     if options.json:
         settings = {"width": options.width, "samples": options.spp, "passes": options.passes, "scenes": list(found)}
         results.write_results(options.json, "cost_model", settings, rows)

@@ -17,6 +17,7 @@ Each part runs both integrators in turn, each with the better of the samplers ``
   included, with the sampler ``independent``.
 - ``cost``: CPU seconds of a sample over those of ``path``, see :mod:`benchmarks.sample_cost`; alone and without
   ``--scenes``, also in scenes where virtual lights gain little.
+- ``classes``: shares of classes of light in the variance, see :mod:`benchmarks.noise_classes`.
 - ``lights``: variance × time of ``manylights`` with fewer and more light paths than it chooses.
 - ``cold``: seconds and peak memory of the first render of a process, 16 samples per pixel, with an empty kernel cache.
 """
@@ -38,14 +39,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
-from benchmarks import results, sample_cost, scenes  # noqa: E402
+from benchmarks import noise_classes, results, sample_cost, scenes  # noqa: E402
 from benchmarks.rivals import DEPTH, KINDS, SAMPLERS, TRIMMED, Rival, Timed, load, measure_in_turn  # noqa: E402
 from benchmarks.views import move_cameras  # noqa: E402
 
 NAMES = (*scenes.NAMES, "classroom", "hall")
 # Scenes where virtual lights gain little: leaves, equal emitters, gloss, masks, no noise
 HARD = ("foliage", "lamp_grid", "glossy", "veils", "furnace")
-PARTS = ("product", "timed", "denoised", "cost", "lights", "cold")
+PARTS = ("product", "timed", "denoised", "cost", "classes", "lights", "cold")
 # Light paths, as multiples of the chosen number
 SWEEP = (1 / 4, 1 / 2, 1, 2, 4)
 COLD_SPP = 16
@@ -266,6 +267,7 @@ def main() -> None:
         "timed": lambda: timed(names, width, seconds, passes),
         "denoised": lambda: denoised(names, 256, seconds, passes),
         "cost": lambda: sample_cost.cost(names, width, passes),
+        "classes": lambda: noise_classes.classes(names, width, passes),
         "lights": lambda: lights(names, width, seconds, passes),
         "cold": lambda: cold(names, width),
     }

@@ -34,12 +34,13 @@ UNITS = {
     "gathered_seconds": "s for clusters and cuts",
     "hidden": "whether the noise of the reference exceeds the error",
     "light_paths": "light paths of a render",
+    "light_share": "fraction of the mean of the image",
     "lights": "number of lights",
     "load_seconds": "s",
     "memory": "GiB at the peak, above the loaded scene where `path` has none",
     "plain_speedup": "as speedup, by the variances of all pixels",
     "product": "relative variance times s",
-    "product_ratio": "product over that of the chosen number of light paths",
+    "product_ratio": "product over that with the chosen value",
     "rate": "shadow rays over matrix entries",
     "rays": "shadow rays per pixel",
     "rays_per_second": "million shadow rays per s",
@@ -56,6 +57,8 @@ UNITS = {
     "start_seconds": "s for pilot, lights and trees",
     "traced_seconds": "s for the traced part",
     "tree_seconds": "s",
+    "variance": "relative variance of a pixel",
+    "variance_share": "fraction of the sum over classes",
 }
 
 

@@ -110,6 +110,21 @@ TABLES = {
             *(Column(f"× {factor}", f"{{times {factor}[product_ratio]:.2f}}") for factor in ("1/4", "1/2", "2", "4")),
         ),
     ),
+    "cost_model": Table(
+        {"": ("cost_model",)},
+        (
+            Column("× 1/2", "{half[product_ratio]:.2f}"),
+            Column("× 2", "{double[product_ratio]:.2f}"),
+            *(
+                Column(
+                    f"{scene} × 1/2, × 2",
+                    f"{{{scene}[half][product_ratio]:.2f}}, {{{scene}[double][product_ratio]:.2f}}",
+                )
+                for scene in ("kitchen", "veach_ajar", "everything8003")
+            ),
+        ),
+        first="constant",
+    ),
     "cold": Table(
         {"": ("manylights_cold",), "large": ("manylights_memory",)},
         (

@@ -8,6 +8,7 @@ import mitsuba as mi
 import pytest
 
 from tests.support.comparisons import SWEEP
+from tests.support.processes import wait_until
 from tests.support.rendering import plugin_with_model
 
 VARIANT = "llvm_ad_rgb"
@@ -57,11 +58,20 @@ def restore_variant():
 
 @pytest.fixture(scope="session")
 def swept(tmp_path_factory, variant):
-    """The output folder of compare.py for `SWEEP`."""
+    """The output folder of compare.py for `SWEEP`, made by the first process of the run that needs it."""
     import compare
 
-    out = tmp_path_factory.mktemp("sweep")
-    assert compare.main([*SWEEP, "-o", str(out), "--cache", str(out / "cache")]) == 0
+    base = tmp_path_factory.getbasetemp()
+    out = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "sweep"
+    try:
+        out.mkdir()
+    except FileExistsError:
+        wait_until((out / "finished").exists)
+        return out
+    try:
+        assert compare.main([*SWEEP, "-o", str(out), "--cache", str(out / "cache")]) == 0
+    finally:
+        (out / "finished").touch()
     return out
 
 

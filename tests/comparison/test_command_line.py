@@ -14,6 +14,7 @@ import pytest
 
 import manylights
 from comparison import command_line, images, one_image
+from tests.support.marks import stress
 from tests.support.paths import ROOT
 from tests.support.processes import PATIENCE
 
@@ -159,7 +160,7 @@ def test_a_medium_is_refused_before_the_first_pass(tmp_path, capfd):
     assert said.err.startswith("manylights: shape 0") and "bounds a participating medium" in said.err and not said.out
 
 
-@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral"])
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", *stress("scalar_rgb")])
 def test_a_variant_without_manylights_is_refused_and_may_render_the_scenes_integrator(tmp_path, variant):
     arguments = scene_with(tmp_path, '<integrator type="path"/>'), "-o", tmp_path / "a.exr", "--spp", 1, "-m", variant
     with process(*arguments) as refused:

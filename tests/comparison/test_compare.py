@@ -238,6 +238,7 @@ def test_comparison_reports_results_and_failures(tmp_path, capsys):
     assert bad["error"] in html.unescape(page)
 
 
+@pytest.mark.stress
 def test_reference_by_vpl_shares_the_lights(tmp_path, capsys):
     status = compare.main([
         CORNELL, "-i", "path,all=vpl,cuts=lightcuts", "-p", "all.vpl_count=300", "-p", "cuts.vpl_count=300",
@@ -256,7 +257,7 @@ def test_reference_by_vpl_shares_the_lights(tmp_path, capsys):
 def test_comparison_is_of_path_and_manylights_unless_others_are_named(tmp_path, capsys):
     """The report states the choice; the samples suffice for virtual lights to pay."""
     status = compare.main([
-        CORNELL, "--spp", "64", "--width", "192", "--reference", "path:128", "--cache", str(tmp_path / "cache"), "-o",
+        CORNELL, "--spp", "64", "--width", "128", "--reference", "path:128", "--cache", str(tmp_path / "cache"), "-o",
         str(tmp_path),
     ])  # fmt: skip
     assert status == 0, capsys.readouterr().out

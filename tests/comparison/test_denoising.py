@@ -13,6 +13,7 @@ import manylights
 from comparison import images
 from comparison.denoising import Denoiser, auxiliary_features
 from tests.support.comparisons import results_of
+from tests.support.marks import stress
 from tests.support.paths import CORNELL
 from tests.support.rendering import render
 from tests.support.scenes import cornell, sensor, wall
@@ -107,7 +108,7 @@ def exact(variant):
     return render(cornell(64).load(), "path", 1024, 99, max_depth=6)
 
 
-@pytest.mark.parametrize("integrator", ["path", "lightcuts", "manylights"])
+@pytest.mark.parametrize("integrator", ["path", "manylights", *stress("lightcuts")])
 def test_denoised_image_is_closer_to_the_reference(exact, integrator):
     scene = cornell(64).load()
     image, took = manylights.render(scene, mi.load_dict({"type": integrator, "max_depth": 6}), spp=16, denoise=True)

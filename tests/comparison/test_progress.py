@@ -14,10 +14,12 @@ from comparison.ending import Ending
 from comparison.progress import ImageBar
 from comparison.render import Took
 from integrators import PLUGINS
+from tests.support.marks import stress
 from tests.support.scenes import cornell
 from vpl.core.stages import Stage, listening, tell
 
 SMALL = {"vpl_count": 500, "max_depth": 3}
+QUICK = ("manylights", "lightcuts", "lightslice", "illuminationcut", "adaptivedirect")
 
 
 @pytest.fixture
@@ -34,7 +36,7 @@ def plugin(name):
 
 
 @pytest.mark.usefixtures("lights_cost_nothing")
-@pytest.mark.parametrize("name", PLUGINS)
+@pytest.mark.parametrize("name", [*QUICK, *stress(*(name for name in PLUGINS if name not in QUICK))])
 def test_every_stage_that_takes_time_is_told_as_it_begins(scene, name):
     told = []
     _, took = manylights.render(

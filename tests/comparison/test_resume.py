@@ -96,6 +96,7 @@ def test_killed_comparison_goes_on_where_it_stopped(tmp_path, monkeypatch):
     assert len(made) == 4  # the previous run overwrote these images
 
 
+@pytest.mark.stress
 def test_two_comparisons_do_not_share_a_folder(tmp_path, capsys):
     process = start(tmp_path)
     try:
@@ -118,7 +119,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 
 @pytest.mark.parametrize(
     ("limit", "printed", "unwritten"),
-    [(100, r"^path: FAILED: .*cornell\.path\.", "results.json"), (12_000, r"^path +1 ", "report.html")],
+    [(100, r"^path: FAILED: .*cornell\.path\.", "results.json"), *stress((12_000, r"^path +1 ", "report.html"))],
 )
 def test_a_full_disk_is_reported_with_the_name_of_the_file_and_the_comparison_goes_on(
     tmp_path, limit, printed, unwritten
@@ -148,7 +149,7 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("metadata", HOSTILE)
+@pytest.mark.parametrize("metadata", ["markup", *stress("not finite", "large")])
 def test_hostile_metadata_of_a_reference_does_not_spoil_the_report(tmp_path, metadata):
     reference, out = tmp_path / "reference.exr", tmp_path / "out"
     images.write_exr(reference, np.ones((16, 16, 3)), ["R", "G", "B"], HOSTILE[metadata])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from integrators.knobs import knobs_of
+from tests.support.marks import stress
 from tests.support.paths import ROOT
 from tests.support.processes import PATIENCE
 
@@ -43,7 +44,7 @@ def test_the_first_image(tmp_path):
     assert np.array(mi.Bitmap(str(tmp_path / "hall.png"))).mean() > 20
 
 
-@pytest.mark.parametrize("name", ["cornell", "hall"])
+@pytest.mark.parametrize("name", ["cornell", *stress("hall")])
 def test_the_mean_is_that_of_all_lights(code, name):
     scene = mi.load_file(str(ROOT / "scenes" / f"{name}.xml"), resx="32", resy="24")
     found, expected = rendered(scene, "randomlights", samples=32), rendered(scene, "vpl")

@@ -13,7 +13,7 @@ from tests.support.processes import PATIENCE
 FOLDER = Path(__file__).resolve().parents[2] / "notebooks"
 FILES = sorted(FOLDER.glob("*.ipynb"))
 notebooks = pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-QUICK = ("first_render", "compare_methods")
+QUICK = ("first_render",)
 
 
 @notebooks

@@ -166,6 +166,7 @@ def draw(scene: mi.Scene) -> None:
 """
 
 
+@pytest.mark.stress
 def test_types_of_the_public_module_reach_the_user(environment, tmp_path):
     (tmp_path / "typed.py").write_text(TYPED)
     command = [sys.executable, "-m", "mypy", "--strict", "--python-executable", environment / "bin/python", "typed.py"]

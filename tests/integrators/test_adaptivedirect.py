@@ -188,7 +188,7 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["clusters", "unoccluded", *stress("all")])
 def test_expectation_equals_direct(mixed, reference, method):
     plugin, more = METHODS[method]
     # A cut at every point takes seconds
@@ -196,6 +196,7 @@ def test_expectation_equals_direct(mixed, reference, method):
     assert_mean_of_reference(mixed, reference, spp, seeds, finds, plugin, **more)
 
 
+@pytest.mark.stress
 def test_bsdf_samples_do_not_change_the_expectation_but_the_noise(mixed, reference):
     for share in (0.0, 1.0):
         assert_mean_of_reference(mixed, reference, 2, finds=0.03, lights="clusters", bsdf_share=share)
@@ -205,6 +206,7 @@ def test_bsdf_samples_do_not_change_the_expectation_but_the_noise(mixed, referen
     assert not np.allclose(without, many, rtol=1e-3)
 
 
+@pytest.mark.stress
 def test_smaller_error_gives_less_noise_for_more_rays(mixed):
     found = []
     for error in (0.2, 0.02):
@@ -224,6 +226,7 @@ class UniformPasses(PrintedPasses):
         self.estimates.most_samples = PrintedEstimates.most_samples
 
 
+@pytest.mark.stress
 def test_probabilities_learnt_from_samples_alone_leave_the_expectation(mixed, reference, monkeypatch):
     monkeypatch.setattr(adaptive, "SitePasses", UniformPasses)
     assert_mean_of_reference(mixed, reference, lights="clusters")
@@ -333,6 +336,7 @@ def test_same_seed_same_image_and_other_seed_other_image(mixed, plugin):
     assert not np.allclose(first, other, rtol=1e-2)
 
 
+@pytest.mark.stress
 def test_order_of_emitters_does_not_matter(reference):
     scene = mi.load_dict(mixed_scene(dict(reversed(mixed_emitters().items()))))
     assert_mean_of_reference(scene, reference, lights="clusters")
@@ -341,6 +345,7 @@ def test_order_of_emitters_does_not_matter(reference):
 # ---- What is known besides the image
 
 
+@pytest.mark.stress
 def test_aovs_have_their_names_and_ranges(mixed):
     for plugin, more in METHODS.values():
         integrator = mi.load_dict({"type": plugin, "aovs": ",".join(AOVS), "error": 0.1, **more})
@@ -365,7 +370,7 @@ def test_aovs_come_in_the_order_that_is_asked_for(mixed):
     assert np.allclose(some[..., 3:], rest[..., [6, 3]], rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("method", ["clusters", "unoccluded"])
+@pytest.mark.parametrize("method", ["clusters", *stress("unoccluded")])
 def test_noise_is_calibrated(mixed, method):
     plugin, more = METHODS[method]
     integrator = mi.load_dict({"type": plugin, "aovs": "noise", "error": 0.1, **more})
@@ -380,7 +385,7 @@ def test_noise_is_calibrated(mixed, method):
     assert actual < 0.2
 
 
-@pytest.mark.parametrize(("plugin", "more"), [METHODS["clusters"], METHODS["unoccluded"]], ids=PLUGINS)
+@pytest.mark.parametrize(("plugin", "more"), [METHODS["clusters"], *stress(METHODS["unoccluded"])], ids=PLUGINS)
 def test_max_samples_holds_and_matters(mixed, plugin, more):
     most = 200
 
@@ -424,7 +429,7 @@ def test_time_is_a_limit(mixed):
 # ---- Films and wrappers
 
 
-@pytest.mark.parametrize("plugin", PLUGINS)
+@pytest.mark.parametrize("plugin", ["adaptivedirect", *stress("unoccludeddirect")])
 @pytest.mark.parametrize(("number", "shape"), [(1, (11, 21, 3)), (2, (13, 19, 3))], ids=["crop", "border"])
 def test_films(mixed, plugin, number, shape):
     ours, path = (view(mixed, mi.load_dict({"type": name, **more}), number, spp) for name, more, spp in (
@@ -483,6 +488,7 @@ def test_mirrors_show_direct_light_of_what_they_reflect(plugin):
     assert compare(scene, 2, 2).max() > 0.5
 
 
+@pytest.mark.stress
 def test_emitter_in_glass_is_found_by_bsdf_samples(variant):
     # The emitter lies within the glass: its light reaches the floor by refraction alone, and light from the floor
     # returns to it by way of the glass only after the fourth edge
@@ -524,6 +530,7 @@ def test_virtual_lights_take_adaptive_direct_light(variant):
     assert_same_mean(pair, 12)
 
 
+@pytest.mark.stress
 @pytest.mark.usefixtures("restore_variant")
 def test_mono_variant_renders_the_same_luminance():
     mi.set_variant("llvm_ad_mono")

@@ -12,7 +12,7 @@ from tests.support.rendering import render
 from tests.support.scenes import area_light, closed_box, image, rgb, wall
 
 BAD = {"nan": math.nan, "inf": math.inf, "negative": -1.0, "huge": 3e38, "big": 1e29, "tiny": 1e-38, "denormal": 1e-42}
-QUICK = ("nan", "huge", "negative")
+QUICK = ("nan", "negative")
 
 
 def texture(value):

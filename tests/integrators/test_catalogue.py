@@ -28,8 +28,8 @@ from tests.support.scenes import rgb, wall
 from tests.support.statistics import assert_same_mean
 
 # A few materials that nothing else tests by every plugin, and emitters that compile quickly, for the short run
-QUICK_SENSORS = ("thinlens", "distant", "batch")
-QUICK_FILMS = ("luminance float32", "rgba float16", "xyza uint32", "crop", "border")
+QUICK_SENSORS = ("thinlens",)
+QUICK_FILMS = ("rgba float16", "crop")
 QUICK_EMITTERS = ("point", "rectangle", "sphere", "envmap", "spot", "directional")
 
 
@@ -62,7 +62,7 @@ def reference(scene, spp=512, seeds=4, **more):
     return [render(scene, "prb", spp, 100 + seed, max_depth=2, **more) for seed in range(seeds)]
 
 
-@pytest.mark.parametrize(("number", "material"), list(enumerate(list(MATERIALS)[::2])))
+@pytest.mark.parametrize(("number", "material"), list(enumerate(list(MATERIALS)[::4])))
 def test_some_materials_with_some_plugin(number, material):
     names, emitters = list(PLUGINS), list(QUICK_EMITTERS)
     emitter = EMITTERS[emitters[number % len(emitters)]]()

@@ -6,6 +6,7 @@ import pytest
 from scipy import stats
 
 from tests.support.catalogue import PLUGINS, plugin
+from tests.support.marks import stress
 from tests.support.rendering import render
 from tests.support.scenes import closed_box, rgb, sensor, wall
 
@@ -52,7 +53,7 @@ def facing_down(kind, height, radius, radiance):
 
 
 @pytest.mark.parametrize("name", all_plugins())
-@pytest.mark.parametrize("height", [1.01, pytest.param(2.0, marks=pytest.mark.stress), 5.0])
+@pytest.mark.parametrize("height", [1.01, *stress(2.0, 5.0)])
 def test_a_glowing_ball_over_a_plane(name, height):
     """Right below a ball of radius r at height h the irradiance is pi L (r / h)²."""
     ball = {
@@ -73,7 +74,7 @@ def test_a_disk_over_a_plane(name):
 
 
 @pytest.mark.parametrize("name", all_plugins(*DIRECT))
-@pytest.mark.parametrize("depth", [pytest.param(2, marks=pytest.mark.stress), 4])
+@pytest.mark.parametrize("depth", [4, *stress(2)])
 def test_light_between_two_disks(name, depth):
     """A glowing disk over another one, each reflecting half of what comes: radiosity of both by quadrature over rings.
 
@@ -93,7 +94,7 @@ def test_light_between_two_disks(name, depth):
 
 
 @pytest.mark.parametrize("name", all_plugins(*DIRECT))
-@pytest.mark.parametrize("depth", [pytest.param(2, marks=pytest.mark.stress), 3, 5])
+@pytest.mark.parametrize("depth", [3, *stress(2, 5)])
 def test_a_furnace_whose_walls_glow(name, depth):
     """Inside a closed box whose walls emit L and reflect a share a of it, n edges carry L (1 + a + ... + a^(n-1))."""
     glow = {"emitter": {"type": "area", "radiance": rgb(1.0)}}

@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import stress
 from tests.support.pairs import prepared
 from tests.support.rendering import render
 from tests.support.rooms import GLOSSY, ODD_SCENES, glossy_room, many_kinds
@@ -44,7 +45,7 @@ def open_floor(size=64, lamps=60):
     return {"type": "scene", "sensor": sensor(size), "floor": wall([0, 0, -1], [0, 1, 0], 0, 4.0), **bulbs}
 
 
-@pytest.mark.parametrize(("direct", "phase_one_error"), [("nee", 0.2), ("vpl", 0.0), ("vpl", 5.0)])
+@pytest.mark.parametrize(("direct", "phase_one_error"), [("vpl", 0.0), *stress(("nee", 0.2), ("vpl", 5.0))])
 def test_error_zero_is_the_sum_of_all_lights(direct, phase_one_error):
     scene = glossy_room()
     settings = {"vpl_count": 300, "max_depth": 5, "direct": direct, "direct_count": 64}
@@ -64,6 +65,7 @@ def test_the_error_of_the_image_follows_the_bound(direct, visibility):
     assert sizes == sorted(sizes, reverse=True)
 
 
+@pytest.mark.stress
 def test_adaptive_visibility_traces_fewer_rays_for_about_the_same_image():
     scene = many_kinds()
     scene["sensor"]["film"] |= {"width": 128, "height": 128}
@@ -76,6 +78,7 @@ def test_adaptive_visibility_traces_fewer_rays_for_about_the_same_image():
     assert relative_error(adaptive[0], expected) < 1.3 * relative_error(every[0], expected) < 0.02
 
 
+@pytest.mark.stress
 def test_adaptive_visibility_changes_nothing_where_nothing_is_in_the_way():
     scene = mi.load_dict(open_floor())
     every, adaptive = (rendered(scene, 4, visibility=name, error=0.05) for name in ("all", "adaptive"))
@@ -84,6 +87,7 @@ def test_adaptive_visibility_changes_nothing_where_nothing_is_in_the_way():
     assert adaptive[1]["shadow_rays"] < 0.7 * every[1]["shadow_rays"]
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("visibility", ["all", "adaptive"])
 def test_work_in_parts_gives_the_same_image(visibility, monkeypatch):
     scene = glossy_room()
@@ -111,6 +115,7 @@ def test_the_largest_cut_is_about_kept():
         assert 0.5 * limit < np.median(cut) < 1.6 * limit and np.percentile(cut, 90) < 2 * limit
 
 
+@pytest.mark.stress
 def test_dark_points_are_refined_as_if_they_had_the_floor():
     scene, settings = mi.load_dict(many_kinds()), {"vpl_count": 1000, "max_depth": 4, "error": 0.05, "aovs": "cut_size"}
     cuts = [rendered(scene, dark_floor=floor, **settings)[0] for floor in (0.0, 0.5, 3.0)]
@@ -246,6 +251,7 @@ def test_same_seed_same_image_and_other_seed_other_image(visibility):
     assert not np.allclose(first[0], other[0], rtol=1e-2)
 
 
+@pytest.mark.stress
 def test_the_order_in_which_materials_were_loaded_does_not_matter():
     """Mitsuba loads in parallel: the order can change from run to run."""
     scene = many_kinds()
@@ -256,6 +262,7 @@ def test_the_order_in_which_materials_were_loaded_does_not_matter():
     assert_same(one, other)
 
 
+@pytest.mark.stress
 @pytest.mark.usefixtures("restore_variant")
 @pytest.mark.parametrize("visibility", ["all", "adaptive"])
 def test_mono_variant_renders_as_all_lights_do(visibility):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from tests.support.catalogue import PLUGINS, plugin
+from tests.support.marks import stress
 from tests.support.rendering import render
 from tests.support.scenes import area_light, closed_box, rgb
 from tests.support.statistics import relative_error
@@ -61,7 +62,7 @@ def scaled(factor):
 # Mitsuba's own offsets of rays have an absolute part: 0.2% of the image at a scale of 1e-2, 3% at 1e-4, in ``path`` as
 # well
 @pytest.mark.parametrize("name", QUICK)
-@pytest.mark.parametrize(("factor", "tolerance"), [(1e-4, 0.06), (1e-2, 0.01), (1e4, 1e-3)])
+@pytest.mark.parametrize(("factor", "tolerance"), [(1e-2, 0.01), (1e4, 1e-3), *stress((1e-4, 0.06))])
 def test_scale(name, factor, tolerance):
     assert change(name, scaled(factor), factor) < tolerance
 

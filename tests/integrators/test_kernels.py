@@ -39,7 +39,7 @@ def compiled():
         yield count
 
 
-QUICK = ("manylights", "lightcuts", "matrixrecovery", "adaptivedirect")
+QUICK = ("manylights", "lightcuts", "adaptivedirect")
 
 
 @pytest.mark.parametrize("name", [*QUICK, *stress(*(name for name in integrators.PLUGINS if name not in QUICK))])

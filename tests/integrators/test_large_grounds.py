@@ -4,10 +4,13 @@ On such a ground, ``path`` itself loses the light of some points, whose own surf
 depends on the directions from which paths arrive, so its means are found to some tenths of a percent only.
 """
 
+import itertools
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import stress
 from tests.support.rendering import render, render_with_statistics
 from tests.support.rooms import lamp_behind_the_camera
 from tests.support.scenes import closed_box, rgb
@@ -47,8 +50,11 @@ def tilted(size):
     return box
 
 
-@pytest.mark.parametrize("size", [1e5, 1e6])
-@pytest.mark.parametrize("ground", [planet, cylinder, plane, tilted])
+GROUNDS = list(itertools.product([planet, cylinder, plane, tilted], [1e5, 1e6]))
+QUICK = ((planet, 1e5), (plane, 1e6))
+
+
+@pytest.mark.parametrize(("ground", "size"), [*QUICK, *stress(*(pair for pair in GROUNDS if pair not in QUICK))])
 def test_a_large_ground(ground, size):
     scene, found = mi.load_dict(ground(size)), []
     for seed in range(8):

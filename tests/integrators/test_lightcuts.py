@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import stress
 from tests.support.pairs import prepared
 from tests.support.rendering import render
 from tests.support.rooms import COATED, GLOSSY, many_kinds
@@ -154,7 +155,7 @@ def test_light_passes_masks_as_path_says():
     assert abs(ours / reference - 1) < 0.06
 
 
-@pytest.mark.parametrize("bsdf", [{"type": "roughdielectric", "alpha": 0.3}, GLOSSY])
+@pytest.mark.parametrize("bsdf", [GLOSSY, *stress({"type": "roughdielectric", "alpha": 0.3})])
 def test_nothing_that_a_material_reflects_has_a_bound_of_zero(bsdf):
     scene = mi.load_dict(
         {"type": "scene", "sensor": sensor(), "ball": {"type": "sphere", "bsdf": bsdf}, "sky": {"type": "constant"}}

@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import stress
 from tests.support.properties import assert_properties_are_shown, assert_property_is_refused
 from tests.support.rendering import render, render_with_statistics
 from tests.support.rooms import glossy_room, many_kinds
@@ -45,7 +46,7 @@ def dark_corners():
     return closed_box(bulbs, size=24, shelf=wall([0, -0.2, 0], [1, 0, 0], -90, 0.8))
 
 
-@pytest.mark.parametrize("make", [dark_corners, glossy_room, many_kinds])
+@pytest.mark.parametrize("make", [dark_corners, *stress(glossy_room, many_kinds)])
 def test_the_mean_over_seeds_is_that_of_all_lights(make):
     """With the same seeds both methods see the same lights: what is left is the noise of the choice.
 

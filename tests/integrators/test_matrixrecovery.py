@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.separated_light import light_of_entries
 from comparison.scene_files import SceneFile
+from tests.support.marks import stress
 from tests.support.pairs import batch_of
 from tests.support.paths import ROOT
 from tests.support.properties import assert_properties_are_shown, assert_property_is_refused
@@ -44,7 +45,7 @@ def scenes():
     }
 
 
-@pytest.mark.parametrize("name", ["room", "kinds", "gloss"])
+@pytest.mark.parametrize("name", ["room", *stress("kinds", "gloss")])
 def test_with_a_column_for_every_light_and_every_row_traced_it_is_the_sum_of_all_lights(name):
     scene = scenes()[name]
     settings = SMALL | {"vpl_count": 200, "direct_count": 60}
@@ -183,6 +184,7 @@ def test_the_same_seed_gives_the_same_image(shadows):
     assert not np.array_equal(first, rendered(shadows, 2, 4, **SMALL)[0])
 
 
+@pytest.mark.stress
 def test_blocks_of_slices_and_chunks_of_entries_change_nothing(shadows, monkeypatch):
     from integrators import matrixrecovery
 

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import stress
 from tests.support.pairs import batch_of
 from tests.support.properties import assert_properties_are_shown, assert_property_is_refused
 from tests.support.rendering import render
@@ -61,7 +62,7 @@ def tinted_mirrors():
     return scene
 
 
-@pytest.mark.parametrize("make", [tinted_mirrors, glossy_room, many_kinds])
+@pytest.mark.parametrize("make", [tinted_mirrors, many_kinds, *stress(glossy_room)])
 def test_the_mean_over_seeds_is_that_of_all_lights(make):
     """With the same seeds both methods see the same lights: what is left is the noise of the representatives."""
     scene = make()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.support.catalogue import EMITTERS, stage
+from tests.support.marks import stress
 from tests.support.rendering import render
 from tests.support.scenes import area_light, closed_box
 from tests.support.statistics import relative_error
@@ -43,7 +44,7 @@ OTHERS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])
+@pytest.mark.parametrize("name", ["adaptivedirect", *stress("lightcuts")])
 @pytest.mark.parametrize("other", OTHERS)
 @pytest.mark.parametrize("lamp", [pytest.param("rectangle", marks=pytest.mark.stress), "cylinder"])
 def test_area_emitters_light_them_as_in_path(name, other, lamp, tmp_path):

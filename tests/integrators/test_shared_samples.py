@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import stress
 from tests.support.rendering import render
 from tests.support.scenes import sensor, wall
 from vpl.direct.adaptive import _BatchLight
@@ -54,7 +55,7 @@ def test_textures_stay_sharp_under_mitsubas_usual_filter(plugin, material, allow
     assert np.abs(ours / expected - 1).max() < allowed
 
 
-@pytest.mark.parametrize("plugin", ["manylights", "mdlightcuts"])
+@pytest.mark.parametrize("plugin", ["manylights", *stress("mdlightcuts")])
 def test_textures_lit_by_other_surfaces_stay_sharp(plugin):
     scene = chequered("gaussian")
     scene["back"] = wall([0, 0, 6], [0, 1, 0], 180, 6.0, (0.8, 0.8, 0.8))

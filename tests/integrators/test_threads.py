@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 import manylights
+from tests.support.marks import stress
 from tests.support.processes import PATIENCE
 from tests.support.rendering import render
 from tests.support.scenes import area_light, closed_box
 
-PLUGINS = ["vpl", "adaptivedirect", "manylights"]
+PLUGINS = ["adaptivedirect", "manylights", *stress("vpl")]
 REFUSAL = "another thread is rendering with the same "
 
 

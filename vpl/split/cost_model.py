@@ -160,16 +160,11 @@ class CostModel:
         "c of the split over the distance between lights.",
         "four times: least raw variance in five scenes; six: less in blocks of pixels, for denoisers",
     )
-    least_rays: float = _constant(0.25, "shadow rays", "Fewest shadow rays of cuts for a sample.", _SENSITIVITY)
-    most_rays: float = _constant(8.0, "shadow rays", "Most shadow rays of cuts for a sample.", _SENSITIVITY)
-    cut_error: float = _constant(
-        0.05,
-        "fraction of the pixel",
-        "Error bound at which the cuts of a pixel have `rays_at_error` shadow rays.",
-        "benchmarks/lightcuts.py",
-    )
-    rays_at_error: float = _constant(
-        110, "shadow rays", "Shadow rays of a pixel at `cut_error`.", "benchmarks/lightcuts.py"
+    coarse_rays: float = _constant(
+        17,
+        "shadow rays",
+        "Shadow rays of the cuts of a pixel at an error bound of 1.",
+        "benchmarks/lightcuts.py: 110 at 5%",
     )
     error_slope: float = _constant(1.6, "exponent", "The error bound falls with this power of the rays.", _SENSITIVITY)
     finest_error: float = _constant(0.001, "fraction of the pixel", "Smallest error bound.", _SENSITIVITY)

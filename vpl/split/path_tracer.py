@@ -189,11 +189,10 @@ def trace_paths(
         sample = emitters.sample(hit.si, path.cell, chosen, member, place, hit.smooth)
         lobe = dr.select(hit.smooth, lobe, sampler.next_1d())
         turn = dr.select(hit.smooth, turn, sampler.next_2d())
-        # A single call: each call adds the code of every material to the kernel
-        toward = hit.si.to_local(sample.direction)
-        value, density, turned, bsdf_weight = hit.bsdf.eval_pdf_sample(
-            context, hit.si, toward, lobe, turn, path.active & ~hit.hidden
-        )  # fmt: skip
+        # A single call: each call adds the code of every material to the kernel. A path that ends needs the sample only
+        # to tell whether the surface counts in alpha
+        toward, scatters = hit.si.to_local(sample.direction), path.active & ~hit.hidden & (hit.goes_on | ~path.valid)
+        value, density, turned, bsdf_weight = hit.bsdf.eval_pdf_sample(context, hit.si, toward, lobe, turn, scatters)
         lit = _lit(path, hit, sample, toward.z, value, density, weight, settings, sampler)
         arriving = sample.arriving(scene, dr.max(dr.abs(lit)) > 0)
         found.add(lit * arriving, path.depth + 2, sampler.next_1d())

@@ -150,12 +150,10 @@ def _cut_rays(rest: float, samples: int, model: CostModel) -> tuple[float, float
 
     The least of (rest / samples + cut variance / rays) × (samples + rays × their cost).
     """
-    wanted = (model.cut_variance / (model.ray_cost * max(rest, 1e-9))) ** 0.5
-    rays = samples * np.clip(wanted, model.least_rays, model.most_rays)
-    error = model.cut_error * (rays / model.rays_at_error) ** -model.error_slope
-    error = float(np.clip(error, model.finest_error, model.coarsest_error))
+    rays = samples * (model.cut_variance / (model.ray_cost * max(rest, 1e-9))) ** 0.5
     # A cut has some nodes, however few rays are wanted
-    return model.rays_at_error * (error / model.cut_error) ** (-1 / model.error_slope), error
+    error = float(np.clip((rays / model.coarse_rays) ** -model.error_slope, model.finest_error, model.coarsest_error))
+    return model.coarse_rays * error ** (-1 / model.error_slope), error
 
 
 def _light_paths(evidence: Evidence, option: Option, left: float) -> int:

@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import stress
 from tests.support.rendering import render
 from tests.support.rooms import sunny
 from tests.support.scenes import sensor, wall
@@ -21,7 +22,7 @@ def floor_under(sky):
     return {"type": "scene", "sensor": sensor(16, 1), "floor": wall([0, -1, 0], [1, 0, 0], -90, 30.0), **sky}
 
 
-@pytest.mark.parametrize("turn", [0.0, 25.0, 77.3])
+@pytest.mark.parametrize("turn", [25.0, *stress(0.0, 77.3)])
 @pytest.mark.parametrize(("shape", "sun"), SKIES, ids=str)
 def test_directions_are_drawn_nearly_by_the_light_of_a_single_texel(shape, sun, turn):
     environment = mi.load_dict({"type": "scene", **sunny(shape, sun, turn=turn)}).environment()

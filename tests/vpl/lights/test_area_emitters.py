@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import stress
 from tests.support.rendering import render
 from tests.support.rooms import smooth_octahedron
 from tests.support.scenes import closed_box
@@ -42,7 +43,7 @@ def assert_light_of_path(emitters, plugin, max_depth=2, **more):
     assert_same_mean(pair, 8, 0.005)
 
 
-@pytest.mark.parametrize("method", DIRECT)
+@pytest.mark.parametrize("method", ["nee", "manylights", *stress("vpl", "adaptivedirect", "unoccludeddirect")])
 def test_a_textured_sphere_lights_from_where_its_texture_is_bright(method):
     plugin, more = DIRECT[method]
     assert_light_of_path(ball(half_bright()), plugin, **more)

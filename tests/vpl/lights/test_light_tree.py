@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from tests.support.marks import stress
 from tests.support.properties import examples
 from vpl.lights.light_set import moments_below
 from vpl.lights.light_tree import (
@@ -166,7 +167,7 @@ def test_every_invariant_holds_for_hostile_lights(lights):
     check_tree(build(position, direction, flux, **options), position, direction, flux)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 8191, 8193])
+@pytest.mark.parametrize("count", [1, 2, 3, 8193, *stress(8191)])
 def test_sizes_around_the_smallest_and_the_chunk(count):
     lights = random_lights(np.random.default_rng(count), count)
     check_tree(build(*lights), *lights)

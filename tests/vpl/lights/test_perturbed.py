@@ -72,7 +72,8 @@ OTHERS = [name for name in CASES if name not in (*QUICK, DARK)]
 
 
 @pytest.mark.parametrize(
-    "case", [*QUICK, pytest.param(DARK, marks=pytest.mark.xfail(reason="too dark")), *stress(*OTHERS)]
+    "case",
+    [*QUICK, pytest.param(DARK, marks=[pytest.mark.xfail(reason="too dark"), pytest.mark.stress]), *stress(*OTHERS)],
 )
 def test_a_sunlit_floor(case):
     """High bumps scatter the right amount of light, although up to 24% too much of it to one side."""
@@ -80,7 +81,7 @@ def test_a_sunlit_floor(case):
     assert_indirect_light_of_path(sunlit(floor(), direction), "vpl", tiles=1 if case == "bumps" else 4)
 
 
-@pytest.mark.parametrize("plugin", PLUGINS)
+@pytest.mark.parametrize("plugin", ["lightcuts", *stress(*(name for name in PLUGINS if name != "lightcuts"))])
 def test_every_plugin_knows_where_its_lights_shine(plugin):
     assert_indirect_light_of_path(sunlit(turned(45), [0.2, -1, 0]), plugin, 8, **PLUGINS[plugin])
 
@@ -97,7 +98,7 @@ def test_glossy_light_is_spread_and_none_is_lost(nested):
     assert found == pytest.approx(expected, rel=0.1)
 
 
-@pytest.mark.parametrize("shape", ["rectangle", "shape group"])
+@pytest.mark.parametrize("shape", ["rectangle", *stress("shape group")])
 def test_light_goes_on_between_perturbed_walls(shape):
     bulb = {"bulb": {"type": "point", "position": [0.3, 0.4, 0.6], "intensity": rgb(1.0)}}
     box = closed_box(bulb, 16)
