@@ -198,6 +198,7 @@ assert manylights.main([{CORNELL!r}, *size, "-o", "a.exr", "-m", "llvm_ad_mono",
     assert images.read_exr(tmp_path / "a.denoised.exr")[1] == ["Y"]
 
 
+@pytest.mark.stress
 def test_comparison_shows_raw_and_denoised(tmp_path, capsys):
     arguments = [
         CORNELL, "-i", "path,direct", "--spp", "8", "--seeds", "2", "--width", "64", "--reference", "path:512", "-o",

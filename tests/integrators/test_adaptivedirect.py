@@ -188,7 +188,7 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("method", ["clusters", "unoccluded", *stress("all")])
+@pytest.mark.parametrize("method", ["clusters", *stress("unoccluded", "all")])
 def test_expectation_equals_direct(mixed, reference, method):
     plugin, more = METHODS[method]
     # A cut at every point takes seconds

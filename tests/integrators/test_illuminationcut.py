@@ -242,7 +242,7 @@ def test_points_without_a_normal_are_black_as_in_the_other_methods():
     assert np.isfinite(rendered(scene, vpl_count=300)[0]).all()
 
 
-@pytest.mark.parametrize("visibility", ["all", "adaptive"])
+@pytest.mark.parametrize("visibility", ["adaptive", *stress("all")])
 def test_same_seed_same_image_and_other_seed_other_image(visibility):
     scene = glossy_room()
     settings = {"vpl_count": 1000, "max_depth": 4, "visibility": visibility}

@@ -255,6 +255,7 @@ def test_odd_scenes_render_without_nan(integrator, name):
         assert image.max() > 0
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("integrator", ["lightcuts", *stress("lightslice", "mdlightcuts", "matrixrecovery")])
 def test_no_kernel_reads_or_writes_outside_of_an_array(integrator, capfd):
     """Dr.Jit's debug mode checks every index; a mirror and a pane give camera paths of several waves."""

@@ -155,6 +155,7 @@ def test_light_passes_masks_as_path_says():
     assert abs(ours / reference - 1) < 0.06
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("bsdf", [GLOSSY, *stress({"type": "roughdielectric", "alpha": 0.3})])
 def test_nothing_that_a_material_reflects_has_a_bound_of_zero(bsdf):
     scene = mi.load_dict(

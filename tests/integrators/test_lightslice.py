@@ -23,7 +23,7 @@ rendered = partial(render_with_statistics, NAME)
 # ---- Against the sum of all lights
 
 
-@pytest.mark.parametrize("spp", [1, 9])
+@pytest.mark.parametrize("spp", [9, *stress(1)])
 def test_the_error_falls_as_columns_are_added_and_vanishes_when_all_are_there(spp):
     scene = glossy_room()
     given = {"vpl_count": 300, "max_depth": 5, "direct": "vpl", "direct_count": 64, "slices": 40}

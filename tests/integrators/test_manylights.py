@@ -61,6 +61,7 @@ def test_emitters(emitters):
     assert_image_of_path(stage(lamps, ball, 16), finds=0.01, max_depth=4)
 
 
+@pytest.mark.stress
 def test_a_turned_sphere_with_a_texture():
     patches = image(np.random.default_rng(3).uniform(0, 8, (4, 8, 3)) ** 2) | {"filter_type": "nearest"}
     turned = mi.ScalarTransform4f().translate([0, 0.1, 0]).rotate([0, 0, 1], 25).rotate([1, 0, 0], 60).scale(0.35)
@@ -68,6 +69,7 @@ def test_a_turned_sphere_with_a_texture():
     assert_image_of_path(closed_box({"ball": glowing}, 16), max_depth=4)
 
 
+@pytest.mark.stress
 def test_a_glowing_mesh_with_vertex_normals():
     assert_image_of_path(closed_box(smooth_octahedron(), 16), max_depth=4)
 
@@ -119,12 +121,13 @@ def test_walls_whose_reflectance_is_negative_in_places():
     assert_image_of_path(room_of(wall, bulb()), 1024, 16, max_depth=5)
 
 
+@pytest.mark.stress
 def test_a_half_transparent_mask_around_all():
     mask = {"type": "mask", "opacity": 0.6, "nested": {"type": "diffuse", "reflectance": rgb(0.9)}}
     assert_image_of_path(room_of(mask, bulb()), finds=0.03, reference="prb", max_depth=4)
 
 
-@pytest.mark.parametrize("hide_emitters", [False, True])
+@pytest.mark.parametrize("hide_emitters", [False, *stress(True)])
 def test_a_mask_with_nothing_behind_it(hide_emitters):
     """`path` loses the light of samples that pass the mask; alpha is equal."""
     mask = {"type": "mask", "opacity": 0.3, "nested": {"type": "diffuse"}}
@@ -139,7 +142,7 @@ def test_a_mask_with_nothing_behind_it(hide_emitters):
     assert found[3] == pytest.approx(darker[3], rel=0.02) and found[3] == pytest.approx(0.3, rel=0.02)
 
 
-@pytest.mark.parametrize("material", ["bumpmap", "normalmap"])
+@pytest.mark.parametrize("material", ["bumpmap", *stress("normalmap")])
 def test_walls_that_turn_their_normals(material):
     """Lights would shine from below the turned normal too, where no sample of the BSDF goes to take that off."""
     description = {**MATERIALS[material](), "nested": {"type": "diffuse", "reflectance": rgb(0.8)}}
@@ -161,7 +164,7 @@ def test_colours_seen_in_a_mirror_at_a_small_depth():
     assert_image_of_path(box, max_depth=4)
 
 
-@pytest.mark.parametrize("max_depth", [5, 8, *stress(6)])
+@pytest.mark.parametrize("max_depth", [5, *stress(6, 8)])
 def test_light_through_four_masks(max_depth):
     """Each of them is an edge of the path."""
     lights = max_depth > 5
@@ -226,6 +229,7 @@ def test_a_room_lit_through_a_window():
     assert_image_of_path(box, finds=0.03, max_depth=6)
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("scale", [1e4, *stress(1e-2)])
 def test_units_of_length_do_not_matter(scale):
     box = closed_box({"light": area_light(scale)}, 16, scale=scale)
@@ -235,6 +239,7 @@ def test_units_of_length_do_not_matter(scale):
 # ---------------------- Emitters that are not seen, alpha ----------------------
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("max_depth", [5, *stress(2)])
 def test_an_emitter_between_camera_and_room_is_looked_through(max_depth):
     transform = mi.ScalarTransform4f().translate([0, 0, 0.3]).scale(0.3)
@@ -274,7 +279,7 @@ def test_filters(options):
     assert_image_of_path(box, max_depth=4)
 
 
-QUICK_SENSORS = ("thinlens", "batch")
+QUICK_SENSORS = ("thinlens",)
 
 
 @pytest.mark.parametrize("kind", [*QUICK_SENSORS, *stress(*(name for name in SENSORS if name not in QUICK_SENSORS))])

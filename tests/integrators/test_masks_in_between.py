@@ -34,7 +34,7 @@ def test_no_light_where_paths_are_too_short_to_pass(name):
         assert render(scene, mi.load_dict(plugin(name, max_depth=max_depth)), 16).max() == 0
 
 
-@pytest.mark.parametrize("max_depth", [5, *stress(6, 8)])
+@pytest.mark.parametrize("max_depth", stress(5, 6, 8))
 def test_light_through_four_masks(max_depth):
     assert_image_of_prb(veiled_room(), max_depth)
 

@@ -98,6 +98,7 @@ def test_the_bias_of_prediction_is_small_and_falls_with_sampling(shadows):
     assert abs(bias(sampling=9.0, steps=PREDICTED)) < 0.01
 
 
+@pytest.mark.stress
 def test_small_lamps_do_not_lose_their_light():
     """The 900 lamps of the hall are local, and few traced rows are near a lamp."""
     file = SceneFile(str(ROOT / "scenes" / "hall.xml"), {"integrator": "path"})

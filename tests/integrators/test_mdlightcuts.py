@@ -40,7 +40,7 @@ def test_error_zero_is_the_sum_of_all_lights(direct, spp):
     assert np.allclose(cut, render(scene, "vpl", spp, **given), rtol=1e-4, atol=1e-5 * cut.mean())
 
 
-@pytest.mark.parametrize("spp", [1, 9])
+@pytest.mark.parametrize("spp", [1, *stress(9)])
 def test_the_error_of_the_image_follows_the_bound(spp):
     scene = glossy_room()
     given = {"vpl_count": 5000, "max_depth": 5, "direct": "vpl", "direct_count": 256}
@@ -62,7 +62,7 @@ def tinted_mirrors():
     return scene
 
 
-@pytest.mark.parametrize("make", [tinted_mirrors, many_kinds, *stress(glossy_room)])
+@pytest.mark.parametrize("make", [tinted_mirrors, *stress(many_kinds, glossy_room)])
 def test_the_mean_over_seeds_is_that_of_all_lights(make):
     """With the same seeds both methods see the same lights: what is left is the noise of the representatives."""
     scene = make()

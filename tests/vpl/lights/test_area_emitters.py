@@ -49,12 +49,13 @@ def test_a_textured_sphere_lights_from_where_its_texture_is_bright(method):
     assert_light_of_path(ball(half_bright()), plugin, **more)
 
 
+@pytest.mark.stress
 def test_light_paths_leave_a_turned_sphere_outwards():
     white = {"type": "rgb", "value": 4.0}
     assert_light_of_path(ball(white), "vpl", max_depth=3, vpl_count=2000, clamping=0.0)
 
 
-@pytest.mark.parametrize("method", ["adaptivedirect", "unoccludeddirect"])
+@pytest.mark.parametrize("method", ["adaptivedirect", *stress("unoccludeddirect")])
 def test_a_mesh_with_vertex_normals_emits_to_the_side_of_its_shading_normals(method):
     """``path`` itself takes shading normals for the density of what it draws by area: BSDF samples are right."""
     plugin, more = DIRECT[method]

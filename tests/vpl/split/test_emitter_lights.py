@@ -108,6 +108,7 @@ def test_the_mean_over_seeds_is_that_of_path(floor, max_depth, always):
     assert_image_of_path(scene, max_depth=max_depth)
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("integrator", [{"hide_emitters": True, "rr_depth": 1}])
 def test_emitters_that_are_hidden_and_paths_that_end_soon_change_no_mean(integrator, always):
     rng = np.random.default_rng(6)
@@ -116,6 +117,7 @@ def test_emitters_that_are_hidden_and_paths_that_end_soon_change_no_mean(integra
     assert_image_of_path(scene, finds=0.03, **integrator)
 
 
+@pytest.mark.stress
 def test_no_lights_stand_for_emitters_with_normals_of_vertices(tmp_path, always):
     """Mitsuba's densities of such emitters differ from the densities of the surface: the remainder finds their light
     like `path`."""
@@ -142,6 +144,7 @@ def test_black_and_flat_emitters_among_many_are_no_trouble(lit, always):
         assert_image_of_path(scene, max_depth=3)
 
 
+@pytest.mark.stress
 def test_turned_covered_hollow_and_uneven_emitters_change_no_mean(always):
     """Panels that face up, a mask, a ball that shines inwards around a second ball, bumps, a sun, and a bright emitter
     among dim emitters."""

@@ -8,6 +8,7 @@ import manylights
 from comparison import images
 from comparison.scene_files import SceneFile
 from tests.support.catalogue import EMITTERS
+from tests.support.marks import stress
 from tests.support.scenes import area_light, closed_box, image, rgb, sensor
 from tests.support.statistics import assert_same_mean
 from vpl.core.parameters import fingerprint, fingerprint_without_camera
@@ -68,7 +69,7 @@ def two_rooms():
     return scene
 
 
-@pytest.mark.parametrize("views", [two_views, two_rooms])
+@pytest.mark.parametrize("views", [two_rooms, *stress(two_views)])
 def test_a_second_camera_sees_the_image_of_path_by_the_lights_of_the_first(made, views):
     scene = mi.load_dict(views())
 

@@ -7,6 +7,7 @@ import pytest
 
 from tests.support.catalogue import EMITTERS, SENSORS, film
 from tests.support.many_emitters import interactions
+from tests.support.marks import stress
 from tests.support.properties import unit_vectors
 from tests.support.rendering import render, render_with_statistics
 from tests.support.scenes import area_light, closed_box, image, rgb, sensor
@@ -55,7 +56,7 @@ def test_an_image_does_not_depend_on_the_order_of_the_emitters():
 
 
 @pytest.mark.parametrize("learns", [False, True])
-@pytest.mark.parametrize("emitter", ["rectangle", "envmap", "constant", "sunsky"])
+@pytest.mark.parametrize("emitter", ["rectangle", "envmap", *stress("constant", "sunsky")])
 def test_what_is_drawn_has_the_density_with_which_it_is_met(emitter, learns):
     """A ray along the drawn direction finds the same radiance and the same density, wherever it arrives; where
     something was learned, in packets of known and unknown cells."""
@@ -270,7 +271,7 @@ def test_no_kernel_is_compiled_anew_for_another_seed(lights_cost_nothing):
 
 
 @pytest.mark.parametrize("many", [False, True])
-@pytest.mark.parametrize("texel", [0.0, np.nan, np.inf])
+@pytest.mark.parametrize("texel", [np.nan, *stress(0.0, np.inf)])
 def test_an_environment_of_no_density_spoils_no_path(texel, many):
     """Mitsuba's own density of an image that is black, or has a texel that is no number, is none in any direction."""
     pixels = np.zeros((4, 8, 3), np.float32)
