@@ -193,6 +193,8 @@ def chosen_integrators(options):
         chosen[label][1][name] = value
     for aov in options.aovs:
         _request_aov(aov, chosen)
+    if options.denoise:
+        chosen = {label: (name, command_line.for_denoising(name, given)) for label, (name, given) in chosen.items()}
     return chosen
 
 

@@ -133,10 +133,13 @@ def parse_scene(options):
     file = SceneFile(options.scene, dict(options.define))
     own, name = file.integrator[0], chosen_integrator(options.integrator, file)
     command_line.check_integrator(name)
+    parameters = dict(options.param)
+    if options.denoise and "denoised" not in file.integrator[1]:
+        parameters = command_line.for_denoising(name, parameters)
     if name != own or options.integrator == name:
-        file.set_integrator(name, dict(options.param))
-    elif options.param:
-        file.set_integrator(name, dict(options.param), keep=None)
+        file.set_integrator(name, parameters)
+    elif parameters:
+        file.set_integrator(name, parameters, keep=None)
     replaced = None if options.integrator or name == own else own
     if options.sensor != batch.ALL and options.sensor >= file.sensors:
         raise UsageError(f"no sensor {options.sensor}: the scene has {file.sensors}")

@@ -176,7 +176,7 @@ def denoised_of(name: str, width: int, seconds: float, passes: int) -> dict:
     from comparison.denoising import Denoiser
 
     scene = load(name, width)
-    rivals = [Rival(name, scene, kind, "multijitter", width, seconds) for kind in KINDS]
+    rivals = [Rival(name, scene, kind, "multijitter", width, seconds, denoised=True) for kind in KINDS]
     measure_in_turn(rivals, passes)
     truth, noise = reference_of(name)
     scale = truth**2 + 0.01 * truth.mean() ** 2

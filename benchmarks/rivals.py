@@ -54,12 +54,15 @@ def light_paths_times(factor: float):
 
 class Rival:
     """Passes of one integrator with one sampler on one scene, of about ``seconds`` each; ``light_paths``: factor on the
-    chosen number."""
+    chosen number; ``more``: properties of ``manylights``."""
 
-    def __init__(self, name: str, scene, kind: str, sampler: str, width: int, seconds: float, light_paths: float = 1):
+    def __init__(
+        self, name: str, scene, kind: str, sampler: str, width: int, seconds: float, light_paths: float = 1, **more
+    ):
         self.kind, self.sampler, self.images, self.seconds, self.light_paths = kind, sampler, [], [], light_paths
         self.scene, self.sensor = scene, SAMPLERS.index(sampler)
-        self.integrator = mi.load_dict({"type": kind, "max_depth": DEPTH})
+        more = more if kind == "manylights" else {}
+        self.integrator = mi.load_dict({"type": kind, "max_depth": DEPTH, **more})
         # Two sizes separate the cost of samples from the fixed cost of a pass
         most = int((LARGEST_PASS / (width * scenes.height(name, width))) ** 0.5)
         side, times = min(8, most), []

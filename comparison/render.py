@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time as clock
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -79,7 +79,8 @@ def render(
     is reached ends the render: `error`, the relative standard error that 95% of the pixels do not exceed; `time`, in
     seconds, compilation included; `spp`, samples per pixel. The default is the scene's samples per pixel. There
     is at least one pass. The log has a warning if `spp` or `time` ends a render above its `error`. `seed`: of the first
-    pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py).
+    pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py), and
+    set the property `denoised` of the integrator during the render, if it has one.
     `progress`: called after each pass with the cost and the image so far; integrators of this project also call it at
     the start of each stage of a pass, with None for the image. If it returns False, no other pass begins; an exception
     ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a `checkpoint.Checkpoint` of the
@@ -118,8 +119,21 @@ def render(
     ending = Ending(spp, time and time - reserved, error, reserved)
     if checkpoint:
         begin -= checkpoint.restore(progressive)
-    with exclusive(sensor=scene.sensors()[sensor]):
+    with exclusive(sensor=scene.sensors()[sensor]), _balanced_for(denoise, progressive.integrator):
         return render_passes(progressive, sizes, ending, begin, progress, denoiser, checkpoint)
+
+
+@contextmanager
+def _balanced_for(denoise, integrator):
+    """Within the block, set the property `denoised` of an integrator that has it, if the image will be denoised."""
+    if not (denoise and hasattr(integrator, "denoised")):
+        yield
+        return
+    given, integrator.denoised = integrator.denoised, True
+    try:
+        yield
+    finally:
+        integrator.denoised = given
 
 
 def _render_all(scene, integrator, **limits):

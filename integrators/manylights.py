@@ -113,6 +113,11 @@ class ManyLightsIntegrator(GatheringIntegrator):
             "Whether the integrator keeps the virtual lights of a seed for its next image with that seed, while only "
             "the sensors of the scene change.",
         ),
+        Boolean(
+            "denoised", False,
+            "Whether the image will be denoised. Denoisers keep noise that neighbouring pixels share, so there are "
+            "more virtual lights, up to twice as many, for up to a sixth more variance × time of the raw image.",
+        ),
     )  # fmt: skip
 
     renders_in_parts = True
@@ -179,7 +184,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         return View(
             scene, emitters, Perturbed(scene), PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray,
             active, grid.width, grid.samples, seed, dr.opaque(mi.Float, 1.0, pixels), OutgoingRadiance.unknown(),
-            learning, self.cost_model,
+            learning, self.cost_model if self.denoised else self.cost_model.without_denoiser(),
         )  # fmt: skip
 
 

@@ -125,6 +125,15 @@ def test_the_raw_image_is_the_one_without_denoising():
     )
 
 
+def test_manylights_knows_whether_its_image_will_be_denoised():
+    plugin, told = mi.load_dict({"type": "manylights", "max_depth": 3}), []
+    scene = cornell(16).load()
+    for denoise in (True, False):
+        manylights.render(scene, plugin, spp=1, denoise=denoise, progress=lambda *_: told.append(plugin.denoised))
+        assert set(told) == {denoise} and not plugin.denoised
+        told.clear()
+
+
 def test_time_includes_denoising(monkeypatch):
     """What the filter will take is reserved."""
     told = []
@@ -166,6 +175,19 @@ def test_denoised_exr_is_beside_the_raw_one(tmp_path):
     np.testing.assert_array_equal(raw, images.read_exr(tmp_path / "b.exr")[0])
     assert raw.shape == denoised.shape and np.abs(raw - denoised).max() > 0.01
     assert 0 < metadata["denoise_seconds"] < metadata["render_seconds"]
+    assert images.read_exr(tmp_path / "b.exr")[2]["parameters"].get("denoised", False) is False
+
+
+@pytest.mark.parametrize(("given", "expected"), [([], True), (["-p", "denoised=false"], False)])
+def test_the_command_sets_the_property_unless_it_is_given(tmp_path, given, expected):
+    assert command("-o", tmp_path / "a.exr", "--denoise", "-i", "manylights", *given) == 0
+    assert images.read_exr(tmp_path / "a.exr")[2]["parameters"]["denoised"] is expected
+
+
+def test_the_comparison_sets_the_property_unless_it_is_given():
+    options = compare.parse([CORNELL, "-i", "path,manylights,raw=manylights", "-p", "raw.denoised=false", "--denoise"])
+    chosen = {label: given for label, (_, given) in compare.chosen_integrators(options).items()}
+    assert chosen == {"path": {}, "manylights": {"denoised": True}, "raw": {"denoised": False}}
 
 
 def test_png_shows_the_denoised_image(tmp_path):

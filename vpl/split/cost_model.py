@@ -12,7 +12,7 @@ squared brightness of the pixel.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 
 def _constant(default: float, unit: str, meaning: str, evidence: str, most: float = math.inf) -> float:
@@ -101,7 +101,8 @@ class CostModel:
     shared: float = _constant(
         4.0,
         "ratio",
-        "Weight of the variance that neighbouring pixels share: a denoiser keeps half of it, and 7 to 16% of the rest.",
+        "Weight of the variance that neighbouring pixels share, in images that are denoised: a denoiser keeps half of "
+        "it, and 7 to 16% of the rest.",
         f"{_LIGHTS} and --parts denoised",
     )
     set_error: float = _constant(
@@ -201,6 +202,10 @@ class CostModel:
     roulette_prior: float = _constant(
         4.0, "vertices", "Vertices of average radiance that each cell has besides its own.", _SENSITIVITY
     )
+
+    def without_denoiser(self) -> CostModel:
+        """The model of images that are not denoised: all variance has the same weight."""
+        return replace(self, shared=1.0)
 
     def __post_init__(self):
         for one in fields(self):

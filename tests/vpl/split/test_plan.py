@@ -27,6 +27,20 @@ def test_lights_pay_where_indirect_light_is_the_noise_and_only_there():
     assert choose(Evidence(direct, direct, none + 1, 10**8, 64, False, MODEL), []).light_paths == 0
 
 
+def test_images_that_are_denoised_have_more_lights():
+    """The number of lights grows with the root of the weight of shared variance."""
+    rng = np.random.default_rng(0)
+    indirect, none = rng.exponential(size=10_000), np.zeros(10_000)
+
+    def light_paths(model):
+        option = Option(True, False, indirect, indirect)
+        evidence = Evidence(indirect, none, np.ones(10_000), 10**7, 1024, False, model)
+        return choose(evidence, [option]).light_paths
+
+    unlimited = replace(MODEL, most_light_share=1.0, most_light_paths=10**9)
+    assert light_paths(unlimited) == pytest.approx(2 * light_paths(unlimited.without_denoiser()), rel=0.05)
+
+
 def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
     """Veils stop the light of virtual lights and let paths pass."""
     rng = np.random.default_rng(0)
