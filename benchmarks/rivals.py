@@ -109,6 +109,8 @@ class Timed(Rival):
     def __init__(self, scene, kind: str, seconds: float):
         self.kind, self.images, self.seconds, self._wanted = kind, [], [], seconds
         self._scene, self.integrator = scene, mi.load_dict({"type": kind, "max_depth": DEPTH})
+        # Two passes compile the kernels
+        render(scene, self.integrator, spp=8, pass_spp=4)
 
     def render(self, seed: int):
         """Render: (image, float64; seconds)."""
