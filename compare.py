@@ -36,7 +36,7 @@ try:
     from comparison import baseline, command_line, machine, metrics, references, report, sweeps, tables, worker
     from comparison.cluster.connection import connected, workers
     from comparison.command_line import UsageError, parameter, positive
-    from comparison.denoising import import_oidn
+    from comparison.denoising import for_denoising, import_oidn
     from comparison.pictures import REFERENCE
     from comparison.progress import Progress
     from comparison.runs import Runs, locked
@@ -194,7 +194,7 @@ def chosen_integrators(options):
     for aov in options.aovs:
         _request_aov(aov, chosen)
     if options.denoise:
-        chosen = {label: (name, command_line.for_denoising(name, given)) for label, (name, given) in chosen.items()}
+        chosen = {label: (name, for_denoising(name, given)) for label, (name, given) in chosen.items()}
     return chosen
 
 

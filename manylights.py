@@ -54,7 +54,7 @@ import integrators  # noqa: F401 (registers the plugins)
 from comparison import batch, command_line
 from comparison.cluster.connection import connected, workers
 from comparison.command_line import UsageError, parameter, positive
-from comparison.denoising import import_oidn
+from comparison.denoising import for_denoising, import_oidn
 from comparison.images import check_extension, write
 from comparison.one_image import INTERRUPTED, Failed, Image, LazyScene
 from comparison.render import Took, render
@@ -135,7 +135,7 @@ def parse_scene(options):
     command_line.check_integrator(name)
     parameters = dict(options.param)
     if options.denoise and "denoised" not in file.integrator[1]:
-        parameters = command_line.for_denoising(name, parameters)
+        parameters = for_denoising(name, parameters)
     if name != own or options.integrator == name:
         file.set_integrator(name, parameters)
     elif parameters:

@@ -5,7 +5,6 @@ import sys
 import tempfile
 import traceback
 from argparse import ArgumentTypeError
-from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 
@@ -163,16 +162,6 @@ def aov_refusal(integrator, aov):
     except (RuntimeError, ValueError) as error:
         return explain(error)
     return None
-
-
-def for_denoising(integrator, parameters):
-    """Return the parameters of an integrator whose images will be denoised: with `denoised`, if the integrator has this
-    property and it is not given."""
-    properties = mi.Properties(integrator)
-    properties["denoised"] = True
-    with suppress(RuntimeError, ValueError):
-        mi.PluginManager.instance().create_object(properties)
-    return {"denoised": True, **parameters} if properties.was_queried("denoised") else parameters
 
 
 def check_scene(path):

@@ -9,6 +9,7 @@ results than a box filter.
 """
 
 import time
+from contextlib import suppress
 from functools import cache
 
 import drjit as dr
@@ -141,3 +142,13 @@ def _three(value):
     """Convert a spectrum to three channels; without RGB, the mean over the wavelengths."""
     value = mi.unpolarized_spectrum(value)
     return mi.Color3f(value) if mi.is_rgb else mi.Color3f(dr.mean(value))
+
+
+def for_denoising(integrator, parameters):
+    """Return the parameters of an integrator whose images will be denoised: with `denoised`, if the integrator has this
+    property and it is not given."""
+    properties = mi.Properties(integrator)
+    properties["denoised"] = True
+    with suppress(RuntimeError, ValueError):
+        mi.PluginManager.instance().create_object(properties)
+    return {"denoised": True, **parameters} if properties.was_queried("denoised") else parameters

@@ -60,7 +60,13 @@ class Image:
         self._described = {"scene": str(options.scene), **described, "variant": options.mode, "seed": options.seed}
         self.path, self._checkpoint, self._remote = batch.output(options, sensor), None, None
         if pool or options.resume:
-            made_by = {"scene": scene.file.fingerprint(), "sensor": sensor, "seed": options.seed, **machine.versions()}
+            made_by = {
+                "value of denoised": scene.file.integrator[1].get("denoised", False),
+                "scene": scene.file.fingerprint(),
+                "sensor": sensor,
+                "seed": options.seed,
+                **machine.versions(),
+            }
             self._checkpoint = Checkpoint(file_of(self.path), made_by, options.resume)
         if pool:
             from .cluster.render import DistributedRender

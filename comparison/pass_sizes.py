@@ -1,8 +1,8 @@
-"""Samples per pixel of the next pass of a render: passes take about two seconds.
+"""Samples per pixel of the next pass of a render: passes take about two seconds, or grow to ten.
 
-Passes in parts can be stopped between parts. They grow: a pass takes about as long as all passes before it together, up
-to ten seconds. They are longer than two seconds, too, if starting a pass is slow: the start takes a quarter of the
-pass, up to about ten seconds, or up to twice the time of the start.
+Passes in parts grow, as they can be stopped between parts: a pass takes about as long as all passes before it together,
+up to ten seconds, the last pass up to twice that. They are longer than two seconds, too, if starting a pass is slow:
+the start takes a quarter of the pass, up to about ten seconds, or up to twice the time of the start.
 
 Sizes are powers of two, from 4 if the number of pixels allows: Mitsuba compiles a single kernel for these sizes, but
 other kernels for sizes between, and, with some film filters, below 4. Starting a pass in parts takes longer than that,
@@ -25,6 +25,7 @@ CHANGED = 1.5  # ratio of the times of two passes of equal size at which earlier
 MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of a prediction from one size for another
 USUAL = 4  # samples per pixel; all powers of two from here have the same kernels
 FIRST_SAMPLES = 2**19  # maximum pixel samples of a first pass, unless one per pixel is more
+KERNEL_SECONDS = 0.3  # to compile the kernel of a size that is no power of two
 LEAST_SHARE = 0.1  # minimum fraction of a pass's time that is assumed proportional to its samples
 PARTS = 8  # with an error limit, a pass has at most this fraction, 1/8, of the samples so far
 
@@ -32,10 +33,12 @@ PARTS = 8  # with an error limit, a pass has at most this fraction, 1/8, of the 
 class PassSizes:
     """Sizes of the passes of an image of `pixels` pixels, up to `spp` samples per pixel and `time` seconds; both may be
     None. `fixed`: size of all passes except the last, or None. `many`: at least eight passes of similar sizes, for an
-    estimate of the error. `in_parts`: whether passes are rendered in parts."""
+    estimate of the error. `in_parts`: whether passes are rendered in parts.
+    `accepts`: whether the sampler keeps a number of samples per pixel."""
 
-    def __init__(self, pixels, spp=None, time=None, fixed=None, many=False, in_parts=False):
+    def __init__(self, pixels, spp=None, time=None, fixed=None, many=False, in_parts=False, accepts=lambda spp: True):
         self._spp, self._time, self._fixed, self._many, self._in_parts = spp, time, fixed, many, in_parts
+        self._accepts = accepts
         self._largest = _power_of_two(largest_pass(pixels, in_parts))
         self._least = USUAL if USUAL * pixels <= FIRST_SAMPLES else 1
         self._current, self._seconds, self._asked = fixed or self._least, {}, None
@@ -50,6 +53,7 @@ class PassSizes:
         if self._before is None:
             self._before = len(passes)
             self._asked = passes[-1].spp if passes else None
+        self._spent = sum(one.seconds for one in passes)
         if passes:
             self._learn(passes[-1].seconds, done, compiles=len(passes) == self._before + 1)
         size = self._current
@@ -75,7 +79,6 @@ class PassSizes:
         repeated = self._asked in self._seconds
         # The first pass of a size may have compiled kernels
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
-        self._spent += seconds
         if not compiles:
             before = self._known.get(self._asked, seconds)
             if not 1 / CHANGED < seconds / max(before, 1e-6) < CHANGED:
@@ -110,7 +113,9 @@ class PassSizes:
         least = size if self._fixed else min(size, self._least)
         line = self._line()
         if self._in_parts and not self._many and not self._fixed and line:
-            filling = int((left - line[0]) / line[1])
+            filling = int((left - line[0] - KERNEL_SECONDS) / line[1])
+            while filling > least and not self._accepts(filling):
+                filling -= 1
             # A single last pass, instead of several ever smaller ones
             if least <= filling <= self._largest and filling < (size if self._spp else 2 * size):
                 return filling

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time as clock
 from collections.abc import Callable
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from vpl.core.stages import listening
 
 from .batch import ALL
 from .checkpoint import Checkpoint
-from .denoising import Denoiser
+from .denoising import Denoiser, for_denoising
 from .ending import Ending
 from .interruption import Interruption
 from .pass_sizes import PassSizes
@@ -79,8 +79,8 @@ def render(
     is reached ends the render: `error`, the relative standard error that 95% of the pixels do not exceed; `time`, in
     seconds, compilation included; `spp`, samples per pixel. The default is the scene's samples per pixel. There
     is at least one pass. The log has a warning if `spp` or `time` ends a render above its `error`. `seed`: of the first
-    pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py), and
-    set the property `denoised` of the integrator during the render, if it has one.
+    pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py); an
+    integrator given by name is then created with its property `denoised`, if it has one.
     `progress`: called after each pass with the cost and the image so far; integrators of this project also call it at
     the start of each stage of a pass, with None for the image. If it returns False, no other pass begins; an exception
     ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a `checkpoint.Checkpoint` of the
@@ -95,7 +95,7 @@ def render(
     the same sensor, or if no variant is set.
     """
     scene = _scene(scene)
-    integrator = _integrator(scene, integrator)
+    integrator = _integrator(scene, integrator, denoise)
     if sensor == ALL:
         if checkpoint:
             raise ValueError(f"checkpoint must be None where sensor is '{ALL}': it is of one image")
@@ -114,26 +114,14 @@ def render(
     progressive = Progressive(scene, seed, sensor, integrator)
     reserved = denoiser.filter_seconds if denoiser else 0.0
     sizes = PassSizes(
-        progressive.pixels, spp, time and time - reserved, pass_spp, error is not None, progressive.in_parts
-    )
+        progressive.pixels, spp, time and time - reserved, pass_spp, error is not None, progressive.in_parts,
+        progressive.accepts,
+    )  # fmt: skip
     ending = Ending(spp, time and time - reserved, error, reserved)
     if checkpoint:
         begin -= checkpoint.restore(progressive)
-    with exclusive(sensor=scene.sensors()[sensor]), _balanced_for(denoise, progressive.integrator):
+    with exclusive(sensor=scene.sensors()[sensor]):
         return render_passes(progressive, sizes, ending, begin, progress, denoiser, checkpoint)
-
-
-@contextmanager
-def _balanced_for(denoise, integrator):
-    """Within the block, set the property `denoised` of an integrator that has it, if the image will be denoised."""
-    if not (denoise and hasattr(integrator, "denoised")):
-        yield
-        return
-    given, integrator.denoised = integrator.denoised, True
-    try:
-        yield
-    finally:
-        integrator.denoised = given
 
 
 def _render_all(scene, integrator, **limits):
@@ -184,13 +172,14 @@ def _scene(scene):
     return SceneFile(scene).load()
 
 
-def _integrator(scene, integrator):
+def _integrator(scene, integrator, denoise):
     """Return the given integrator, the plugin of the given name, or by default the scene's integrator. Raises
-    ValueError if there is none, and for a scene that the integrator does not support."""
+    ValueError if there is none, and for a scene that the integrator does not support. `denoise`: whether the image will
+    be denoised."""
     if isinstance(integrator, str):
         import integrators  # noqa: F401 (registers plugins; needs a variant)
 
-        integrator = mi.load_dict({"type": integrator})
+        integrator = mi.load_dict({"type": integrator} | (for_denoising(integrator, {}) if denoise else {}))
     integrator = integrator or scene.integrator()
     if integrator is None:
         raise ValueError("the scene has no integrator; give one")

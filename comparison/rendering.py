@@ -167,6 +167,11 @@ class Progressive(Passes):
         image = render_pass(self._scene, self._sensor, self.integrator, spp, seed, first, self._shared)
         return self.add(image) if accept() else None
 
+    def accepts(self, spp):
+        """Return whether the sampler keeps a number of samples per pixel, which some samplers round up."""
+        with _sample_count(self._scene.sensors()[self._sensor].sampler(), spp) as rounded:
+            return rounded == spp
+
     def should_stop(self):
         """Return whether the integrator's `cancel` was called."""
         return self.integrator.should_stop()

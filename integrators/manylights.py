@@ -23,7 +23,7 @@ from .gathering import GatheringIntegrator
 from .knobs import Boolean
 from .manual import manual_page
 
-# Samples of a pixel by which the emitter sampler sizes its learning where passes share it: a usual size of a pass
+# Samples of a pixel by which the pilot and its learning are sized where passes share them: a usual size of a pass
 _SHARED_SAMPLES = 16
 
 
@@ -60,10 +60,10 @@ class ManyLightsIntegrator(GatheringIntegrator):
     emitter.  Environments, directional emitters, and meshes with vertex normals other than their geometric normals are
     traced.
 
-    **Decisions.** A pilot of up to 32 768 paths decides whether virtual lights pay, how many there are, where they
-    lie, and how many samples of a pixel they light.  Without lights, ``manylights`` is ``path`` with stratified
-    samples.  The decision is in ``statistics``, in the log (level Info) and in the files that the command writes.  It
-    depends on the seed and not on the clock.  The passes of ``manylights.render`` and of the
+    **Decisions.** A pilot of up to 32 768 paths, or a sixteenth of the camera rays, decides whether virtual lights pay,
+    how many there are, where they lie, and how many samples of a pixel they light.  Without lights, ``manylights`` is
+    ``path`` with stratified samples.  The decision is in ``statistics``, in the log (level Info) and in the files that
+    the command writes.  It depends on the seed and not on the clock.  The passes of ``manylights.render`` and of the
     command share the pilot of the first pass; each pass draws its own lights.
 
     **Kept lights.** With ``keep_lights``, the frames of a moving camera or several sensors share the virtual lights of

@@ -66,12 +66,11 @@ def swept(tmp_path_factory, variant):
     try:
         out.mkdir()
     except FileExistsError:
-        wait_until((out / "finished").exists)
-        return out
-    try:
-        assert compare.main([*SWEEP, "-o", str(out), "--cache", str(out / "cache")]) == 0
-    finally:
-        (out / "finished").touch()
+        wait_until(lambda: (out / "finished").exists() or (out / "failed").exists())
+    else:
+        status = compare.main([*SWEEP, "-o", str(out), "--cache", str(out / "cache")])
+        (out / ("finished" if status == 0 else "failed")).touch()
+    assert (out / "finished").exists(), "compare.py failed in the first process that made the sweep"
     return out
 
 

@@ -1,6 +1,7 @@
 """compare.py --check: speed-ups that fell since an earlier comparison."""
 
 import json
+import shutil
 
 import pytest
 
@@ -94,6 +95,8 @@ def test_check_sets_the_exit_status(swept, tmp_path, capsys, monkeypatch):
     entry = {"value": 1, "at_most": None, "low": None, "high": None, "speed_up": 1e9}
     results["scenes"][0]["equal_errors"]["rays"] = [{"error": 0.05, "costs": {"lightcuts": entry, "vpl": entry}}]
     (tmp_path / "baseline.json").write_text(json.dumps(results))
-    again = [*SWEEP, "-o", str(swept), "--cache", str(swept / "cache"), "--resume", "--check"]
+    out = tmp_path / "sweep"  # a copy: other processes read the original
+    shutil.copytree(swept, out)
+    again = [*SWEEP, "-o", str(out), "--cache", str(out / "cache"), "--resume", "--check"]
     assert compare.main([*again, str(tmp_path / "baseline.json")]) == 3
     assert "vpl over lightcuts, rays at error 0.05: 1e+09× before" in capsys.readouterr().err

@@ -18,6 +18,7 @@ from tests.support.marks import stress
 from tests.support.paths import CORNELL
 from tests.support.rendering import render
 from tests.support.scenes import cornell, sensor, wall
+from vpl.split.cost_model import CostModel
 
 RED = (0.6, 0.1, 0.2)
 
@@ -126,13 +127,15 @@ def test_the_raw_image_is_the_one_without_denoising():
     )
 
 
-def test_manylights_knows_whether_its_image_will_be_denoised():
-    plugin, told = mi.load_dict({"type": "manylights", "max_depth": 3}), []
-    scene = cornell(16).load()
-    for denoise in (True, False):
-        manylights.render(scene, plugin, spp=1, denoise=denoise, progress=lambda *_: told.append(plugin.denoised))
-        assert set(told) == {denoise} and not plugin.denoised
-        told.clear()
+@pytest.mark.parametrize("denoise", [True, False])
+def test_a_plugin_by_name_is_balanced_for_the_denoiser_and_an_object_keeps_its_property(denoise, monkeypatch):
+    plugin, told, scene = mi.load_dict({"type": "manylights", "max_depth": 3}), [], cornell(16).load()
+    without = CostModel.without_denoiser
+    monkeypatch.setattr(CostModel, "without_denoiser", lambda model: told.append(model) or without(model))
+    manylights.render(scene, plugin, spp=1, denoise=denoise)
+    assert len(told) == 1 and not plugin.denoised
+    manylights.render(scene, "manylights", spp=1, denoise=denoise)
+    assert len(told) == (1 if denoise else 2)
 
 
 def test_time_includes_denoising(monkeypatch):
@@ -180,8 +183,11 @@ def test_denoised_exr_is_beside_the_raw_one(tmp_path):
 
 
 @pytest.mark.parametrize(("given", "expected"), [([], True), (["-p", "denoised=false"], False)])
-def test_the_command_sets_the_property_unless_it_is_given(tmp_path, given, expected):
+def test_the_command_sets_the_property_unless_it_is_given(tmp_path, given, expected, monkeypatch):
+    told, without = [], CostModel.without_denoiser
+    monkeypatch.setattr(CostModel, "without_denoiser", lambda model: told.append(model) or without(model))
     assert command("-o", tmp_path / "a.exr", "--denoise", "-i", "manylights", *given) == 0
+    assert len(told) == (0 if expected else 1)
     assert json.loads(images.read_exr(tmp_path / "a.exr")[2]["parameters"])["denoised"] is expected
 
 

@@ -1,5 +1,6 @@
 """Sizes of passes, with integrators whose cost is made up."""
 
+import math
 from collections import Counter
 
 import pytest
@@ -126,6 +127,14 @@ def test_in_parts_only_a_last_pass_has_an_odd_size(time):
     odd = [one.spp for one in passes if one.spp & (one.spp - 1)]
     assert odd in ([], [passes[-1].spp])
     assert 0.8 * time < sum(one.seconds for one in passes) < time + 0.5 or ended_by == "spp"
+
+
+def test_in_parts_the_last_pass_has_a_size_that_the_sampler_keeps():
+    passes, ended_by = render(
+        SQUARE, 0.3, 0.1, time=20, more=0.1, in_parts=True, accepts=lambda spp: math.isqrt(spp) ** 2 == spp
+    )
+    odd = [one.spp for one in passes if one.spp & (one.spp - 1)]
+    assert ended_by == "time" and odd and all(math.isqrt(spp) ** 2 == spp for spp in odd)
 
 
 def test_in_parts_ten_seconds_hold_few_passes():

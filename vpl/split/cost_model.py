@@ -33,7 +33,7 @@ class CostModel:
     pilot_share: float = _constant(
         1 / 16,
         "1 / camera ray",
-        "Largest size of a pilot for a camera ray: a pilot is traced up to four times.",
+        "Rays of a pilot for each camera ray of the image, at most: a pilot is traced up to four times.",
         "benchmarks/manylights.py --parts cost",
         most=1,
     )
@@ -160,6 +160,9 @@ class CostModel:
         "spacings",
         "c of the split over the distance between lights.",
         "four times: least raw variance in five scenes; six: less in blocks of pixels, for denoisers",
+    )
+    most_rays: float = _constant(
+        8.0, "shadow rays", "Most shadow rays of cuts for a sample, however little the paths leave.", _SENSITIVITY
     )
     coarse_rays: float = _constant(
         17,

@@ -229,7 +229,7 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
         drawn.append(wanted)
         return surface_lights(view, arrivals, wanted, lambda: clock.begin(Stage.TREE))
 
-    made = kept.find(view.scene, (view.seed, view.rules.max_depth), make) if kept else make()
+    made = kept.find(view.scene, (view.seed, view.rules.max_depth, view.model.shared), make) if kept else make()
     statistics = {"light_paths": sum(drawn), "lights": {"surface": made.lights.count}}
     if not made.groups:
         return None, statistics

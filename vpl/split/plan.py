@@ -150,7 +150,8 @@ def _cut_rays(rest: float, samples: int, model: CostModel) -> tuple[float, float
 
     The least of (rest / samples + cut variance / rays) × (samples + rays × their cost).
     """
-    rays = samples * (model.cut_variance / (model.ray_cost * max(rest, 1e-9))) ** 0.5
+    wanted = (model.cut_variance / (model.ray_cost * max(rest, 1e-9))) ** 0.5
+    rays = samples * min(wanted, model.most_rays)
     # A cut has some nodes, however few rays are wanted
     error = float(np.clip((rays / model.coarse_rays) ** -model.error_slope, model.finest_error, model.coarsest_error))
     return model.coarse_rays * error ** (-1 / model.error_slope), error

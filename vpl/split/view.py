@@ -158,8 +158,8 @@ class View:
     ``scene``; ``emitters``: emitter sampler; ``perturbed``: shapes without a minorant; ``rules`` of the paths; ``ray``,
     ``active``: of the camera, evaluated, the ``samples`` of a pixel side by side; ``width`` of the image in pixels;
     ``seed``; ``importance`` of radiance in each pixel and ``outgoing`` radiance of surfaces: for Russian roulette;
-    ``learning_count``: number of camera rays, for the size of the emitter sampler's learning; ``model``: constants of
-    the decisions.
+    ``learning_count``: number of camera rays, for the sizes of the pilot and of the emitter sampler's learning;
+    ``model``: constants of the decisions.
     """
 
     scene: mi.Scene
