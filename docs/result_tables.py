@@ -93,6 +93,15 @@ TABLES = {
     ),
     "views": Table({"": ("manylights_views",)}, (Column("ratio", ratio="speedup"),), first="scene, view"),
     "own": Table({"": ("manylights_own",)}, (Column("ratio", ratio="speedup"),)),
+    "timed10": Table(
+        {"": ("manylights_timed10",)},
+        (
+            Column("`path`: samples", "{path[samples]:.0f}"),
+            Column("`manylights`: samples", "{manylights[samples]:.0f}"),
+            Column("ratio", ratio="speedup"),
+        ),
+        order="speedup",
+    ),
     "timed": Table({"": ("manylights_timed",)}, (Column("ratio", ratio="speedup"),)),
     "timed_wide": Table(
         {"": ("manylights_timed_wide",)},
