@@ -1,6 +1,7 @@
 """Make the gallery: every scene of scenes/ by `path` and by `manylights` at equal time, and a reference.
 
-    ./run -- python docs/gallery.py
+    ./run -- python docs/gallery.py                               # all scenes
+    ./run -- python docs/gallery.py --scenes foliage lamp_grid    # two scenes; the others stay
 
 Renders references by `manylights`, or by `adaptivedirect` for scenes with direct light alone, and keeps the references
 in output/gallery. Compares by compare.py. Writes docs/gallery.md and the pictures in docs/gallery/.
@@ -112,12 +113,20 @@ def described():
     return {cell[0][1:].partition("]")[0]: f"{cell[1][0].upper()}{cell[1][1:]}. For: {cell[2]}." for cell in cells}
 
 
+def sections_of(page):
+    """Sections of the page by the name of the scene; the introduction has no name."""
+    introduction, *others = page.split("\n## ")
+    return {"": introduction} | {one.partition("\n")[0]: f"## {one}" for one in others}
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=30.0, help="time of an image (default: 30)")
     parser.add_argument("--reference-seconds", type=float, default=150.0, help="time of a reference (default: 150)")
+    known = sorted(path.stem for path in SCENES.glob("*.xml"))
+    parser.add_argument("--scenes", nargs="+", choices=known, metavar="NAME", help="scenes to render (default: all)")
     options = parser.parse_args()
-    names = sorted(path.stem for path in SCENES.glob("*.xml"))
+    names = sorted(set(options.scenes or known))
     command_line.set_variant("llvm_ad_rgb")
     (WORK / "references").mkdir(parents=True, exist_ok=True)
     for name in names:
@@ -129,8 +138,9 @@ def main():
     if status:
         return status
     results = json.loads((WORK / "results.json").read_text())
-    shutil.rmtree(PICTURES, ignore_errors=True)
-    PICTURES.mkdir()
+    if not options.scenes:
+        shutil.rmtree(PICTURES, ignore_errors=True)
+    PICTURES.mkdir(exist_ok=True)
     for name in names:
         for label in (*INTEGRATORS, REFERENCE):
             convert(WORK / f"{name}.{label}.png", PICTURES / f"{name}.{label}.jpg")
@@ -138,7 +148,9 @@ def main():
     renders = [one for scene in results["scenes"] for one in scene["renders"]]
     doubts = BUSY if tables.load_warnings(renders, results["machine"]["cores"]) else ""
     introduction = INTRODUCTION.format(seconds=options.seconds, width=WIDTH, doubts=doubts)
-    PAGE.write_text("\n".join([introduction, *(rows(scene, introduced) for scene in results["scenes"])]))
+    kept = sections_of(PAGE.read_text()) if options.scenes else {"": introduction}
+    kept |= {scene["name"]: rows(scene, introduced) for scene in results["scenes"]}
+    PAGE.write_text("\n".join(kept[name] for name in sorted(kept)))
     return 0
 
 
