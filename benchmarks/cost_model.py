@@ -14,9 +14,9 @@ import argparse
 import sys
 import time
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -25,7 +25,7 @@ mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
 from benchmarks import results, scenes  # noqa: E402
-from benchmarks.rivals import DEPTH, TRIMMED  # noqa: E402
+from benchmarks.rivals import DEPTH, trimmed_variance  # noqa: E402
 from vpl.split.cost_model import CostModel  # noqa: E402
 
 # Rooms with one and with many emitters, noisy and smooth indirect light
@@ -45,19 +45,16 @@ class Measured:
         integrator = mi.load_dict({"type": "manylights", "max_depth": DEPTH})
         integrator.cost_model = model
         for seed in range(passes + 1):
-            dr.sync_thread()
-            start = time.process_time()
-            image = mi.render(scene, integrator=integrator, spp=spp, seed=seed)
-            image, spent = np.array(image, np.float64)[..., :3], time.process_time() - start
+            render = partial(mi.render, scene, integrator=integrator, spp=spp, seed=seed)
+            image, spent = scenes.timed(render, time.process_time)
             # The first render compiles
             if seed:
-                self.images.append(image)
+                self.images.append(np.array(image, np.float64)[..., :3])
                 self.seconds.append(spent)
 
     def product(self, scale: np.ndarray) -> float:
         """Relative variance between images × median CPU seconds."""
-        error = np.sort((np.var(self.images, axis=0, ddof=1) / scale).mean(-1).ravel())
-        return error[: int(len(error) * (1 - TRIMMED))].mean() * float(np.median(self.seconds))
+        return trimmed_variance(self.images, scale) * float(np.median(self.seconds))
 
 
 def ratios_of(name: str, constants: list[str], options) -> dict:

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks import scenes
-from benchmarks.rivals import DEPTH, TRIMMED
+from benchmarks.rivals import DEPTH, trimmed_variance
 from comparison.rendering import SharedStart
 from vpl.split import estimator, path_tracer
 
@@ -110,13 +110,9 @@ def classes_of(name: str, width: int, passes: int) -> dict:
     alone[_ALL] = [image - traced for image, traced in zip(images, alone[_ALL], strict=True)]
     mean = np.mean(images, axis=0)
     scale = mean**2 + 0.01 * mean.mean() ** 2
-
-    def variance(of_class) -> float:
-        error = np.sort((np.var(of_class, axis=0, ddof=1) / scale).mean(-1).ravel())
-        return float(error[: int(len(error) * (1 - TRIMMED))].mean())
-
-    found, light = [variance(of_class) for of_class in alone], [np.mean(of_class) / mean.mean() for of_class in alone]
-    total, whole = sum(found), variance(images)
+    found = [trimmed_variance(of_class, scale) for of_class in alone]
+    light = [np.mean(of_class) / mean.mean() for of_class in alone]
+    total, whole = sum(found), trimmed_variance(images, scale)
     row = "".join(f"{100 * x / total:6.0f} ({100 * y:2.0f})" for x, y in zip(found, light, strict=True))
     print(f"{name:16s}{row}{total:10.4f}{whole:10.4f}", flush=True)
     shares = {

@@ -52,6 +52,12 @@ def light_paths_times(factor: float):
         yield
 
 
+def trimmed_variance(images: list, scale: np.ndarray, trimmed: float = TRIMMED) -> float:
+    """Variance between images over ``scale``, without the fraction ``trimmed`` of pixels with the largest errors."""
+    error = np.sort((np.var(images, axis=0, ddof=1) / scale).mean(-1).ravel())
+    return float(error[: int(len(error) * (1 - trimmed))].mean())
+
+
 class Rival:
     """Passes of one integrator with one sampler on one scene, of about ``seconds`` each; ``light_paths``: factor on the
     chosen number; ``more``: properties of ``manylights``."""
@@ -93,9 +99,7 @@ class Rival:
 
     def product(self, scale: np.ndarray, trimmed: float = TRIMMED) -> float:
         """Variance × seconds of a pass, without the fraction ``trimmed`` of the pixels with the largest errors."""
-        error = np.var(self.images, axis=0, ddof=1) / scale
-        error = np.sort(error.mean(-1).ravel())
-        return error[: int(len(error) * (1 - trimmed))].mean() * float(np.median(self.seconds))
+        return trimmed_variance(self.images, scale, trimmed) * float(np.median(self.seconds))
 
     def mean(self) -> tuple[float, float]:
         """Mean of the image over passes, and its standard error."""

@@ -66,11 +66,10 @@ class Contestant:
             self._render(0)
 
     def _render(self, seed: int) -> float:
-        dr.sync_thread()
-        start = time.process_time()
-        dr.eval(mi.render(self._scene, integrator=self.integrator, spp=self._spp, seed=seed))
-        dr.sync_thread()
-        return time.process_time() - start
+        def image():
+            return mi.render(self._scene, integrator=self.integrator, spp=self._spp, seed=seed)
+
+        return scenes.timed(image, time.process_time)[1]
 
     def measure(self, seed: int) -> None:
         """Render once more."""

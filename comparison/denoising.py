@@ -9,7 +9,6 @@ results than a box filter.
 """
 
 import time
-from contextlib import suppress
 from functools import cache
 
 import drjit as dr
@@ -17,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from .images import colour
+from .scene_files import known_parameters
 
 FEATURE_SPP = 16
 FEATURE_SEED = 0xFEA7  # combined with the seed of the image, to avoid correlated noise
@@ -147,8 +147,5 @@ def _three(value):
 def for_denoising(integrator, parameters):
     """Return the parameters of an integrator whose images will be denoised: with `denoised`, if the integrator has this
     property and it is not given."""
-    properties = mi.Properties(integrator)
-    properties["denoised"] = True
-    with suppress(RuntimeError, ValueError):
-        mi.PluginManager.instance().create_object(properties)
-    return {"denoised": True, **parameters} if properties.was_queried("denoised") else parameters
+    usual = {"denoised": True}
+    return usual | parameters if known_parameters(integrator, usual) else parameters

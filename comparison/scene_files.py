@@ -75,12 +75,8 @@ class SceneFile:
         given, (old_name, old) = dict(parameters or {}), self.integrator
         kept = {key: old[key] for key in old if key not in given and (keep is None or key in keep)}
         if name != old_name or keep is not None:
-            # Mitsuba has no list of a plugin's parameters. A trial creation, even a failed one, records the queried
-            # parameters.
-            tried = _properties(name, kept | given)
-            with suppress(RuntimeError, ValueError):
-                mi.PluginManager.instance().create_object(tried)
-            kept = {key: kept[key] for key in kept if tried.was_queried(key)}
+            known = known_parameters(name, kept | given)
+            kept = {key: kept[key] for key in kept if key in known}
         properties = _properties(name, kept | given)
         mi.PluginManager.instance().create_object(_properties(name, kept | given))
         nodes = self._nodes(mi.ObjectType.Integrator)
@@ -179,6 +175,15 @@ class SceneFile:
 
     def _nodes(self, kind):
         return [node for node in self._state.nodes if node.type == kind]
+
+
+def known_parameters(name, parameters):
+    """Return the names of those `parameters` that a plugin has. Mitsuba has no list of a plugin's parameters: a trial
+    creation, even a failed one, records the queried parameters."""
+    tried = _properties(name, parameters)
+    with suppress(RuntimeError, ValueError):
+        mi.PluginManager.instance().create_object(tried)
+    return {key for key in parameters if tried.was_queried(key)}
 
 
 def _properties(name, parameters):

@@ -146,6 +146,17 @@ def write_image(path, image):
         file.write(str(path))
 
 
+def write_mesh(path, triangles):
+    """Write a binary PLY file; triangles share no vertices and so are flat-shaded."""
+    vertices = np.round(triangles.reshape(-1, 3), 3).astype("<f4")
+    faces = np.empty(len(triangles), [("count", "u1"), ("vertices", "<i4", 3)])
+    faces["count"], faces["vertices"] = 3, np.arange(len(vertices)).reshape(-1, 3)
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    path.write_bytes(head.encode() + vertices.tobytes() + faces.tobytes())
+
+
 def downlight(position, cutoff, intensity, colour, random):
     """Return a spot emitter pointing straight down, with a random intensity around `intensity`."""
     below = numbers(np.subtract(position, (0, 0, 1)))
@@ -156,9 +167,10 @@ def downlight(position, cutoff, intensity, colour, random):
     )
 
 
-def write_scene(document, name, make, images=None, arguments=None, counts=None):
+def write_scene(document, name, make, images=None, arguments=None, counts=None, meshes=None):
     """Run the command line of a generator: write `make(seed, **counts)` to the output (default: `name`.xml), and
-    textures `images` (name -> texels) beside it. Each entry of `counts` (name -> default) becomes an option."""
+    textures `images` (name -> texels) and `meshes` (name -> triangles) beside it. Each entry of `counts` (name ->
+    default) becomes an option."""
     command_line = parser(document, f"{name}.xml")
     for what, usual in (counts or {}).items():
         command_line.add_argument(f"--{what}", type=int, default=usual, help=f"number of {what} (default: {usual})")
@@ -172,6 +184,8 @@ def write_scene(document, name, make, images=None, arguments=None, counts=None):
         output.write_text(make(options.seed, **given))
         for file, texels in (images or {}).items():
             write_image(output.parent / file, texels)
+        for file, triangles in (meshes or {}).items():
+            write_mesh(output.parent / file, triangles)
     except (ValueError, OSError) as error:
         command_line.exit(2, f"{name}: {error}\n")
 

@@ -6,11 +6,9 @@ travels short distances.
     python scenes/foliage.py --output scenes/foliage.xml
 """
 
-from pathlib import Path
-
 import numpy as np
-from elements import box, header, material, parser, sky, sky_image, write_image
-from forest_lights import leaves, write_mesh
+from elements import box, header, material, sky, sky_image, write_scene
+from forest_lights import leaves
 
 SKY, MESH = "foliage_sky.exr", "foliage_leaves.ply"
 LEAVES, RADIUS, HEIGHT = 4000, 1.5, 1.4  # number; of the bush, in metres
@@ -38,17 +36,13 @@ def garden(seed):
     return "\n".join([*parts, box("ground", (-9, -9, -0.2), (9, 9, 0)), sky(SKY), "</scene>"]) + "\n"
 
 
+def day_sky():
+    """Return the texels of a sky with a sun."""
+    return sky_image((0.4, 0.6, 1.1), (0.8, 0.8, 0.7), (0.1, 0.1, 0.1), (400, 360, 290), (0.5, -0.6, 0.9), 4, 0.003)
+
+
 def main(arguments=None):
-    command_line = parser(__doc__, "foliage.xml")
-    options = command_line.parse_args(arguments)
-    output = options.output or Path("foliage.xml")
-    try:
-        output.write_text(garden(options.seed))
-        write_mesh(output.parent / MESH, bush())
-        day = sky_image((0.4, 0.6, 1.1), (0.8, 0.8, 0.7), (0.1, 0.1, 0.1), (400, 360, 290), (0.5, -0.6, 0.9), 4, 0.003)
-        write_image(output.parent / SKY, day)
-    except OSError as error:
-        command_line.exit(2, f"foliage: {error}\n")
+    write_scene(__doc__, "foliage", garden, {SKY: day_sky()}, arguments, meshes={MESH: bush()})
 
 
 if __name__ == "__main__":

@@ -10,10 +10,9 @@ each occlude the sky. The trees are instances of meshes written beside the scene
 """
 
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
-from elements import box, bulb, drum, header, material, numbers, parser, sky, sky_image, slab, tube, write_image
+from elements import box, bulb, drum, header, material, numbers, sky, sky_image, slab, tube, write_scene
 
 CLEARING = 6.0  # metres, radius of the clearing; the ground is 2 * GROUND wide
 GROUND = 45.0
@@ -97,17 +96,6 @@ def meshes():
         "forest_pine.ply": crown(5.2, 13.4, lambda t: 0.5 + 2.6 * np.sin(np.pi * (0.2 + 0.8 * t)), 0.2, 280, random),
         "forest_bush.ply": bush(random),
     }
-
-
-def write_mesh(path, triangles):
-    """Write a binary PLY file; triangles share no vertices and so are flat-shaded."""
-    vertices = np.round(triangles.reshape(-1, 3), 3).astype("<f4")
-    faces = np.empty(len(triangles), [("count", "u1"), ("vertices", "<i4", 3)])
-    faces["count"], faces["vertices"] = 3, np.arange(len(vertices)).reshape(-1, 3)
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
-    head += "".join(f"property float {axis}\n" for axis in "xyz")
-    head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    path.write_bytes(head.encode() + vertices.tobytes() + faces.tobytes())
 
 
 def groups():
@@ -300,16 +288,7 @@ def night_sky():
 
 
 def main(arguments=None):
-    command_line = parser(__doc__, "forest_lights.xml")
-    options = command_line.parse_args(arguments)
-    output = options.output or Path("forest_lights.xml")
-    try:
-        output.write_text(clearing(options.seed))
-        write_image(output.parent / SKY, night_sky())
-        for name, triangles in meshes().items():
-            write_mesh(output.parent / name, triangles)
-    except (ValueError, OSError) as error:
-        command_line.exit(2, f"forest_lights: {error}\n")
+    write_scene(__doc__, "forest_lights", clearing, {SKY: night_sky()}, arguments, meshes=meshes())
 
 
 if __name__ == "__main__":

@@ -68,8 +68,11 @@ def swept(tmp_path_factory, variant):
     except FileExistsError:
         wait_until(lambda: (out / "finished").exists() or (out / "failed").exists())
     else:
-        status = compare.main([*SWEEP, "-o", str(out), "--cache", str(out / "cache")])
-        (out / ("finished" if status == 0 else "failed")).touch()
+        succeeded = False
+        try:
+            succeeded = compare.main([*SWEEP, "-o", str(out), "--cache", str(out / "cache")]) == 0
+        finally:
+            (out / ("finished" if succeeded else "failed")).touch()
     assert (out / "finished").exists(), "compare.py failed in the first process that made the sweep"
     return out
 
