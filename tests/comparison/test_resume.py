@@ -73,6 +73,7 @@ def test_interruption_leaves_a_report_of_what_is_finished(tmp_path, signal_numbe
     assert not list(tmp_path.glob(".*.exr")) and not (tmp_path / "runs" / "kernels").exists()
 
 
+@pytest.mark.stress
 def test_killed_comparison_goes_on_where_it_stopped(tmp_path, monkeypatch):
     process = start(tmp_path)
     os.kill(process.pid, signal.SIGKILL)

@@ -248,6 +248,7 @@ def test_emitters_seen_by_the_camera_equal_path(mixed, plugin):
     assert render(mixed, plugin, 4, 3, max_depth=0).max() == 0
 
 
+@pytest.mark.stress
 def test_hidden_emitters_equal_path(mixed, expected):
     hidden = cache(lambda seed: render(mixed, "path", 512, 1000 + seed, max_depth=2, hide_emitters=True))
     assert_mean_of_reference(mixed, hidden, hide_emitters=True)
@@ -519,6 +520,7 @@ def test_a_medium_is_refused_by_name(plugin):
     assert "participating medium" in str(error.value) + str(error.value.__cause__)
 
 
+@pytest.mark.stress
 def test_virtual_lights_take_adaptive_direct_light(variant):
     scene = mi.load_dict(closed_box({"lamp": area_light()}))
     given = {"max_depth": 3, "vpl_count": 1000, "direct_error": 0.2}

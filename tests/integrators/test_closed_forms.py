@@ -73,6 +73,7 @@ def test_a_disk_over_a_plane(name):
     assert_mean(name, mi.load_dict(scene), 0.5 * 2.0 / (1 + 1.5**2), max_depth=2)
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("name", all_plugins(*DIRECT))
 @pytest.mark.parametrize("depth", [4, *stress(2)])
 def test_light_between_two_disks(name, depth):

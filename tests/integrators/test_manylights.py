@@ -113,6 +113,7 @@ def test_a_blend_of_a_mirror_and_a_diffuse_wall(weight):
     assert_image_of_path(room_of(blend, bulb()), max_depth=4)
 
 
+@pytest.mark.stress
 def test_walls_whose_reflectance_is_negative_in_places():
     """Surfaces around receive negative light from there, which virtual lights carry as well."""
     texels = np.full((4, 4, 3), 0.7)
@@ -195,6 +196,7 @@ def test_shading_normals_far_from_geometric_ones(tmp_path, material):
     assert_image_of_path(box, finds=0.045, max_depth=5)
 
 
+@pytest.mark.stress
 def test_instances(tmp_path):
     box = closed_box(lamp_behind_the_camera(), 16)
     ball = {"type": "ply", "filename": coarse_ball(tmp_path), "bsdf": {"type": "twosided", "of": {"type": "diffuse"}}}
@@ -272,6 +274,7 @@ FILTERS = {
 }  # fmt: skip
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("options", ["gaussian", *stress("lanczos")])
 def test_filters(options):
     box = closed_box(lamp_behind_the_camera(), 32)

@@ -39,6 +39,7 @@ def test_light_through_four_masks(max_depth):
     assert_image_of_prb(veiled_room(), max_depth)
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("lamp", ["point", *stress("directional", "spot")])
 def test_light_from_one_point_or_direction_does_not_pass(lamp):
     """Only next-event estimation finds the emitter, and masks block its rays."""

@@ -183,6 +183,7 @@ def hostile_lights(draw):
     return center, radius * scale, axis, cone_cos, intensity * 10.0 ** -rng.uniform(0, decades, count)
 
 
+@pytest.mark.stress
 @given(hostile_lights())
 @settings(max_examples=examples(150), deadline=None)
 def test_every_invariant_holds_for_hostile_lights(lights):

@@ -406,6 +406,7 @@ def test_a_wider_window_and_the_angular_weight_do_what_they_say():
 # --- Representatives ---
 
 
+@pytest.mark.stress
 def test_representatives_are_drawn_in_proportion_to_intensity():
     rng = np.random.default_rng(10)
     position, direction, flux = random_lights(rng, 12)

@@ -69,6 +69,7 @@ def two_rooms():
     return scene
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("views", [two_rooms, *stress(two_views)])
 def test_a_second_camera_sees_the_image_of_path_by_the_lights_of_the_first(made, views):
     scene = mi.load_dict(views())
