@@ -73,8 +73,10 @@ class ManyLightsIntegrator(GatheringIntegrator):
     ``hide_emitters``.  Image and derivatives have the means of ``prb`` and different seeds, so the gradient of a
     squared error has the mean that ``prb`` gives.  Derivatives have the limits of ``prb``: they leave out moving edges
     of shapes and shadows, and the positions of point emitters.  Derivatives also have the cost and the noise of
-    ``prb``: virtual lights reduce the noise of the image alone.  A wrapper ``aov`` passes derivatives on; ``moment``
-    raises an error.
+    ``prb``: virtual lights reduce the noise of the image alone.  Pixels share the errors of virtual lights.  A
+    parameter that acts on many pixels, such as the colour of a wall, can therefore have a noisier gradient than with an
+    image by ``prb``; ``virtual_lights`` false avoids this.  A wrapper ``aov`` passes derivatives on; ``moment`` raises
+    an error.
 
     **Kept lights.** With ``keep_lights``, the frames of a moving camera or several sensors share the virtual lights of
     a seed and their tree, up to two million lights.  Each frame keeps the mean of ``path`` and has a pilot of its own;

@@ -142,6 +142,24 @@ def test_a_depth_of_zero_has_no_gradients():
     assert not np.array(dark.render_forward(scene, parameters)).any()
 
 
+def test_a_depth_of_more_than_32_bits_is_no_limit():
+    scene = mi.load_dict(room())
+    parameters = with_gradients(scene, LAMP)
+    found, expected = (
+        gradients(linear_loss(mi.render(scene, parameters, integrator=plugin(name, max_depth=depth))), parameters, LAMP)
+        for name, depth in (("manylights", 2**33), ("prb", -1))
+    )
+    np.testing.assert_allclose(found, expected, rtol=ROUNDING)
+
+
+def test_there_are_no_gradients_below_moment():
+    scene = mi.load_dict(room())
+    parameters = with_gradients(scene, LAMP)
+    wrapped = mi.load_dict({"type": "moment", "image": {"type": "manylights", "max_depth": DEPTH}})
+    with pytest.raises(RuntimeError, match="does not depend"):
+        dr.backward(linear_loss(mi.render(scene, parameters, integrator=wrapped)))
+
+
 def test_the_integrator_of_a_scene_below_aov():
     nested = {"type": "manylights", "max_depth": DEPTH}
     scene = mi.load_dict(room(integrator={"type": "aov", "aovs": "depth:depth", "image": nested}))
