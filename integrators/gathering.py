@@ -131,10 +131,13 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         _hear_interruptions()
         with exclusive(sensor=sensor, integrator=self):
             outer, self._sensor = self._sensor, sensor
+            own = sensor.sampler().sample_count()
             try:
                 return self._render(scene, sensor, seed, spp, develop, evaluate)
             finally:
                 self._sensor = outer
+                # Mitsuba leaves spp there; a later call without spp, as of gradients, means that of the scene
+                sensor.sampler().set_sample_count(own)
 
     def _render(self, *arguments):
         """Render, with exclusive use of the sensor and the integrator."""
@@ -223,8 +226,14 @@ class GatheringIntegrator(mi.SamplingIntegrator):
 
     def render_forward(self, *args, **kwargs):
         """Not supported: the choice of samples depends on earlier results, discontinuously."""
-        raise NotImplementedError(f"{type(self).__name__} cannot be differentiated: use Mitsuba's prb integrators.")
+        self._refuse_gradients()
 
     def render_backward(self, *args, **kwargs):
         """Not supported: the choice of samples depends on earlier results, discontinuously."""
-        raise NotImplementedError(f"{type(self).__name__} cannot be differentiated: use Mitsuba's prb integrators.")
+        self._refuse_gradients()
+
+    def _refuse_gradients(self):
+        raise NotImplementedError(
+            f"{type(self).__name__} cannot be differentiated: use manylights, whose gradients are those of prb, or one "
+            "of Mitsuba's prb integrators"
+        )

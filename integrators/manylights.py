@@ -25,6 +25,8 @@ from .manual import manual_page
 
 # Samples of a pixel by which the pilot and its learning are sized where passes share them: a usual size of a pass
 _SHARED_SAMPLES = 16
+# Largest depth that prb can count, with 32 bits
+_DEEPEST = 2**32 - 1
 
 
 @manual_page
@@ -66,6 +68,16 @@ class ManyLightsIntegrator(GatheringIntegrator):
     the command writes.  It depends on the seed and not on the clock.  The passes of ``manylights.render`` and of the
     command share the pilot of the first pass; each pass draws its own lights.
 
+    **Gradients.** ``mi.render(scene, params, integrator=...)`` has gradients in ``*_ad_*`` variants.  The image is that
+    of ``manylights``, and its derivatives are those of ``prb`` with the same ``max_depth``, ``rr_depth`` and
+    ``hide_emitters``.  Image and derivatives have the means of ``prb`` and different seeds, so the gradient of a
+    squared error has the mean that ``prb`` gives.  Derivatives have the limits of ``prb``: they leave out moving edges
+    of shapes and shadows, and the positions of point emitters.  Derivatives also have the cost and the noise of
+    ``prb``: virtual lights reduce the noise of the image alone.  Pixels share the errors of virtual lights.  A
+    parameter that acts on many pixels, such as the colour of a wall, can therefore have a noisier gradient than with an
+    image by ``prb``; ``virtual_lights`` false avoids this.  A wrapper ``aov`` passes derivatives on; ``moment`` raises
+    an error.
+
     **Kept lights.** With ``keep_lights``, the frames of a moving camera or several sensors share the virtual lights of
     a seed and their tree, up to two million lights.  Each frame keeps the mean of ``path`` and has a pilot of its own;
     lights that stand for emitters are made for each frame.  The price is quality.  The lights lie where the first
@@ -85,7 +97,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
       passed only masks, so it is too dark where nothing is behind a mask.  With ``hide_emitters``, ``path`` hides an
       environment behind a mask, which ``manylights`` shows.  Alpha is that of ``path``.
     - Surfaces only: the plugin refuses a scene with a participating medium.
-    - ``*_rgb`` and ``*_mono`` variants only.  Not differentiable, and no recording by ``dr.freeze``.
+    - ``*_rgb`` and ``*_mono`` variants only.  No recording by ``dr.freeze``.
     - Materials and emitters: all that ``path`` renders.  Virtual lights do not carry light that metals or surfaces with
       bump or normal maps reflect, nor light that passes a mask or thin glass between x1 and x2: paths trace it.
 
@@ -150,6 +162,41 @@ class ManyLightsIntegrator(GatheringIntegrator):
             yield
         finally:
             self._makes_start = self._only_starts = False
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        """Derivative of the image, by ``prb``: a tensor of the shape of the image, see :meth:`_adjoint` for errors.
+
+        ``params``: parameters with derivatives; ``sensor``: a sensor or its index; ``spp``: 0 for that of the sampler.
+        """
+        with self._adjoint(scene, sensor) as (prb, sensor):
+            derivative = prb.render_forward(scene, params, sensor, seed, spp)
+        return derivative if self.max_depth > 0 else dr.zeros(mi.TensorXf, derivative.shape)
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        """Add the derivatives of parameters for those of the image, ``grad_in``, by ``prb``; otherwise as
+        :meth:`render_forward`."""
+        with self._adjoint(scene, sensor) as (prb, sensor):
+            # prb shows emitters to paths of length 0
+            if self.max_depth > 0:
+                prb.render_backward(scene, params, grad_in, sensor, seed, spp)
+
+    @contextmanager
+    def _adjoint(self, scene, sensor):
+        """The integrator ``prb`` with the same paths, and the sensor, which both are reserved for this thread.
+
+        Raises RuntimeError in a variant without derivatives and while another thread renders with the same sensor,
+        ValueError for a participating medium.
+        """
+        if "_ad_" not in mi.variant():
+            raise RuntimeError(
+                f'manylights: the variant "{mi.variant()}" has no derivatives: set one that has, such as llvm_ad_rgb'
+            )
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        with exclusive(sensor=sensor, integrator=self):
+            self.check_scene(scene)
+            depth = self.max_depth if self.max_depth <= _DEEPEST else -1
+            paths = {"max_depth": depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
+            yield mi.load_dict({"type": "prb", **paths}), sensor
 
     def _sample(self, scene, sampler, ray, active):
         clock, shared = Clock(Stage.SCENE), self._shared
