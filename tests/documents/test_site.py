@@ -4,6 +4,7 @@ import html
 import re
 import subprocess
 import sys
+import tomllib
 
 import mitsuba as mi
 import pytest
@@ -65,6 +66,12 @@ def test_the_sidebar_has_every_page(site):
     pages = {page.stem for page in (ROOT / "docs").glob("*.md")} - {"index"}
     assert set(re.findall(r'href="(\w+)\.html"', sidebar)) == pages
     assert "url=docs/index.html" in (site / "index.html").read_text().replace(" ", "")
+
+
+def test_every_page_shows_the_version_of_the_package(site):
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    for page in ("README", "docs/start", "docs/plugins/vpl"):
+        assert f'<span class="sidebar-brand-text">Manylights {version}</span>' in (site / f"{page}.html").read_text()
 
 
 def test_lines_of_links_for_single_files_are_left_out(site):
