@@ -1,10 +1,12 @@
 """The installed package: contents of the wheel, commands, types, and discovery of plugins by Mitsuba."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import zipfile
 from importlib.metadata import Distribution
 from pathlib import Path
@@ -156,6 +158,28 @@ def test_commands_and_the_demo_are_installed(environment):
     assert all(file.is_file() and file.is_relative_to(environment) for file in files)
 
 
+def extras():
+    """Names of the modules of optional packages that the commands use."""
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    packages = [requirement for extra in ("compare", "denoise", "cluster") for requirement in listed[extra]]
+    return [re.match(r"[\w-]+", package)[0].replace("-", "_") for package in packages]
+
+
+@pytest.mark.parametrize("command", ["manylights", "compare"])
+def test_help_needs_no_optional_package(environment, command):
+    """A module None in sys.modules cannot be imported."""
+    hide = f"import sys\nsys.modules |= dict.fromkeys({extras()})\nimport {command}\n"
+    assert "usage: " in run(environment, "python", "-c", f"{hide}{command}.main(['--help'])")
+
+
+def test_a_comparison_names_the_missing_package(environment):
+    script = f"import sys\nsys.modules |= dict.fromkeys({extras()})\nimport compare\nprint(compare.main(['--demo']))"
+    done = subprocess.run(
+        [environment / "bin/python", "-c", script], cwd=environment, capture_output=True, text=True, timeout=PATIENCE
+    )
+    assert done.stdout == "1\n" and "pip install 'manylights[compare]'" in done.stderr
+
+
 TYPED = """
 from typing import assert_type
 import manylights
@@ -259,3 +283,9 @@ def test_ten_lines_of_a_new_user_run_without_optional_packages(bare, tmp_path, c
     pin = "import os\nos.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n" if cores == "one" else ""
     said = run(bare, "python", "-c", pin + NEW_USER, folder=tmp_path)
     assert said.endswith("4 [24, 16] [24, 16]\n")  # after colours of Mitsuba's log
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("command", ["manylights", "manylights-compare"])
+def test_commands_of_a_bare_installation_show_their_help(bare, command):
+    assert f"usage: {command}" in run(bare, command, "--help")
