@@ -45,6 +45,8 @@ def test_every_plugin_has_a_page_with_all_of_its_properties(site, name):
     rows = re.findall(r'paramname[^>]*"><span class="pre">(\w+)', table)
     assert rows == [knob.name for knob in knobs_of(type(mi.load_dict({"type": name})))]
     assert "|int|" not in text(page) and "{" not in table
+    description = page.read_text().partition("</h1>")[2].partition("<table")[0]
+    assert description.count("<p>") == 1, "the table comes after the first paragraph"
 
 
 def test_links_to_plugins_lead_to_their_pages(site):
