@@ -30,7 +30,11 @@ import shlex
 import signal
 import sys
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
+
+MISSING = "the package '{}' is missing; pip install 'manylights[compare]' brings it"
+OPTIONAL = ("flip_evaluator", "matplotlib")  # imported after the options are parsed: --help does not need them
 
 try:
     from comparison import baseline, command_line, machine, metrics, references, report, sweeps, tables, worker
@@ -43,7 +47,7 @@ try:
     from comparison.scene_comparison import SceneComparison
     from comparison.scene_files import short_name
 except ModuleNotFoundError as missing:
-    sys.exit(f"compare: the package '{missing.name}' is missing; pip install 'manylights[compare]' brings it")
+    sys.exit(f"compare: {MISSING.format(missing.name)}")
 
 ROOT = Path(__file__).resolve().parent
 PACKAGED = ROOT / "comparison" / "scenes"  # location of the demo scenes in a wheel
@@ -241,7 +245,10 @@ def check_scenes(paths, reference):
 
 
 def run(options, command):
-    """Compare on all scenes; return the exit status."""
+    """Compare on all scenes; return the exit status. Raises ModuleNotFoundError if an optional package is missing."""
+    for name in OPTIONAL:
+        if find_spec(name) is None:
+            raise ModuleNotFoundError(MISSING.format(name))
     if options.denoise:
         import_oidn()
     command_line.set_variant(options.mode)

@@ -5,7 +5,6 @@ noise, so that an exact image scores zero on average. An error below the noise o
 cannot be distinguished from zero.
 """
 
-import flip_evaluator
 import numpy as np
 
 EPSILON = 1e-2  # relMSE: weight of the squared mean reference in the denominator
@@ -102,6 +101,8 @@ def flip(image, reference):
     scale = 1 / np.mean(reference, dtype=np.float64)
     shown = [np.nan_to_num(scale * np.asarray(one, np.float64), posinf=0, neginf=0) for one in (reference, image)]
     shown = [np.clip(one, 0, np.finfo(np.float32).max).astype(np.float32) for one in shown]
+    import flip_evaluator  # optional: only comparisons need the package
+
     values, mean, settings = flip_evaluator.evaluate(*shown, "HDR", applyMagma=False)
     stops = {key: settings[key] + float(np.log2(scale)) for key in ("startExposure", "stopExposure")}
     return np.clip(values[..., 0], 0, 1), float(mean), settings | stops

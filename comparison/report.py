@@ -4,7 +4,7 @@ import json
 from datetime import UTC, datetime
 from pathlib import Path
 
-from . import images, machine, metrics, page, paper_tables, tables, verdict
+from . import images, machine, metrics, paper_tables, tables, verdict
 
 FORMAT = 2  # of results.json; incremented by incompatible changes
 
@@ -75,6 +75,8 @@ def _limit_text(scene):
 
 def write(folder, results, pictures):
     """Write `results.json` and `report.html` to a folder. `pictures`: the `Pictures` (or None) of each scene."""
+    from . import page  # needs matplotlib, an optional package
+
     folder = Path(folder)
     with images.replacing(folder / "results.json") as file:
         file.write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")

@@ -5,6 +5,7 @@ The source folder is the root of the project, so that links between README.md, s
 """
 
 import sys
+import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -12,11 +13,12 @@ sys.path[:0] = [str(ROOT), str(ROOT / "docs" / "site")]
 
 project = "Manylights"
 copyright = "The Manylights authors"
-html_title = "Manylights"
+release = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+html_title = f"Manylights {release}"
 root_doc = "docs/index"
 include_patterns = [
-    "README.md", "CHANGELOG.md", "scenes/README.md", "notebooks/README.md", "docs/*.md", "docs/plugins/*.rst",
-    "docs/code/*.rst",
+    "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "scenes/README.md", "notebooks/README.md",
+    "docs/*.md", "docs/plugins/*.rst", "docs/code/*.rst",
 ]  # fmt: skip
 exclude_patterns = [".*", "build", "dist", "output", "shared"]
 

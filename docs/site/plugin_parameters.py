@@ -1,6 +1,10 @@
-"""Directive `pluginparameters` of Mitsuba's manual: a list of lists (name, type, description), shown as a table."""
+"""Directive `pluginparameters` of Mitsuba's manual: a list of lists (name, type, description), shown as a table.
+
+Docstrings have the list first, as in Mitsuba. Pages show the table after the first paragraph of the description.
+"""
 
 from docutils import nodes
+from sphinx.transforms import SphinxTransform
 from sphinx.util.docutils import SphinxDirective
 
 TITLES, WIDTHS = ("Parameter", "Type", "Description"), (20, 12, 68)
@@ -25,6 +29,19 @@ class PluginParameters(SphinxDirective):
         return [_table(rows)]
 
 
+class AfterDescription(SphinxTransform):
+    """Move tables of parameters behind the next paragraph."""
+
+    default_priority = 400
+
+    def apply(self):
+        for table in list(self.document.findall(nodes.table)):
+            if "paramstable" in table["classes"]:
+                paragraph = table.next_node(nodes.paragraph, descend=False, siblings=True)
+                table.parent.remove(table)
+                paragraph.parent.insert(paragraph.parent.index(paragraph) + 1, table)
+
+
 def _table(rows):
     group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in WIDTHS), cols=len(WIDTHS))
     group += nodes.thead("", _row([nodes.paragraph(text=title)] for title in TITLES))
@@ -38,4 +55,5 @@ def _row(cells):
 
 def setup(app):
     app.add_directive("pluginparameters", PluginParameters)
+    app.add_transform(AfterDescription)
     return {"parallel_read_safe": True}

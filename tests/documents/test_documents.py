@@ -4,13 +4,15 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from tests.support.paths import ROOT
 
-PAGES = [ROOT / "README.md", ROOT / "scenes" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+FRONT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "scenes/README.md")]
+PAGES = [*FRONT, *sorted((ROOT / "docs").glob("*.md"))]
 RESULTS = sorted((ROOT / "docs" / "results").glob("*.json"))
 PLUGINS = {file for file in (ROOT / "integrators").glob("*.py") if "\nmi.register_integrator(" in file.read_text()}
 
@@ -38,6 +40,21 @@ def test_links_lead_somewhere(page):
 
 def test_readme_is_one_page():
     assert len(re.sub(r"<!--.*?-->", "", (ROOT / "README.md").read_text()).split()) < 1500
+
+
+def test_the_citation_in_readme_agrees_with_the_citation_file_and_the_package():
+    readme, citation = (ROOT / "README.md").read_text(), (ROOT / "CITATION.cff").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    (entry,) = re.findall(r"```bibtex\n(.*?)```", readme, re.DOTALL)
+    fields = dict(re.findall(r"^  (\w+) = \{+(.*?)\}+,?$", entry, re.MULTILINE))
+    listed = dict(re.findall(r'^([\w-]+): "?(.+?)"?$', citation, re.MULTILINE))
+    assert entry.startswith("@software{manylights,") and set(fields) == {"title", "author", "version", "license"}
+    assert (fields["title"], fields["version"], fields["license"]) == (
+        listed["title"], listed["version"], listed["license"],
+    )  # fmt: skip
+    assert (fields["version"], fields["license"]) == (project["version"], project["license"])
+    authors = re.findall(r"^  - name: (The .+)$", citation, re.MULTILINE)
+    assert authors == [fields["author"]] == [author["name"] for author in project["authors"]]
 
 
 def check_tables(root):

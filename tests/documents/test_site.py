@@ -4,6 +4,7 @@ import html
 import re
 import subprocess
 import sys
+import tomllib
 
 import mitsuba as mi
 import pytest
@@ -44,6 +45,8 @@ def test_every_plugin_has_a_page_with_all_of_its_properties(site, name):
     rows = re.findall(r'paramname[^>]*"><span class="pre">(\w+)', table)
     assert rows == [knob.name for knob in knobs_of(type(mi.load_dict({"type": name})))]
     assert "|int|" not in text(page) and "{" not in table
+    description = page.read_text().partition("</h1>")[2].partition("<table")[0]
+    assert description.count("<p>") == 1, "the table comes after the first paragraph"
 
 
 def test_links_to_plugins_lead_to_their_pages(site):
@@ -65,6 +68,12 @@ def test_the_sidebar_has_every_page(site):
     pages = {page.stem for page in (ROOT / "docs").glob("*.md")} - {"index"}
     assert set(re.findall(r'href="(\w+)\.html"', sidebar)) == pages
     assert "url=docs/index.html" in (site / "index.html").read_text().replace(" ", "")
+
+
+def test_every_page_shows_the_version_of_the_package(site):
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    for page in ("README", "docs/start", "docs/plugins/vpl"):
+        assert f'<span class="sidebar-brand-text">Manylights {version}</span>' in (site / f"{page}.html").read_text()
 
 
 def test_lines_of_links_for_single_files_are_left_out(site):

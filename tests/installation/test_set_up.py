@@ -1,6 +1,7 @@
 """The command ./run, with stand-ins for Python and apt: nothing is downloaded or installed here."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -19,7 +20,7 @@ case $* in
     -V) echo 'Python 3.11.9' ;;
     *version_info?:2*) echo 3.11 ;;
     *'-m venv'*) for folder; do :; done; mkdir -p "$folder/bin"; cp "$0" "$folder/bin/python" ;;
-    *'-m pip'*) [ ! -e "$STATE/kill" ] || kill -9 0; [ ! -e "$STATE/offline" ] ;;
+    *'-m pip'*) [ ! -e "$STATE/slow" ] || sleep 3; [ ! -e "$STATE/kill" ] || kill -9 0; [ ! -e "$STATE/offline" ] ;;
     *llvm_version*)
         case $DRJIT_LIBLLVM_PATH in */.venv/system/*) ;; *) [ ! -e "$STATE/old_llvm" ] ;; esac ;;
     *'import drjit'*) [ ! -e "$STATE/no_libatomic" ] ;;
@@ -176,6 +177,38 @@ def test_completes_after_an_error_and_after_being_killed(project):
     project.run("--", "true")
     assert project.calls("-e .[test]") == 1
     assert project.run("--", "true").stderr == ""
+
+
+def test_a_long_step_counts_seconds_on_a_terminal_only(project):
+    project.set("slow")
+    assert "\r" not in project.run("--", "true").stderr
+    shutil.rmtree(project.folder / ".venv")
+    terminal, process_end = os.openpty()
+    call = [project.folder / "run", "--", "true"]
+    subprocess.run(call, env=project.environment, stderr=process_end, timeout=PATIENCE, check=True)
+    os.close(process_end)
+    shown = os.read(terminal, 10_000).decode()
+    os.close(terminal)
+    assert "\r1 s " in shown and "\r2 s " in shown
+    lines = [line.strip() for line in re.split(r"[\r\n]+", shown) if line.strip()]
+    assert all(re.match(r"\d+ s$|Setting up \(once\): ", line) for line in lines) and lines[-1].endswith(": done")
+
+
+def test_ctrl_c_during_a_long_step_ends_the_counter(project):
+    project.set("slow")
+    terminal, process_end = os.openpty()
+    call = [project.folder / "run", "--", "true"]
+    with subprocess.Popen(call, env=project.environment, stderr=process_end, start_new_session=True) as process:
+        os.close(process_end)
+        shown = ""
+        while "1 s " not in shown:
+            shown += os.read(terminal, 10_000).decode()
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(timeout=PATIENCE) in (130, -signal.SIGINT)
+        with pytest.raises(OSError):  # the terminal reports an error once no process has it open
+            while os.read(terminal, 10_000):
+                pass
+    os.close(terminal)
 
 
 def test_sets_up_again_when_what_it_depends_on_changes(project):
