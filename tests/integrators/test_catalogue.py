@@ -119,9 +119,10 @@ def measured(sensor, **film_options):
 @pytest.mark.parametrize("sensor", [*QUICK_SENSORS, *stress(*(name for name in SENSORS if name not in QUICK_SENSORS))])
 def test_every_sensor(sensor):
     scene = measured(sensor)
-    reference = cache(lambda seed: render(scene, "prb", 256, seed, max_depth=2))
+    tiles, spp = (1, 4096) if sensor in ONE_PIXEL else (4, 256)
+    reference = cache(lambda seed: render(scene, "prb", spp, seed, max_depth=2))
     for name in ("lightcuts", "adaptivedirect"):
-        assert_mean_of_reference(scene, name, 256, reference, tiles=1 if sensor in ONE_PIXEL else 4)
+        assert_mean_of_reference(scene, name, spp, reference, tiles=tiles)
 
 
 @pytest.mark.stress

@@ -92,8 +92,10 @@ def test_every_material_under_every_emitter(emitter, material):
     if emitter == "directionalarea":
         pytest.skip("path does not sample it: the image is black")
     scene = stage(EMITTERS[emitter](), one_of(MATERIALS[material]()), 16)
+    # The reference finds light behind glass by chance
+    spp = 256 if "dielectric" in material else 128
     for max_depth in (2, 3, 5, -1):
-        assert_image_of_path(scene, reference="prb", lights=max_depth != 2, max_depth=max_depth)
+        assert_image_of_path(scene, spp, reference="prb", lights=max_depth != 2, max_depth=max_depth)
 
 
 @pytest.mark.parametrize("alpha", [0.1, 0.4])

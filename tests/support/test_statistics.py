@@ -47,3 +47,11 @@ def test_a_bias_of_one_tile_is_found():
 
     with pytest.raises(AssertionError, match="p value"):
         statistics.assert_same_mean(pair, 16, finds=0.02)
+
+
+def test_images_without_variance_are_equal_to_rounding():
+    image = noisy_images(0)[0]
+    result = statistics.compare_means([(image * (1 + 1e-7), image)] * 4)
+    assert result == statistics.Comparison(1.0, 0.0)
+    with pytest.raises(AssertionError, match="difference without variance"):
+        statistics.compare_means([(image * (1 + 1e-4), image)] * 4)
