@@ -19,6 +19,7 @@ from vpl.split.roulette import OutgoingRadiance
 from vpl.split.surface_lights import KeptLights
 from vpl.split.view import PathRules, View
 
+from .camera_samples import stratified
 from .gathering import GatheringIntegrator
 from .knobs import Boolean
 from .manual import manual_page
@@ -90,9 +91,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
     - Single pixels may be negative while samples are few, because the traced part is a difference.
     - Caustics: the pilot compares relative variances without the largest 0.1% of the errors.  For a glass ball under a
       small lamp it chooses virtual lights, which reduce that variance but leave a larger plain variance than ``path``.
-    - Samplers: the sensor's sampler places samples in the pixel, on the lens and in time.  The plugin stratifies the
-      choice of emitters and directions.  ``multijitter`` instead of ``independent``, Mitsuba's default, reduces the
-      variance by 2% (bistro_interior), 8% (kitchen) or 23% (cornell).
+    - Samplers: the plugin stratifies the choice of emitters and directions.  In place of ``independent``, Mitsuba's
+      default, the plugin also stratifies the samples in a pixel, on the lens and in time.  Other samplers, the sensor
+      ``batch`` and wrappers, such as ``aov`` and ``moment``, keep the samples of the sensor's sampler.
     - Masks: the image is that of ``prb``.  ``path`` (Mitsuba 3.9.1) shows black for samples whose path ends after it
       passed only masks, so it is too dark where nothing is behind a mask.  With ``hide_emitters``, ``path`` hides an
       environment behind a mask, which ``manylights`` shows.  Alpha is that of ``path``.
@@ -129,6 +130,11 @@ class ManyLightsIntegrator(GatheringIntegrator):
             "denoised", False,
             "Whether the image will be denoised. Denoisers keep noise that neighbouring pixels share, so there are "
             "more virtual lights, up to twice as many, for up to a sixth more variance × time of the raw image.",
+        ),
+        Boolean(
+            "stratified", True,
+            "Whether the plugin stratifies the samples in a pixel, on the lens and in time if the sensor's sampler is "
+            "``independent``, Mitsuba's default. Other samplers, and the sensor ``batch``, keep their samples.",
         ),
     )  # fmt: skip
 
@@ -197,6 +203,10 @@ class ManyLightsIntegrator(GatheringIntegrator):
             depth = self.max_depth if self.max_depth <= _DEEPEST else -1
             paths = {"max_depth": depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
             yield mi.load_dict({"type": "prb", **paths}), sensor
+
+    def _render(self, scene, sensor, seed, spp, develop, evaluate):
+        chosen = stratified(sensor, spp) if self.stratified else sensor
+        return super()._render(scene, chosen, seed, spp, develop, evaluate)
 
     def _sample(self, scene, sampler, ray, active):
         clock, shared = Clock(Stage.SCENE), self._shared

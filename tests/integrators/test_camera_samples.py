@@ -1,0 +1,89 @@
+"""Camera samples of ``manylights`` are stratified where the sensor's sampler is ``independent``, and only there."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests.support.rendering import render
+from tests.support.statistics import assert_same_mean
+
+PIXELS, SAMPLES = 6, 16
+
+
+def edge(sampler="independent", rfilter="box", **sensor):
+    """A lamp whose slanted edge crosses the image."""
+    film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": rfilter}}
+    camera = {
+        "type": "perspective",
+        "fov": 40,
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+    }
+    lamp = {
+        "type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([0, 0, 1], 20),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}},
+    }  # fmt: skip
+    return mi.load_dict(
+        {"type": "scene", "lamp": lamp, "sensor": camera | sensor | {"film": film, "sampler": {"type": sampler}}}
+    )
+
+
+def variance(scene, **more):
+    images = np.array([render(scene, "manylights", SAMPLES, seed, max_depth=1, **more) for seed in range(16)])
+    return images.var(0, ddof=1).mean()
+
+
+@pytest.mark.parametrize("passes", [1, 4])
+def test_samples_of_a_pixel_are_one_in_each_stratum(passes):
+    from integrators.camera_samples import LatticeSampler
+
+    sampler = LatticeSampler(SAMPLES, PIXELS)
+    sampler.seed(7, PIXELS * SAMPLES // passes)
+    drawn = []
+    for number in range(passes):
+        if number:
+            sampler.advance()
+        once, points, lens = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+        rows = [np.array(x) for x in (once, points.x, points.y, lens.x, lens.y)]
+        drawn.append(np.array(rows).reshape(5, PIXELS, -1))
+    # A random shift and then a point in each stratum: all gaps are equal
+    ordered = np.sort(np.concatenate(drawn, 2), 2)
+    assert np.diff(ordered, axis=2) == pytest.approx(1 / SAMPLES, abs=1e-5)
+    assert len({tuple(row) for row in ordered.reshape(5 * PIXELS, -1).round(6)}) == 5 * PIXELS
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+def test_an_edge_has_a_fraction_of_the_variance(rfilter):
+    scene = edge(rfilter=rfilter)
+    assert variance(scene) < 0.4 * variance(scene, stratified=False)
+
+
+def test_a_lens_has_less_variance():
+    lens = {"type": "thinlens", "aperture_radius": 0.3, "focus_distance": 1.0}
+    scene = edge(**lens)
+    assert variance(scene) < 0.7 * variance(scene, stratified=False)
+
+
+def test_a_chosen_sampler_is_used():
+    scene = edge("stratified")
+    images = [render(scene, "manylights", SAMPLES, 3, max_depth=1, stratified=on) for on in (True, False)]
+    assert (images[0] == images[1]).all()
+
+
+@pytest.mark.parametrize("more", [{}, {"samples_per_pass": 4}])
+def test_the_mean_is_that_of_path(more):
+    scene = edge(rfilter="gaussian")
+
+    def pair(seed):
+        return render(scene, "manylights", SAMPLES, seed, max_depth=2, **more), render(scene, "path", 64, seed)
+
+    assert_same_mean(pair, 8, finds=0.02)
+
+
+def test_the_sensor_keeps_its_sampler_and_film():
+    scene = edge()
+    sensor = scene.sensors()[0]
+    before = sensor.sampler().sample_count()
+    image = mi.render(scene, integrator=mi.load_dict({"type": "manylights"}), spp=SAMPLES)
+    assert sensor.sampler().class_name() == "IndependentSampler" and sensor.sampler().sample_count() == before
+    assert dr.allclose(image, mi.TensorXf(sensor.film().bitmap()))
