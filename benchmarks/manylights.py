@@ -14,7 +14,8 @@ Each part runs both integrators in turn, each with the better of the samplers ``
 - ``denoised``: error of one pass through Open Image Denoise against the reference, without the noise of the reference,
   and the time of ``path`` for equal error.
 - ``timed``: variance × time of ``--passes`` images that ``manylights.render`` ends after ``--seconds``, with their
-  pilots and first passes, and the sampler ``independent``.  Kernels are compiled before.
+  pilots and first passes.  ``path`` uses ``multijitter``, ``manylights`` its own stratified samples.  Kernels are
+  compiled before.
 - ``cost``: CPU seconds of a sample over those of ``path``, see :mod:`benchmarks.sample_cost`; alone and without
   ``--scenes``, also in scenes where virtual lights gain little.
 - ``classes``: shares of classes of light in the variance, see :mod:`benchmarks.noise_classes`.

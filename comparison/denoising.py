@@ -15,6 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from vpl.core.sampling import independent_sampler
+
 from .images import colour
 from .scene_files import known_parameters
 
@@ -79,14 +81,19 @@ class Denoiser:
 
 def auxiliary_features(scene, sensor, spp, seed):
     """Render "albedo" and "normal", a dict of (height, width, 3) float32, of the first surfaces that are neither mirror
-    nor glass, with `spp` samples per pixel and the film's filter; `sensor` is a `mi.Sensor`.
+    nor glass, with `spp` samples per pixel and the film's filter; `sensor` is a `mi.Sensor`. The samples are stratified
+    if the sensor's sampler is `independent`.
 
     Albedo, 0 to 1: directional albedo, estimated by one BSDF sample, times the throughput of mirrors and glass before
     the surface, plus emission. Normal: shading normal in world space, turned towards the viewer. Both are 0 in empty
     directions.
     """
     seed = int(np.random.SeedSequence((FEATURE_SEED, seed)).generate_state(1)[0])
-    mi.render(scene, sensor=sensor, integrator=_feature_integrator(mi.variant()), spp=spp, seed=seed)
+    # The module belongs to the variant
+    from integrators.camera_samples import stratified
+
+    rays = stratified(sensor, spp)
+    mi.render(scene, sensor=rays, integrator=_feature_integrator(mi.variant()), spp=spp, seed=seed)
     bitmap = sensor.film().bitmap()
     names = [entry.name for entry in bitmap.struct_()]
     planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
@@ -104,7 +111,10 @@ def _feature_integrator(variant):
             return list(FEATURES)
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
-            albedo, normal, valid = _first_rough_surface(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
+            # Stratified numbers are for camera rays alone
+            number = sampler.next_1d()
+            own = independent_sampler(int(dr.reinterpret_array(mi.UInt32, number)[0]), dr.width(number))
+            albedo, normal, valid = _first_rough_surface(scene, own, mi.Ray3f(ray), mi.Bool(active))
             finite = dr.all(dr.isfinite(albedo)) & dr.all(dr.isfinite(normal))
             albedo, normal = dr.select(finite, dr.minimum(albedo, 1), 0), dr.select(finite, normal, 0)
             return mi.Spectrum(0), valid, [*albedo, *normal]
