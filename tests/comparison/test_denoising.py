@@ -115,7 +115,8 @@ def test_denoised_image_is_closer_to_the_reference(exact, integrator):
     scene = cornell(64).load()
     image, took = manylights.render(scene, mi.load_dict({"type": integrator, "max_depth": 6}), spp=16, denoise=True)
     raw, denoised = (squared_error(one.numpy(), exact) for one in (took.raw, image))
-    assert denoised < (1 if integrator == "lightcuts" else 0.3) * raw
+    # The less noise an image has, the less of it a denoiser removes
+    assert denoised < {"path": 0.3, "manylights": 0.4, "lightcuts": 1}[integrator] * raw
     assert abs(image.numpy().mean() / exact.mean() - 1) < 0.02
     assert 0 < took.denoise_seconds < took.seconds
 
