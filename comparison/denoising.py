@@ -92,8 +92,8 @@ def auxiliary_features(scene, sensor, spp, seed):
     # The module belongs to the variant
     from integrators.camera_samples import stratified
 
-    rays = stratified(sensor, spp)
-    mi.render(scene, sensor=rays, integrator=_feature_integrator(mi.variant()), spp=spp, seed=seed)
+    with stratified(sensor, spp) as wrapper:
+        mi.render(scene, sensor=wrapper, integrator=_feature_integrator(mi.variant()), spp=spp, seed=seed)
     bitmap = sensor.film().bitmap()
     names = [entry.name for entry in bitmap.struct_()]
     planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)

@@ -37,6 +37,7 @@ class SceneComparison:
         try:
             file = self._parse()
             self.result["hash"] = file.fingerprint()
+            self.result["sampler"] = file.sampler_name
             self._reference = self._first_reference(file)
             if self._runner is not worker:
                 self._expect_runs()

@@ -104,6 +104,12 @@ class SceneFile:
         properties = mi.Properties(films[0].props if films else mi.Properties("hdrfilm"))
         return properties.get("width", 768), properties.get("height", 576)
 
+    @property
+    def sampler_name(self):
+        """Plugin of the first sampler, with Mitsuba's default."""
+        samplers = self._nodes(mi.ObjectType.Sampler)
+        return samplers[0].props.plugin_name() if samplers else "independent"
+
     def set_sampler(self, name):
         """Replace the type of all samplers and keep their parameters."""
         self.changes.append(("set_sampler", (name,)))

@@ -167,7 +167,7 @@ def load_warnings(renders, cores):
 
 def scene_warnings(scene):
     """Return warnings about the scene, independent of the machine's load."""
-    return _machines(scene) + _unequal_times(scene) + _hidden(scene)
+    return _machines(scene) + _unequal_times(scene) + _hidden(scene) + _unequal_samplers(scene)
 
 
 def _machines(scene):
@@ -205,3 +205,17 @@ def _hidden(scene):
     if not hidden:
         return []
     return [f"The reference's noise hides the error of {', '.join(hidden)}; use a reference with more samples."]
+
+
+def _unequal_samplers(scene):
+    """Return a list with a sentence if only some integrators stratify camera samples."""
+    if scene.get("sampler") != "independent":
+        return []
+    shown = {render["integrator"]: render["parameters"] for render in scene["renders"] if "error" not in render}
+    ours = shown.get("manylights")
+    if ours is None or len(shown) == 1 or not ours.get("stratified", True):
+        return []
+    return [
+        "The scene's sampler is independent: manylights stratifies camera samples, and other integrators do not. With "
+        "a stratified sampler in the scene, such as multijitter, all of them do."
+    ]

@@ -1,37 +1,44 @@
 """Stratified camera samples instead of Mitsuba's ``independent`` sampler: places in the pixel and on the lens, times.
 
 Mitsuba's ``render`` takes all numbers of a camera ray from the sampler of the sensor, which Python cannot exchange.
-:func:`stratified` therefore wraps the sensor: the wrapper has the film and the rays of the sensor, and a sampler of its
-own.
+:func:`stratified` therefore lends a sensor that has the film and the rays of the scene's sensor, and its own sampler.
+
+Mitsuba's sensor ``batch`` calls its sensors through Dr.Jit's registry of all sensors, whichever scene they belong to.
+A sensor that another thread frees meanwhile would end the process, so lent sensors are kept and lent again.
 """
 
 from __future__ import annotations
+
+from contextlib import contextmanager
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from vpl.core.sampling import derived_seed
 from vpl.split.lattice import Lattice
 
-# Mitsuba's default, chosen by nobody who knows its noise
+# Mitsuba's default. A scene that names another sampler keeps it
 _REPLACED = "IndependentSampler"
-# Mitsuba calls the sensors of a batch through its registry of all sensors, where the wrapper must not be
-_UNWRAPPED = "BatchSensor"
+# A batch of sensors calls its sensors through the registry, and would call a lent sensor, too
+_KEPT = "BatchSensor"
 
 
 class LatticeSampler(mi.Sampler):
     """Camera samples from rank-1 lattices over the samples of a pixel; see :mod:`vpl.split.lattice`.
 
-    Each call of ``next_1d`` or ``next_2d`` takes a lattice in an independent random order.  The sampler serves one
-    render and no symbolic loop.
+    Each call of ``next_1d`` or ``next_2d`` takes a lattice in an independent random order.  The numbers are for camera
+    rays and not for symbolic loops.  ``pixels``: of the film, borders included.
     """
 
-    def __init__(self, samples: int, pixels: int):
-        """``samples`` of each of the ``pixels`` of a film, borders included."""
-        properties = mi.Properties("lattice")
-        properties["sample_count"] = samples
-        super().__init__(properties)
-        self._pixels, self._seed, self._pass = pixels, 0, 0
+    def __init__(self):
+        super().__init__(mi.Properties("lattice"))
+        self.pixels, self._seed, self._pass = 1, 0, 0
+
+    @property
+    def pass_seed(self) -> int:
+        """Seed of a pass of a render; independent of the number of samples."""
+        return derived_seed(self._seed, self._pass)
 
     def seed(self, seed, wavefront_size=0xFFFFFFFF):
         """Begin the first pass of a render; lanes are sorted by pixel."""
@@ -54,12 +61,12 @@ class LatticeSampler(mi.Sampler):
         return self._next()[1]
 
     def _begin(self):
-        lanes, samples = self.wavefront_size(), self.sample_count()
-        each = dr.opaque(mi.UInt32, lanes // self._pixels)
-        lane = dr.arange(mi.UInt32, lanes)
+        lanes = self.wavefront_size()
+        each = lanes // self.pixels
+        lane, wide = dr.arange(mi.UInt32, lanes), dr.opaque(mi.UInt32, each)
         # The passes of a render share the lattice of a pixel
-        number = lane // each * dr.opaque(mi.UInt32, samples) + self._pass * each + lane % each
-        self._lattice, self._calls = Lattice(number, samples, self._seed), 0
+        number = lane % wide + dr.opaque(mi.UInt32, self._pass * each)
+        self._lattice, self._calls = Lattice(lane // wide, number, self.sample_count(), self._seed), 0
 
     def _next(self):
         self._calls += 1
@@ -67,42 +74,72 @@ class LatticeSampler(mi.Sampler):
 
 
 class StratifiedSensor(mi.Sensor):
-    """A sensor with the film, the rays and the shutter of ``sensor``, and a :class:`LatticeSampler`."""
+    """A sensor with the film and the rays of another sensor, and a :class:`LatticeSampler`, see :meth:`becomes`."""
 
-    def __init__(self, sensor, samples: int):
+    # Mitsuba may call a sensor before and after it is lent
+    _sensor = None
+
+    def __init__(self):
+        properties = mi.Properties("stratified")
+        properties["film"] = self._idle = mi.load_dict({"type": "hdrfilm", "width": 1, "height": 1})
+        properties["sampler"] = LatticeSampler()
+        # Times from 0 to 1 stand for the shutter of the other sensor
+        properties["shutter_open"], properties["shutter_close"] = 0.0, 1.0
+        super().__init__(properties)
+
+    def becomes(self, sensor, spp: int) -> None:
+        """Stand for ``sensor`` with ``spp`` samples of a pixel; None: for no sensor."""
+        self._sensor, self.m_film = sensor, sensor.film() if sensor else self._idle
+        if sensor is None:
+            return
         film = sensor.film()
         size = np.array(film.crop_size(), np.int64) + (2 * film.rfilter().border_size() if film.sample_border() else 0)
-        properties = mi.Properties("stratified")
-        properties["film"] = film
-        properties["sampler"] = LatticeSampler(samples, int(np.prod(size)))
-        begin = float(dr.detach(mi.Float(sensor.shutter_open()))[0])
-        properties["shutter_open"] = begin
-        properties["shutter_close"] = begin + float(sensor.shutter_open_time())
-        super().__init__(properties)
         self.m_needs_sample_3 = sensor.needs_aperture_sample()
-        if sensor.get_medium() is not None:
-            self.set_medium(sensor.get_medium())
-        self._sensor = sensor
+        self.sampler().set_sample_count(spp)
+        self.sampler().pixels = int(np.prod(size))
 
     def to_string(self):
-        """The wrapped sensor."""
+        """The other sensor."""
         return f"StratifiedSensor[{self._sensor}]"
 
-    def sample_ray(self, *numbers):
-        """Rays of the wrapped sensor."""
-        return self._sensor.sample_ray(*numbers)
+    def sample_ray(self, time, *numbers):
+        """Rays of the other sensor."""
+        if self._sensor is None:
+            return dr.zeros(mi.Ray3f), mi.Spectrum(0)
+        return self._sensor.sample_ray(self._time(time), *numbers)
 
-    def sample_ray_differential(self, *numbers):
-        """Rays of the wrapped sensor, with differentials."""
-        return self._sensor.sample_ray_differential(*numbers)
+    def sample_ray_differential(self, time, *numbers):
+        """Rays of the other sensor, with differentials."""
+        if self._sensor is None:
+            return dr.zeros(mi.RayDifferential3f), mi.Spectrum(0)
+        return self._sensor.sample_ray_differential(self._time(time), *numbers)
+
+    def _time(self, time):
+        return self._sensor.shutter_open() + time * self._sensor.shutter_open_time()
 
 
+_IDLE: list[StratifiedSensor] = []
+
+
+@contextmanager
 def stratified(sensor, spp: int):
-    """``sensor``, with stratified samples if its sampler is ``independent`` and it is no batch of sensors.
+    """Within the block, a sensor for ``sensor`` with stratified samples if its sampler is ``independent``.
 
-    ``spp``: samples of a pixel; 0: as many as the sampler has.
+    Yields ``sensor`` itself with another sampler, for a batch of sensors, and within a participating medium, which
+    integrators refuse.  ``spp``: samples of a pixel; 0: as many as the sampler has.
     """
     sampler = sensor.sampler()
-    if sampler.class_name() != _REPLACED or sensor.class_name() == _UNWRAPPED:
-        return sensor
-    return StratifiedSensor(sensor, spp or sampler.sample_count())
+    if sampler.class_name() != _REPLACED or sensor.class_name() == _KEPT or sensor.get_medium() is not None:
+        yield sensor
+        return
+    try:
+        # A single operation, because threads render at the same time
+        lent = _IDLE.pop()
+    except IndexError:
+        lent = StratifiedSensor()
+    try:
+        lent.becomes(sensor, spp or sampler.sample_count())
+        yield lent
+    finally:
+        lent.becomes(None, 0)
+        _IDLE.append(lent)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +19,7 @@ from vpl.split.roulette import OutgoingRadiance
 from vpl.split.surface_lights import KeptLights
 from vpl.split.view import PathRules, View
 
-from .camera_samples import stratified
+from .camera_samples import LatticeSampler, stratified
 from .gathering import GatheringIntegrator
 from .knobs import Boolean
 from .manual import manual_page
@@ -205,8 +205,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
             yield mi.load_dict({"type": "prb", **paths}), sensor
 
     def _render(self, scene, sensor, seed, spp, develop, evaluate):
-        chosen = stratified(sensor, spp) if self.stratified else sensor
-        return super()._render(scene, chosen, seed, spp, develop, evaluate)
+        with stratified(sensor, spp) if self.stratified else nullcontext(sensor) as chosen:
+            return super()._render(scene, chosen, seed, spp, develop, evaluate)
 
     def _sample(self, scene, sampler, ray, active):
         clock, shared = Clock(Stage.SCENE), self._shared
@@ -227,7 +227,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
 
     def _view(self, scene, sampler, ray, active, known: Start | None) -> View:
         number = dr.detach(sampler.next_1d())
-        seed = int(dr.reinterpret_array(mi.UInt32, number)[0])
+        bits = dr.reinterpret_array(mi.UInt32, number)
+        # Renders with different numbers of samples share kept lights
+        seed = sampler.pass_seed if isinstance(sampler, LatticeSampler) else int(bits[0])
         grid, count = self.pixel_grid(scene, sampler), max(dr.width(ray), dr.width(number))
         # Some sensors give a single ray for all samples
         wide = dr.zeros(mi.Float, count)

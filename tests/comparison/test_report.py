@@ -232,6 +232,15 @@ def test_page_begins_with_the_verdict(swept):
     assert "error ÷ path’s" in page
 
 
+def test_unequal_samplers_are_named():
+    def warnings(sampler="independent", **parameters):
+        renders = [{"integrator": name, "parameters": parameters} for name in ("path", "manylights")]
+        return tables._unequal_samplers({"sampler": sampler, "renders": renders})
+
+    assert len(warnings()) == len(warnings(stratified=True)) == 1
+    assert warnings("multijitter") == warnings(stratified=False) == []
+
+
 # --- Strips ---
 
 

@@ -28,8 +28,9 @@ def edge(sampler="independent", rfilter="box", **sensor):
     )
 
 
-def variance(scene, **more):
-    images = np.array([render(scene, "manylights", SAMPLES, seed, max_depth=1, **more) for seed in range(16)])
+def variance(scene, stratified=True, **more):
+    more |= {"stratified": stratified, "max_depth": 1}
+    images = np.array([render(scene, "manylights", SAMPLES, seed, **more) for seed in range(16)])
     return images.var(0, ddof=1).mean()
 
 
@@ -37,7 +38,9 @@ def variance(scene, **more):
 def test_samples_of_a_pixel_are_one_in_each_stratum(passes):
     from integrators.camera_samples import LatticeSampler
 
-    sampler = LatticeSampler(SAMPLES, PIXELS)
+    sampler = LatticeSampler()
+    sampler.pixels = PIXELS
+    sampler.set_sample_count(SAMPLES)
     sampler.seed(7, PIXELS * SAMPLES // passes)
     drawn = []
     for number in range(passes):
@@ -58,10 +61,17 @@ def test_an_edge_has_a_fraction_of_the_variance(rfilter):
     assert variance(scene) < 0.4 * variance(scene, stratified=False)
 
 
+LENS = {"type": "thinlens", "aperture_radius": 0.3, "focus_distance": 1.0}
+
+
 def test_a_lens_has_less_variance():
-    lens = {"type": "thinlens", "aperture_radius": 0.3, "focus_distance": 1.0}
-    scene = edge(**lens)
+    scene = edge(**LENS)
     assert variance(scene) < 0.7 * variance(scene, stratified=False)
+
+
+def test_passes_have_less_variance():
+    scene = edge()
+    assert variance(scene, samples_per_pass=4) < 0.4 * variance(scene, stratified=False)
 
 
 def test_a_chosen_sampler_is_used():
@@ -70,12 +80,14 @@ def test_a_chosen_sampler_is_used():
     assert (images[0] == images[1]).all()
 
 
-@pytest.mark.parametrize("more", [{}, {"samples_per_pass": 4}])
-def test_the_mean_is_that_of_path(more):
-    scene = edge(rfilter="gaussian")
+@pytest.mark.parametrize(("camera", "more"), [({}, {}), ({}, {"samples_per_pass": 4}), (LENS, {})])
+def test_the_mean_is_that_of_path(camera, more):
+    scene = edge(rfilter="gaussian", **camera)
 
     def pair(seed):
-        return render(scene, "manylights", SAMPLES, seed, max_depth=2, **more), render(scene, "path", 64, seed)
+        return render(scene, "manylights", SAMPLES, seed, max_depth=2, stratified=True, **more), render(
+            scene, "path", 64, seed
+        )
 
     assert_same_mean(pair, 8, finds=0.02)
 
@@ -87,3 +99,22 @@ def test_the_sensor_keeps_its_sampler_and_film():
     image = mi.render(scene, integrator=mi.load_dict({"type": "manylights"}), spp=SAMPLES)
     assert sensor.sampler().class_name() == "IndependentSampler" and sensor.sampler().sample_count() == before
     assert dr.allclose(image, mi.TensorXf(sensor.film().bitmap()))
+
+
+def test_kept_lights_serve_any_number_of_samples():
+    scene = mi.load_dict(mi.cornell_box() | {"integrator": {"type": "manylights", "keep_lights": True}})
+    for spp in (32, 64):
+        mi.render(scene, spp=spp, seed=2)
+    found = scene.integrator().statistics
+    assert sum(found["lights"].values()) > 0 and found["light_paths"] == 0
+
+
+def test_lent_sensors_are_lent_again():
+    from integrators import camera_samples
+
+    first, second = edge().sensors()[0], edge().sensors()[0]
+    with camera_samples.stratified(first, 4) as one, camera_samples.stratified(second, 9) as other:
+        assert one is not other and one.film() is first.film() and other.sampler().sample_count() == 9
+    assert one.film() is not first.film()
+    with camera_samples.stratified(second, 0) as again:
+        assert again in (one, other)

@@ -39,8 +39,10 @@ def detectable_shift(count, significance):
     return optimize.brentq(lambda shift: stats.nct.sf(critical, count - 1, shift) - POWER, 1, 10 * critical)
 
 
-def compare_means(pairs, tiles=4):
+def compare_means(pairs, tiles=4, level=SCREENING):
     """Test images for equal means; ``pairs``: (found, expected) of each seed, arrays (height, width, channels).
+
+    ``level``: significance by which a bias counts as found.
 
     Two t tests share the level [Šidák 1967]: a test of the image mean, and a test of the means of tiles and of
     channels, with the least p value corrected for their number.  Raises AssertionError if means without variance
@@ -55,15 +57,16 @@ def compare_means(pairs, tiles=4):
     blocks = blocks.reshape(count, tiles, rows, tiles, columns, channels).mean((2, 4)).reshape(count, -1)
     parts = np.concatenate([blocks, difference.mean((1, 2))], axis=1)
     # Tiles that see nothing but an emitter, and the direct light of a point, differ by rounding alone
-    level = np.abs(expected).mean()
-    noisy = parts.std(0) > 1e-6 * level
-    assert (np.abs(parts.mean(0)[~noisy]) <= ROUNDING * level).all(), "a difference without variance"
+    brightness = np.abs(expected).mean()
+    assert brightness > 0, "the expected images are black"
+    noisy = parts.std(0) > 1e-6 * brightness
+    assert (np.abs(parts.mean(0)[~noisy]) <= ROUNDING * brightness).all(), "a difference without variance"
     if not noisy.any():
         return Comparison(1.0, 0.0)
     of_parts = corrected(stats.ttest_1samp(parts[:, noisy], 0).pvalue.min(), noisy.sum())
     of_mean = stats.ttest_1samp(means, 0).pvalue
     error = means.std(ddof=1) / np.sqrt(count) / expected.mean()
-    return Comparison(corrected(min(of_mean, of_parts), 2), detectable_shift(count, 1 - (1 - SCREENING) ** 0.5) * error)
+    return Comparison(corrected(min(of_mean, of_parts), 2), detectable_shift(count, 1 - (1 - level) ** 0.5) * error)
 
 
 @cache
@@ -88,7 +91,8 @@ def assert_same_mean(pair, seeds, finds=0.01, tiles=4):
     result = compare_means([pair(seed) for seed in range(seeds)], tiles)
     certain = result.detectable * certain_fraction(seeds)
     if result.p_value <= SCREENING or certain > finds:
-        result = compare_means([pair(seed) for seed in range(seeds, (1 + CONFIRMATION) * seeds)], tiles)
+        more = range(seeds, (1 + CONFIRMATION) * seeds)
+        result = compare_means([pair(seed) for seed in more], tiles, SIGNIFICANCE)
         certain = result.detectable * certain_fraction(CONFIRMATION * seeds)
         assert result.p_value > SIGNIFICANCE, f"p value {result.p_value:.2g}"
     assert certain <= finds, f"a bias below {certain:.2%} would go unseen"

@@ -68,13 +68,11 @@ def _fraction(bits):
 
 
 class Lattice:
-    """Numbers for paths; ``lane`` (UInt32): lane of each path; ``samples`` consecutive lanes belong to a pixel."""
+    """Numbers for paths; ``pixel``, ``number`` (UInt32): of each path, with numbers below ``samples``."""
 
-    def __init__(self, lane, samples: int, seed: int):
-        # Evaluated: counted and chosen lanes use the same kernel
-        dr.eval(lane)
+    def __init__(self, pixel, number, samples: int, seed: int):
         self._samples = dr.opaque(mi.UInt32, samples)
-        self._pixel, self._number = lane // self._samples, lane % self._samples
+        self._pixel, self._number = pixel, number
         # Derived, because vertex numbers are added to the seed
         self._seed = dr.opaque(mi.UInt32, derived_seed(seed, 0))
         orders = _orders(samples)
@@ -82,6 +80,14 @@ class Lattice:
         # Steps between points of the lattice, in units of 2^-32
         steps = (round(times * 2**32 / samples) for times in (1, lattice_multiplier(samples)))
         self._steps = [dr.opaque(mi.UInt32, step % 2**32) for step in steps]
+
+    @classmethod
+    def of_lanes(cls, lane, samples: int, seed: int) -> Lattice:
+        """For paths in the lanes ``lane`` (UInt32); ``samples`` consecutive lanes belong to a pixel."""
+        # Evaluated: counted and chosen lanes use the same kernel
+        dr.eval(lane)
+        each = dr.opaque(mi.UInt32, samples)
+        return cls(lane // each, lane % each, samples, seed)
 
     def at(self, vertex):
         """Numbers of a path at a ``vertex`` (UInt32, counted): (number, pair, number, pair) in [0, 1)."""

@@ -218,7 +218,7 @@ def trace_camera_rays(view: View, lane: mi.UInt32, settings: PathSettings, *stre
     part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
     importance = dr.gather(mi.Float, view.importance, lane // dr.opaque(mi.UInt32, view.samples))
     edge = FirstEdge.of_camera(part, importance, dr.gather(mi.Bool, view.active, lane))
-    lattice = Lattice(lane, view.samples, derived_seed(seed, 0))
+    lattice = Lattice.of_lanes(lane, view.samples, derived_seed(seed, 0))
     sampler = independent_sampler(derived_seed(seed, 1), dr.width(lane))
     return trace_paths(view.scene, view.emitters, edge, lattice, sampler, settings)
 

@@ -148,7 +148,7 @@ def _places_with_minorants(scene, emitters, rays, settings: PathSettings, seed: 
     count = dr.width(rays.o)
     depth, gathering = dr.opaque(mi.UInt32, 2), dr.opaque(mi.UInt32, Gathering.PLACING)
     settings = replace(settings, max_depth=depth, gathering=gathering, emitters_carried=dr.opaque(mi.Bool, True))
-    lattice = Lattice(dr.arange(mi.UInt32, count), 1, derived_seed(seed, 0))
+    lattice = Lattice.of_lanes(dr.arange(mi.UInt32, count), 1, derived_seed(seed, 0))
     sampler = independent_sampler(derived_seed(seed, 1), count)
     edge = FirstEdge.of_camera(rays, 1.0, True)
     met = trace_paths(scene, emitters, edge, lattice, sampler, settings).gathered.first
@@ -176,7 +176,7 @@ def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: i
     # The throughput starts with pi, the weight of a direction, which lets paths go on longer: with 1, lights would cost
     # 7% less and have 12% more variance (kitchen)
     edge = FirstEdge.of(places.position, ray, ones(count) * dr.pi, density, False, State.PAST, cell, 1.0, True)
-    lattice = Lattice(dr.arange(mi.UInt32, count), 1, seed)
+    lattice = Lattice.of_lanes(dr.arange(mi.UInt32, count), 1, seed)
     found = trace_paths(scene, emitters, edge, lattice, independent_sampler(derived_seed(seed, 1), count), settings)
     # A light stands for paths of one length, because gather vertices far from the camera may use short paths only. The
     # irradiance is a single contribution, drawn by its share, with the colour of the contribution

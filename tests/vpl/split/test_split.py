@@ -112,7 +112,7 @@ def test_minorants_are_0_where_none_is_asked_for_and_the_same_elsewhere():
 @pytest.mark.parametrize("samples", [1, 4, 16, 64, 6, 100, 3000])
 def test_numbers_are_uniform_and_stratified_in_every_pixel(samples):
     pixels = max(2**18 // samples, 512)
-    numbers = Lattice(dr.arange(mi.UInt32, pixels * samples), samples, 7).at(mi.UInt32(3))
+    numbers = Lattice.of_lanes(dr.arange(mi.UInt32, pixels * samples), samples, 7).at(mi.UInt32(3))
     columns = [np.array(x).reshape(-1, pixels, samples) for x in numbers]
     # Numbers have 24 bits
     far = max(samples // 1024, 1)
@@ -145,7 +145,7 @@ def test_no_lattice_of_as_many_points_is_much_better():
 def test_products_of_numbers_are_no_noisier_than_those_of_random_ones():
     """Orders that keep halves of the points together would double the variance."""
     samples, pixels = 64, 8192
-    numbers = Lattice(dr.arange(mi.UInt32, pixels * samples), samples, 5)
+    numbers = Lattice.of_lanes(dr.arange(mi.UInt32, pixels * samples), samples, 5)
     first, second = (numbers.at(mi.UInt32(vertex)) for vertex in (0, 1))
     chosen = first[0], first[1].x, first[2], first[3].y, second[0]
     halves = [np.where(np.array(x).reshape(pixels, samples) < 0.5, 1, -1) for x in chosen]
@@ -158,7 +158,7 @@ def test_numbers_of_other_dimensions_vertices_pixels_and_seeds_are_independent()
     columns = [
         np.array(x).reshape(-1, 4 * 4096)
         for seed, vertex in ((1, 0), (1, 1), (2, 0))
-        for x in Lattice(lane, 4, seed).at(mi.UInt32(vertex))
+        for x in Lattice.of_lanes(lane, 4, seed).at(mi.UInt32(vertex))
     ]
     correlation = np.corrcoef(np.concatenate(columns))
     assert np.abs(correlation - np.eye(len(correlation))).max() < 0.05
