@@ -81,7 +81,9 @@ class StratifiedSensor(mi.Sensor):
 
     def __init__(self):
         properties = mi.Properties("stratified")
-        properties["film"] = self._idle = mi.load_dict({"type": "hdrfilm", "width": 1, "height": 1})
+        # The pixel format of mono variants, which warn of others
+        idle = {"type": "hdrfilm", "width": 1, "height": 1, "pixel_format": "luminance"}
+        properties["film"] = self._idle = mi.load_dict(idle)
         properties["sampler"] = LatticeSampler()
         # Times from 0 to 1 stand for the shutter of the other sensor
         properties["shutter_open"], properties["shutter_close"] = 0.0, 1.0
