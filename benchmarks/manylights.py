@@ -14,7 +14,7 @@ Each part runs both integrators in turn, each with the better of the samplers ``
 - ``denoised``: error of one pass through Open Image Denoise against the reference, without the noise of the reference,
   and the time of ``path`` for equal error.
 - ``timed``: variance × time of ``--passes`` images that ``manylights.render`` ends after ``--seconds``, with their
-  pilots and first passes.  ``path`` uses ``multijitter``, ``manylights`` its own stratified samples.  Kernels are
+  pilots and first passes.  ``path`` uses its better sampler, ``manylights`` its own stratified samples.  Kernels are
   compiled before.
 - ``cost``: CPU seconds of a sample over those of ``path``, see :mod:`benchmarks.sample_cost`; alone and without
   ``--scenes``, also in scenes where virtual lights gain little.
@@ -103,6 +103,19 @@ def print_mean(rows: dict) -> None:
         print(f"geometric mean {scenes.geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
 
 
+def best_of(rivals: list, scale: np.ndarray) -> dict:
+    """The rival with the least variance × time of each integrator, by name."""
+    return {kind: min((r for r in rivals if r.kind == kind), key=lambda r: r.product(scale)) for kind in KINDS}
+
+
+def outcome(best: dict, scale: np.ndarray) -> tuple[dict, list[str]]:
+    """(Row of the result file, columns for print) of the best rivals."""
+    values = {kind: float(best[kind].product(scale)) for kind in KINDS}
+    row = {kind: {"product": values[kind], "samples": best[kind].spp} for kind in KINDS}
+    columns = [f"{values[kind]:.4g} ({best[kind].spp}, {best[kind].sampler[:5]})" for kind in KINDS]
+    return row | {"speedup": values["path"] / values["manylights"]}, columns
+
+
 def product_of(name: str, width: int, seconds: float, passes: int, view: int) -> dict:
     """Print variance × time of a scene, from a random camera where ``view`` is not 0; returns the row."""
     scene = load(name, width)
@@ -111,27 +124,19 @@ def product_of(name: str, width: int, seconds: float, passes: int, view: int) ->
     rivals = [Rival(name, scene, kind, sampler, width, seconds) for kind in KINDS for sampler in SAMPLERS]
     measure_in_turn(rivals, passes)
     scale = scale_of(name, [image for rival in rivals for image in rival.images], width, view)
-    best = {kind: min((r for r in rivals if r.kind == kind), key=lambda r: r.product(scale)) for kind in KINDS}
-    values = [best[kind].product(scale) for kind in KINDS]
-    ratio = values[0] / values[1]
+    best = best_of(rivals, scale)
+    row, columns = outcome(best, scale)
     plain = best["path"].product(scale, 0) / best["manylights"].product(scale, 0)
     (ours, error), (theirs, their_error) = best["manylights"].mean(), best["path"].mean()
     sets = np.std([image.mean() for image in best["manylights"].images], ddof=1) / ours
-    columns = [
-        f"{value:.4g} ({best[kind].spp}, {best[kind].sampler[:5]})" for value, kind in zip(values, KINDS, strict=True)
-    ]
-    row = {
-        kind: {"product": float(value), "samples": best[kind].spp} for value, kind in zip(values, KINDS, strict=True)
-    }
     label = f"{name} {view}" if view else name
     excess, uncertain = ours / theirs - 1, np.hypot(error / ours, their_error / theirs)
     print(
-        f"{label:18s} {columns[0]:>22s} {columns[1]:>22s} {ratio:7.2f} {plain:7.2f}   {excess:+.2%} ± {uncertain:.2%}"
-        f"{sets:12.2%}   {best['manylights'].integrator.statistics.get('plan')}",
+        f"{label:18s} {columns[0]:>22s} {columns[1]:>22s} {row['speedup']:7.2f} {plain:7.2f}   "
+        f"{excess:+.2%} ± {uncertain:.2%}{sets:12.2%}   {best['manylights'].integrator.statistics.get('plan')}",
         flush=True,
     )
     more = {
-        "speedup": ratio,
         "plain_speedup": plain,
         "bias": excess,
         "bias_deviation": uncertain,
@@ -146,15 +151,14 @@ def timed(names, width: int, seconds: float, passes: int) -> dict:
     rows = {}
     for name in names:
         scene = load(name, width)
-        rivals = [Timed(scene, kind, seconds) for kind in KINDS]
+        rivals = [Timed(scene, "path", sampler, seconds) for sampler in SAMPLERS]
+        # manylights stratifies the samples of this sampler
+        rivals.append(Timed(scene, "manylights", "independent", seconds))
         measure_in_turn(rivals, passes)
         scale = scale_of(name, [image for rival in rivals for image in rival.images], width)
-        theirs, ours = (rival.product(scale) for rival in rivals)
-        columns = (f"{value:.4g} ({rival.spp})" for value, rival in zip((theirs, ours), rivals, strict=True))
-        print(f"{name:18s}" + "".join(f"{column:>22s}" for column in columns) + f"{theirs / ours:8.2f}", flush=True)
-        pairs = zip(KINDS, (theirs, ours), rivals, strict=True)
-        row = {kind: {"product": float(value), "samples": rival.spp} for kind, value, rival in pairs}
-        rows[name] = row | {"speedup": float(theirs / ours)}
+        row, columns = outcome(best_of(rivals, scale), scale)
+        print(f"{name:18s}" + "".join(f"{column:>22s}" for column in columns) + f"{row['speedup']:8.2f}", flush=True)
+        rows[name] = row
     print_mean(rows)
     return rows
 

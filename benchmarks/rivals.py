@@ -108,14 +108,11 @@ class Rival:
 
 
 class Timed(Rival):
-    """Images of one integrator on one scene that end by time.
+    """Images of one integrator with one sampler on one scene that end by time."""
 
-    ``path`` takes ``multijitter``, its better sampler; ``manylights`` stratifies the samples of ``independent``.
-    """
-
-    def __init__(self, scene, kind: str, seconds: float):
-        self.kind, self.images, self.seconds, self._wanted = kind, [], [], seconds
-        self.sensor = SAMPLERS.index("multijitter" if kind == "path" else "independent")
+    def __init__(self, scene, kind: str, sampler: str, seconds: float):
+        self.kind, self.sampler, self.images, self.seconds, self._wanted = kind, sampler, [], [], seconds
+        self.sensor = SAMPLERS.index(sampler)
         self._scene, self.integrator = scene, mi.load_dict({"type": kind, "max_depth": DEPTH})
         # Two passes compile the kernels
         render(scene, self.integrator, sensor=self.sensor, spp=8, pass_spp=4)
