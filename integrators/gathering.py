@@ -51,6 +51,14 @@ def _hear_interruptions() -> None:
         signal.signal(signal.SIGINT, handler)
 
 
+def _for_all_samples(sampler, ray, active):
+    """(Camera rays, mask) with a lane for each sample: some sensors, such as ``radiancemeter``, give a single ray."""
+    count = max(dr.width(ray), sampler.wavefront_size())
+    ray, wide = mi.Ray3f(ray), dr.zeros(mi.Float, count)
+    ray.o, ray.d, ray.time = ray.o + wide, ray.d + wide, ray.time + wide
+    return ray, mi.Bool(active) & dr.full(mi.Bool, True, count)
+
+
 @dataclass
 class CameraPass:
     """Camera rays of a pass, followed to their gather points: the first step of a render.
@@ -155,7 +163,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
                 self._refuse_recording()
                 self.check_scene(scene)
                 share_code(scene)
-                return self._sample(scene, sampler, mi.Ray3f(ray), active)
+                return self._sample(scene, sampler, *_for_all_samples(sampler, ray, active))
             except Exception as error:
                 # Logged, as `mi.render` raises a general error with this error as the cause
                 mi.Log(mi.LogLevel.Warn, f"{type(self).__name__}: {error}")

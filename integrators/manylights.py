@@ -230,11 +230,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         bits = dr.reinterpret_array(mi.UInt32, number)
         # Renders with different numbers of samples share kept lights
         seed = sampler.pass_seed if isinstance(sampler, LatticeSampler) else int(bits[0])
-        grid, count = self.pixel_grid(scene, sampler), max(dr.width(ray), dr.width(number))
-        # Some sensors give a single ray for all samples
-        wide = dr.zeros(mi.Float, count)
-        ray.o, ray.d, ray.time = ray.o + wide, ray.d + wide, ray.time + wide
-        active = mi.Bool(active) & dr.full(mi.Bool, True, count)
+        grid, count = self.pixel_grid(scene, sampler), dr.width(ray)
         dr.make_opaque(ray, active)
         pixels = -(-count // grid.samples)
         # A shared start serves larger passes, too
