@@ -33,6 +33,7 @@ UNITS = {
     "fewer_rays": "shadow rays of the other method over those of this one, at equal error",
     "gathered_seconds": "s for clusters and cuts",
     "hidden": "whether the noise of the reference exceeds the error",
+    "independent_speedup": "as speedup, over path with the sampler independent",
     "light_paths": "light paths of a render",
     "light_share": "fraction of the mean of the image",
     "lights": "number of lights",

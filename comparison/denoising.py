@@ -1,13 +1,15 @@
 """Denoising by Open Image Denoise on the CPU, guided by albedo and shading normal.
 
 Requires the package `mitsuba-oidn` (`pip install 'manylights[denoise]'`). Albedo and normal belong to the first surface
-that is neither mirror nor glass. A few samples per pixel suffice for them, and a separate filter removes the remaining
-noise ("prefiltering"), so that the denoiser can treat them as noise-free.
+that is neither mirror nor glass. They have as many samples as the image, but at least 16 and at most 64 per pixel; if
+time is limited, 16 and up to 64 more in a twenty-fifth of the limit. A separate filter removes the remaining noise
+("prefiltering"), so that the denoiser can treat them as noise-free.
 
 The denoiser mistakes noise correlated between pixels for detail: a wide reconstruction filter of the film gives worse
 results than a box filter.
 """
 
+import math
 import time
 from functools import cache
 
@@ -15,12 +17,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from vpl.core.sampling import independent_sampler
+from vpl.core.sampling import derived_seed, independent_sampler
 
 from .images import colour
 from .scene_files import known_parameters
 
-FEATURE_SPP = 16
+# Fewest and most samples per pixel: squares, to which some of Mitsuba's samplers round
+FEATURE_SPP = 16, 64  # 64 instead of 16: denoised error 2 to 10% less in four scenes (decisions.md)
+FEATURE_WAVEFRONT = 1 << 22  # most samples of an image rendered at once, some 400 MB, or the fewest per pixel
+FEATURE_SHARE = 0.04  # of a time limit; the samples of a path take about 25 times as long
 FEATURE_SEED = 0xFEA7  # combined with the seed of the image, to avoid correlated noise
 DEEPEST = 16  # interactions with mirrors, panes and masks
 FEATURES = ("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z")
@@ -40,14 +45,15 @@ def import_oidn():
 class Denoiser:
     """Denoises images of a scene by one of its sensors (an index).
 
-    `seconds`: time spent so far, including the auxiliary passes, which the constructor renders.
-    `filter_seconds`: estimated time of a call of `denoise`.
+    `spp`, `time_limit`: samples per pixel and seconds of the image, None if unlimited; they limit the samples of albedo
+    and normal. `feature_spp`: samples per pixel of albedo and normal. `seconds`: time spent so far, including albedo
+    and normal, which the constructor renders. `filter_seconds`: estimated time of a call of `denoise`.
     """
 
-    def __init__(self, scene, sensor=0, seed=0):
+    def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None):
         self._oidn, begin = import_oidn(), time.perf_counter()
         self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
-        features = auxiliary_features(scene, scene.sensors()[sensor], FEATURE_SPP, seed)
+        features, self.feature_spp = _features(scene, scene.sensors()[sensor], seed, spp, time_limit)
         filtering = time.perf_counter()
         self._features = {name: self._filtered({name: plane}) for name, plane in features.items()}
         end = time.perf_counter()
@@ -79,16 +85,46 @@ class Denoiser:
         return output
 
 
+def _features(scene, sensor, seed, spp, time_limit):
+    """Return (albedo and normal, samples per pixel), see `Denoiser` for the limits."""
+    fewest, most = FEATURE_SPP
+    wanted = most if spp is None else math.isqrt(min(max(spp, fewest), most)) ** 2
+    if time_limit is None:
+        return auxiliary_features(scene, sensor, wanted, seed), wanted
+    # The first samples tell the time of the others; compilation counts, because people wait for it
+    begin = time.perf_counter()
+    found = auxiliary_features(scene, sensor, fewest, seed)
+    spent = time.perf_counter() - begin
+    more = math.isqrt(int(min(FEATURE_SHARE * time_limit / spent * fewest, wanted))) ** 2
+    if more < fewest:
+        return found, fewest
+    rest = auxiliary_features(scene, sensor, more, derived_seed(seed, 1))
+    return _mean_of([(fewest, found), (more, rest)]), fewest + more
+
+
+def _mean_of(weighted):
+    """Return the mean of dictionaries of images, from pairs (weight, dictionary)."""
+    whole = sum(weight for weight, _ in weighted)
+    return {name: sum(weight / whole * one[name] for weight, one in weighted) for name in weighted[0][1]}
+
+
 def auxiliary_features(scene, sensor, spp, seed):
     """Render "albedo" and "normal", a dict of (height, width, 3) float32, of the first surfaces that are neither mirror
-    nor glass, with `spp` samples per pixel and the film's filter; `sensor` is a `mi.Sensor`. The samples are stratified
-    if the sensor's sampler is `independent`.
+    nor glass, with `spp` samples per pixel (at least, in large images) and the film's filter; `sensor` is a
+    `mi.Sensor`. The samples are stratified if the sensor's sampler is `independent`.
 
     Albedo, 0 to 1: directional albedo, estimated by one BSDF sample, times the throughput of mirrors and glass before
     the surface, plus emission. Normal: shading normal in world space, turned towards the viewer. Both are 0 in empty
     directions.
     """
-    seed = int(np.random.SeedSequence((FEATURE_SEED, seed)).generate_state(1)[0])
+    fewest, pixels = FEATURE_SPP[0], int(np.prod(sensor.film().crop_size()))
+    each, parts = (spp, 1) if spp * pixels <= FEATURE_WAVEFRONT else (fewest, math.ceil(spp / fewest))
+    return _mean_of([(each, _rendered(scene, sensor, each, (seed, part))) for part in range(parts)])
+
+
+def _rendered(scene, sensor, spp, key):
+    """Render the features of `auxiliary_features` at once; `key`: integers that make the seed."""
+    seed = int(np.random.SeedSequence((FEATURE_SEED, *key)).generate_state(1)[0])
     # The module belongs to the variant
     from integrators.camera_samples import stratified
 

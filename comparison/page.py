@@ -83,7 +83,7 @@ def _summary(results):
     summary = results["summary"]
     labels = list(dict.fromkeys(label for row in summary["scenes"].values() for label in row))
     rows = [
-        (name, [_outcome(row.get(label), label == summary["base"]) for label in labels])
+        (name, [_outcome(row.get(label), label == summary["bases"].get(label)) for label in labels])
         for name, row in summary["scenes"].items()
     ]
     means = [summary["means"].get(label) for label in labels]

@@ -110,7 +110,7 @@ def render(
     if error is None and time is None and spp is None:
         spp = scene.sensors()[sensor].sampler().sample_count()
     begin = clock.perf_counter()
-    denoiser = Denoiser(scene, sensor, seed) if denoise else None
+    denoiser = Denoiser(scene, sensor, seed, spp, time) if denoise else None
     progressive = Progressive(scene, seed, sensor, integrator)
     reserved = denoiser.filter_seconds if denoiser else 0.0
     sizes = PassSizes(

@@ -187,9 +187,10 @@ def _unequal_times(scene):
     for name, renders in settings(scene).items():
         seconds = [render["seconds"] for render in renders if "error" not in render and render["budget"]]
         if seconds:
-            budgets.setdefault(renders[0]["budget"], {})[name] = _mean(seconds)
+            # The denoiser takes its time after a budget, for all integrators
+            budgets.setdefault((renders[0]["budget"], renders[0]["denoised"]), {})[name] = _mean(seconds)
     found = []
-    for budget, seconds in budgets.items():
+    for (budget, _), seconds in budgets.items():
         shortest, longest = (choose(seconds, key=seconds.get) for choose in (min, max))
         if seconds[longest] > (1 + UNEQUAL) * seconds[shortest]:
             found.append(

@@ -1,8 +1,9 @@
 """Summary of a comparison: each integrator relative to the first, per scene, in geometric means, and in a sentence.
 
-A ratio divides a number of an integrator by the number of the first; below 1 is better. With curves, ratios are
-geometric means of interpolated values, otherwise ratios of single images. Single images give a time at equal error only
-if the first integrator is one of Mitsuba's unbiased integrators, because only then its error is known to fall with the
+A ratio divides a number of an integrator by the number of the first; below 1 is better. Denoised images are compared
+with denoised images of the first, and come first, because people use them. With curves, ratios are geometric means of
+interpolated values, otherwise ratios of single images. Single images give a time at equal error only if they are raw
+images and the first integrator is one of Mitsuba's unbiased integrators: only then the error is known to fall with the
 number of samples.
 """
 
@@ -18,6 +19,34 @@ PARTS = ("half", "a third", "a quarter", "a fifth", "a sixth", "a seventh", "an 
 
 def summarise(scenes, metric):
     """Return the "summary" of results.schema.json for the results of some scenes."""
+    groups = [_summary_of(group, metric) for group in _groups(scenes, metric)]
+    merged = {"base": groups[-1][0] if groups else None, "bases": {}, "scenes": {}, "means": {}, "sentences": []}
+    for base, rows, means, sentences in groups:
+        merged["bases"] |= {label: base for row in rows.values() for label in row}
+        for name, row in rows.items():
+            merged["scenes"].setdefault(name, {}).update(row)
+        merged["means"] |= means
+        merged["sentences"] += sentences
+    return merged
+
+
+def _groups(scenes, metric):
+    """Return the scenes with their denoised images alone, if there are any, and with their raw images alone."""
+    if not any(render["denoised"] for scene in scenes for render in scene["renders"]):
+        return [scenes] if scenes else []
+    groups = []
+    for denoised in (True, False):
+        group = []
+        for scene in scenes:
+            renders = [render for render in scene["renders"] if render["denoised"] is denoised]
+            labels = list(dict.fromkeys(render["label"] for render in renders))
+            group.append({**scene, "renders": renders} | analysis.analyse(renders, labels, metric))
+        groups.append(group)
+    return groups
+
+
+def _summary_of(scenes, metric):
+    """Return (label of the first integrator, rows by scene, means by label, sentences) of a group of images."""
     labels = list(dict.fromkeys(render["label"] for scene in scenes for render in scene["renders"]))
     rows = {scene["name"]: _row(scene, labels, metric) for scene in scenes}
     means = {
@@ -28,7 +57,7 @@ def summarise(scenes, metric):
     sentences = [text for label in order if (text := _sentence(label, labels[0], rows))]
     if means and not sentences:
         sentences = [f"These runs do not determine the performance of {_listed(order)} relative to {labels[0]}."]
-    return {"base": labels[0] if labels else None, "scenes": rows, "means": means, "sentences": sentences}
+    return labels[0] if labels else None, rows, means, sentences
 
 
 def _row(scene, labels, metric):
@@ -72,8 +101,8 @@ def _ratios(scene, points, base, label, metric):
     seconds = sorted(float(np.mean(list(point.cost.values()))) for point in (first, other))
     is_equal_time = seconds[1] <= (1 + tables.UNEQUAL) * seconds[0]
     error = _ratio_of_points(first, other, lambda cost, error: error) if is_equal_time else None
-    integrator = next(render["integrator"] for render in scene["renders"] if render["label"] == base)
-    if integrator not in UNBIASED:
+    of_base = next(render for render in scene["renders"] if render["label"] == base)
+    if of_base["integrator"] not in UNBIASED or of_base["denoised"]:
         return {"error": error, "time": None}
     power = 1 if metric in metrics.SQUARED else 2
     time = _ratio_of_points(first, other, lambda cost, error: cost * error**power)

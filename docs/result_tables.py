@@ -88,6 +88,7 @@ TABLES = {
             Column("bias", "{bias:+.2%} ± {bias_deviation:.2%}"),
             Column("sets", "{set_deviation:.2%}"),
             Column("ratio, denoised", ratio="denoised.speedup"),
+            Column("over `independent`", ratio="denoised.independent_speedup"),
         ),
         order="speedup",
     ),

@@ -51,7 +51,8 @@ class DistributedRender:
         fail."""
         begin = clock.perf_counter() - self._seconds
         try:
-            denoiser = Denoiser(self._scene.get(), self._sensor, self._seed) if denoise else None
+            limits = self._seed, self.spp, self._time
+            denoiser = Denoiser(self._scene.get(), self._sensor, *limits) if denoise else None
             reserved = denoiser.filter_seconds if denoiser else 0.0
             ending = Ending(self.spp, self._time and self._time - reserved, self._error, reserved)
             if self._time:

@@ -11,8 +11,8 @@ import pytest
 
 import compare
 import manylights
-from comparison import images
-from comparison.denoising import Denoiser, auxiliary_features
+from comparison import denoising, images
+from comparison.denoising import Denoiser, _features, auxiliary_features
 from tests.support.comparisons import results_of
 from tests.support.marks import stress
 from tests.support.paths import CORNELL
@@ -213,6 +213,35 @@ def test_without_the_package_the_message_says_what_to_install(tmp_path, monkeypa
     with pytest.raises(ModuleNotFoundError, match="manylights\\[denoise\\]"):
         manylights.render(cornell().load(), denoise=True)
     assert command("-o", tmp_path / "a.exr") == 0  # nothing else needs it
+
+
+@pytest.mark.parametrize(("spp", "samples"), [(1, 16), (40, 36), (1000, 64), (None, 64)])
+def test_albedo_and_normal_have_as_many_samples_as_the_image_within_limits(spp, samples):
+    assert Denoiser(cornell(16).load(), spp=spp).feature_spp == samples
+
+
+@pytest.mark.parametrize(("time_limit", "samples"), [(1e-3, 16), (1e6, 80)])
+def test_albedo_and_normal_take_a_small_part_of_a_time_limit(time_limit, samples):
+    assert Denoiser(cornell(16).load(), time_limit=time_limit).feature_spp == samples
+
+
+def test_features_of_large_images_are_means_of_renders(monkeypatch):
+    scene = cornell(16).load()
+    whole = auxiliary_features(scene, scene.sensors()[0], 50, 0)
+    monkeypatch.setattr(denoising, "FEATURE_WAVEFRONT", 1)
+    parts = auxiliary_features(scene, scene.sensors()[0], 50, 0)
+    for name, plane in whole.items():
+        assert 0 < np.abs(parts[name] - plane).mean() < 0.02
+
+
+def test_features_of_more_samples_are_those_of_fewer_with_less_noise():
+    """With a time limit, two renders are averaged."""
+    scene = cornell(16).load()
+    few, many = (_features(scene, scene.sensors()[0], 0, spp, limit)[0] for spp, limit in ((16, None), (64, 1e6)))
+    exact = auxiliary_features(scene, scene.sensors()[0], 1024, 7)
+    for name, plane in exact.items():
+        errors = [np.square(found[name] - plane).mean() for found in (few, many)]
+        assert errors[1] < 0.5 * errors[0] < 0.05
 
 
 def test_mono_variant(tmp_path):

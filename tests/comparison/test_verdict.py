@@ -5,11 +5,11 @@ import pytest
 from comparison import analysis, verdict
 
 
-def run(label, setting, seconds, error, seed=0, noise=0.0, bias=0.0, integrator=None):
+def run(label, setting, seconds, error, seed=0, noise=0.0, bias=0.0, integrator=None, denoised=False):
     errors = {"relmse": error, "rmse": error**0.5, "bias": bias, "noise": {"relmse": noise, "rmse": noise**0.5}}
     return {
         "label": label, "setting": setting, "integrator": integrator or label, "seed": seed, "seconds": seconds,
-        "spp": 1, "rays_per_sample": None, "errors": errors,
+        "spp": 1, "rays_per_sample": None, "errors": errors, "denoised": denoised,
     }  # fmt: skip
 
 
@@ -115,7 +115,43 @@ def test_the_best_comes_first():
 
 
 def test_nothing_is_said_without_runs():
-    assert verdict.summarise([], "relmse") == {"base": None, "scenes": {}, "means": {}, "sentences": []}
+    nothing = {"base": None, "bases": {}, "scenes": {}, "means": {}, "sentences": []}
+    assert verdict.summarise([], "relmse") == nothing
+
+
+def with_denoised(*renders):
+    """Raw images, and their denoised images with a tenth of the error, in a second more."""
+    return scene("box", *renders, *(
+        run(f"{one['label']}, denoised", one["setting"], one["seconds"] + 1, one["errors"]["relmse"] * factor,
+            integrator=one["integrator"], denoised=True)
+        for one, factor in zip(renders, (0.1, 0.5), strict=True)
+    ))  # fmt: skip
+
+
+def test_denoised_images_are_compared_with_denoised_images_and_come_first():
+    found = verdict.summarise([with_denoised(run("path", "", 10.0, 0.1), run("ours", "", 10.0, 0.01))], "relmse")
+    assert found["sentences"] == [
+        "ours, denoised has half of the error of path, denoised at equal time in box.",
+        "ours needs about a tenth of the time of path for the same error in box.",
+    ]
+    assert found["base"] == "path" and next(iter(found["scenes"]["box"])) == "path, denoised"
+    assert found["bases"] == {
+        "path, denoised": "path, denoised", "ours, denoised": "path, denoised", "path": "path", "ours": "path"
+    }  # fmt: skip
+    # The denoised error does not fall with the number of samples at a known rate
+    assert found["scenes"]["box"]["ours, denoised"]["time"] is None
+    assert set(found["means"]) == {"ours", "ours, denoised"}
+
+
+def test_curves_of_denoised_images_are_relative_to_the_denoised_curve():
+    runs = [
+        run(f"{label}{end}", f"spp={spp}", spp / factor, scale / spp, denoised=bool(end))
+        for end, scale, speed_up in (("", 1.0, 10), (", denoised", 0.1, 4))
+        for label, factor in (("path", 1.0), ("ours", speed_up)) for spp in (1, 4, 16)
+    ]  # fmt: skip
+    row = verdict.summarise([scene("box", *runs)], "relmse")["scenes"]["box"]
+    assert row["ours, denoised"]["time"]["value"] == pytest.approx(0.25, rel=0.02)
+    assert row["ours"]["time"]["value"] == pytest.approx(0.1, rel=0.02)
 
 
 @pytest.mark.parametrize(

@@ -54,6 +54,14 @@ def test_a_closed_box(max_depth):
     assert_image_of_path(closed_box(lamp_behind_the_camera(), 16), max_depth=max_depth)
 
 
+@pytest.mark.stress
+def test_a_batch_of_sensors_with_virtual_lights():
+    box = closed_box(lamp_behind_the_camera(), 16)
+    cameras = {name: box["sensor"] | {"film": film(8, 16), "fov": fov} for name, fov in (("near", 30), ("far", 60))}
+    batch = {"type": "batch", "film": film(16, 16), "sampler": box["sensor"]["sampler"], **cameras}
+    assert_image_of_path(box | {"sensor": batch}, max_depth=4)
+
+
 @pytest.mark.parametrize("emitters", [*QUICK_EMITTERS, *stress("constant", "sunsky")])
 def test_emitters(emitters):
     ball = {"ball": {"type": "sphere", "center": [-0.6, -0.4, 0.3], "radius": 0.55, "bsdf": {"type": "plastic"}}}
