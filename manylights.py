@@ -54,7 +54,7 @@ import integrators  # noqa: F401 (registers the plugins)
 from comparison import batch, command_line
 from comparison.cluster.connection import connected, workers
 from comparison.command_line import UsageError, parameter, positive
-from comparison.denoising import for_denoising, import_oidn
+from comparison.denoising import QUALITIES, for_denoising, import_oidn
 from comparison.images import check_extension, write
 from comparison.one_image import INTERRUPTED, Failed, Image, LazyScene
 from comparison.render import Took, render
@@ -99,6 +99,8 @@ def parse(arguments):
         help="end when 95%% of the pixels have at most this relative standard error, such as 0.02, estimated from the "
              "variance between passes")  # fmt: skip
     add("--denoise", action="store_true", help="denoise by Open Image Denoise (pip install 'manylights[denoise]')")
+    add("--denoise-quality", choices=QUALITIES, default=QUALITIES[0],
+        help="network of Open Image Denoise (default: %(default)s)")  # fmt: skip
     add("-s", "--seed", type=command_line.seed, default=0, metavar="N", help="seed (default: 0)")
     add("--pass-spp", type=positive(int), metavar="N",
         help="samples per pixel of a pass (default: for passes of two to ten seconds; with --workers, by the size of "

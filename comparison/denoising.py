@@ -27,6 +27,7 @@ FEATURE_SPP = 16, 64  # 64 instead of 16: denoised error 2 to 10% less in four s
 FEATURE_WAVEFRONT = 1 << 22  # most samples of an image rendered at once, some 400 MB, or the fewest per pixel
 FEATURE_SHARE = 0.04  # of a time limit; the samples of a path take about 25 times as long
 FEATURE_SEED = 0xFEA7  # combined with the seed of the image, to avoid correlated noise
+QUALITIES = ("high", "balanced", "fast")  # of Open Image Denoise: networks of three sizes
 DEEPEST = 16  # interactions with mirrors, panes and masks
 FEATURES = ("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z")
 
@@ -42,16 +43,28 @@ def import_oidn():
     return mitsuba_oidn
 
 
+def denoiser_for(denoise, *scene_and_limits):
+    """Return a `Denoiser` of the remaining arguments, or None without `denoise`; True means the first of
+    `QUALITIES`. Raises ValueError for another value."""
+    if not denoise:
+        return None
+    if denoise is not True and denoise not in QUALITIES:
+        raise ValueError(f"denoise must be True, False or one of {', '.join(QUALITIES)}, got {denoise!r}")
+    return Denoiser(*scene_and_limits, quality=QUALITIES[0] if denoise is True else denoise)
+
+
 class Denoiser:
     """Denoises images of a scene by one of its sensors (an index).
 
     `spp`, `time_limit`: samples per pixel and seconds of the image, None if unlimited; they limit the samples of albedo
     and normal. `feature_spp`: samples per pixel of albedo and normal. `seconds`: time spent so far, including albedo
-    and normal, which the constructor renders. `filter_seconds`: estimated time of a call of `denoise`.
+    and normal, which the constructor renders. `filter_seconds`: estimated time of a call of `denoise`. `quality`: one
+    of `QUALITIES`.
     """
 
-    def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None):
+    def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=QUALITIES[0]):
         self._oidn, begin = import_oidn(), time.perf_counter()
+        self._quality = getattr(self._oidn.Quality, quality.capitalize())
         self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
         features, self.feature_spp = _features(scene, scene.sensors()[sensor], seed, spp, time_limit)
         filtering = time.perf_counter()
@@ -79,7 +92,7 @@ class Denoiser:
         network = self._device.new_filter("RT")
         for name, plane in (*arrays.items(), ("output", output)):
             network.set_image(name, plane)
-        for name, value in settings.items():
+        for name, value in ({"quality": self._quality} | settings).items():
             setattr(network, name, value)
         network.execute()
         return output

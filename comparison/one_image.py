@@ -111,6 +111,7 @@ class Image:
 
     def _render(self, output):
         """Render with a progress bar, and write from time to time."""
+        denoise = self._options.denoise and self._options.denoise_quality
         with ImageBar() as bar, Deadline(output.end_early):
 
             def progress(took, image):
@@ -119,10 +120,10 @@ class Image:
                     output.keep(took, image)
 
             if self._remote:
-                return self._remote.render(denoise=self._options.denoise, progress=progress)
+                return self._remote.render(denoise=denoise, progress=progress)
             scene = self._scene.get()
             return render(
-                scene, self._scene.integrator, self._sensor, denoise=self._options.denoise, progress=progress,
+                scene, self._scene.integrator, self._sensor, denoise=denoise, progress=progress,
                 checkpoint=self._checkpoint, **self._limits(),
             )  # fmt: skip
 

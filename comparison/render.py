@@ -18,7 +18,7 @@ from vpl.core.stages import listening
 
 from .batch import ALL
 from .checkpoint import Checkpoint
-from .denoising import Denoiser, for_denoising
+from .denoising import denoiser_for, for_denoising
 from .ending import Ending
 from .interruption import Interruption
 from .pass_sizes import PassSizes
@@ -66,7 +66,7 @@ def render(
     time: float | None = None,
     spp: int | None = None,
     seed: int = 0,
-    denoise: bool = False,
+    denoise: bool | str = False,
     progress: Callable[[Took, mi.TensorXf | None], bool | None] | None = None,
     pass_spp: int | None = None,
     checkpoint: Checkpoint | None = None,
@@ -79,8 +79,9 @@ def render(
     is reached ends the render: `error`, the relative standard error that 95% of the pixels do not exceed; `time`, in
     seconds, compilation included; `spp`, samples per pixel. The default is the scene's samples per pixel. There
     is at least one pass. The log has a warning if `spp` or `time` ends a render above its `error`. `seed`: of the first
-    pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py); an
-    integrator given by name is then created with its property `denoised`, if it has one.
+    pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py), by
+    the network "high" (True), "balanced" or "fast"; an integrator given by name is then created with its property
+    `denoised`, if it has one.
     `progress`: called after each pass with the cost and the image so far; integrators of this project also call it at
     the start of each stage of a pass, with None for the image. If it returns False, no other pass begins; an exception
     ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a `checkpoint.Checkpoint` of the
@@ -89,10 +90,10 @@ def render(
     Ctrl-C, or `cancel()` of the integrator, returns the image of the finished passes. Without a finished pass Ctrl-C
     raises KeyboardInterrupt and `cancel()` RuntimeError. A second Ctrl-C raises KeyboardInterrupt.
 
-    Raises ValueError for limits that are not positive, for a sensor that does not exist, for a scene without an
-    integrator, and for a participating medium that the integrator does not support; FileNotFoundError for a missing
-    scene file; ModuleNotFoundError if the package for `denoise` is missing; RuntimeError if another thread renders with
-    the same sensor, or if no variant is set.
+    Raises ValueError for limits that are not positive, for another `denoise`, for a sensor that does not exist, for a
+    scene without an integrator, and for a participating medium that the integrator does not support; FileNotFoundError
+    for a missing scene file; ModuleNotFoundError if the package for `denoise` is missing; RuntimeError if another
+    thread renders with the same sensor, or if no variant is set.
     """
     scene = _scene(scene)
     integrator = _integrator(scene, integrator, denoise)
@@ -110,7 +111,7 @@ def render(
     if error is None and time is None and spp is None:
         spp = scene.sensors()[sensor].sampler().sample_count()
     begin = clock.perf_counter()
-    denoiser = Denoiser(scene, sensor, seed, spp, time) if denoise else None
+    denoiser = denoiser_for(denoise, scene, sensor, seed, spp, time)
     progressive = Progressive(scene, seed, sensor, integrator)
     reserved = denoiser.filter_seconds if denoiser else 0.0
     sizes = PassSizes(

@@ -139,6 +139,17 @@ def test_a_plugin_by_name_is_balanced_for_the_denoiser_and_an_object_keeps_its_p
     assert len(told) == (1 if denoise else 2)
 
 
+def test_a_quality_chooses_the_network():
+    scene, plugin = cornell(32).load(), mi.load_dict({"type": "path", "max_depth": 3})
+    high, fast, usual = (
+        manylights.render(scene, plugin, spp=2, denoise=one)[0].numpy() for one in ("high", "fast", True)
+    )
+    np.testing.assert_array_equal(high, usual)
+    assert 0 < np.abs(high - fast).mean() < 0.3 * high.mean()
+    with pytest.raises(ValueError, match="denoise must be True, False or one of high, balanced, fast, got 'best'"):
+        manylights.render(scene, plugin, spp=2, denoise="best")
+
+
 def test_time_includes_denoising(monkeypatch):
     """What the filter will take is reserved."""
     told = []
@@ -196,6 +207,15 @@ def test_the_comparison_sets_the_property_unless_it_is_given():
     options = compare.parse([CORNELL, "-i", "path,manylights,raw=manylights", "-p", "raw.denoised=false", "--denoise"])
     chosen = {label: given for label, (_, given) in compare.chosen_integrators(options).items()}
     assert chosen == {"path": {}, "manylights": {"denoised": True}, "raw": {"denoised": False}}
+
+
+def test_the_command_passes_the_quality_on(tmp_path, capsys):
+    for quality in ("high", "fast"):
+        assert command("-o", tmp_path / f"{quality}.exr", "--denoise", "--denoise-quality", quality) == 0
+    high, fast = (images.read_exr(tmp_path / f"{quality}.denoised.exr")[0] for quality in ("high", "fast"))
+    assert np.abs(high - fast).max() > 0
+    assert command("--denoise", "--denoise-quality", "best") == 2
+    assert "invalid choice: 'best'" in capsys.readouterr().err
 
 
 def test_png_shows_the_denoised_image(tmp_path):
