@@ -99,8 +99,8 @@ def parse(arguments):
         help="end when 95%% of the pixels have at most this relative standard error, such as 0.02, estimated from the "
              "variance between passes")  # fmt: skip
     add("--denoise", action="store_true", help="denoise by Open Image Denoise (pip install 'manylights[denoise]')")
-    add("--denoise-quality", choices=QUALITIES, default=QUALITIES[0],
-        help="network of Open Image Denoise (default: %(default)s)")  # fmt: skip
+    add("--denoise-quality", choices=QUALITIES,
+        help=f"with --denoise: network, from best to quickest (default: {QUALITIES[0]})")  # fmt: skip
     add("-s", "--seed", type=command_line.seed, default=0, metavar="N", help="seed (default: 0)")
     add("--pass-spp", type=positive(int), metavar="N",
         help="samples per pixel of a pass (default: for passes of two to ten seconds; with --workers, by the size of "
@@ -115,6 +115,8 @@ def parse(arguments):
         help="scale PNG images by 2^STOPS (default: bring the 95th percentile of the brightness to 0.8)")  # fmt: skip
     command_line.add_common_options(parser)
     options = parser.parse_args(arguments)
+    if options.denoise_quality and not options.denoise:
+        parser.error("--denoise-quality needs --denoise")
     if options.output and not options.output.is_dir():
         try:
             check_extension(options.output)

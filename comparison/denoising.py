@@ -46,11 +46,16 @@ def import_oidn():
 def denoiser_for(denoise, *scene_and_limits):
     """Return a `Denoiser` of the remaining arguments, or None without `denoise`; True means the first of
     `QUALITIES`. Raises ValueError for another value."""
+    check_denoise(denoise)
     if not denoise:
         return None
-    if denoise is not True and denoise not in QUALITIES:
+    return Denoiser(*scene_and_limits, quality=denoise if isinstance(denoise, str) else QUALITIES[0])
+
+
+def check_denoise(denoise):
+    """Raise ValueError for a string that is not one of `QUALITIES`."""
+    if isinstance(denoise, str) and denoise not in QUALITIES:
         raise ValueError(f"denoise must be True, False or one of {', '.join(QUALITIES)}, got {denoise!r}")
-    return Denoiser(*scene_and_limits, quality=QUALITIES[0] if denoise is True else denoise)
 
 
 class Denoiser:
@@ -64,13 +69,18 @@ class Denoiser:
 
     def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=QUALITIES[0]):
         self._oidn, begin = import_oidn(), time.perf_counter()
-        self._quality = getattr(self._oidn.Quality, quality.capitalize())
+        self.quality, self._network = quality, getattr(self._oidn.Quality, quality.capitalize())
         self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
         features, self.feature_spp = _features(scene, scene.sensors()[sensor], seed, spp, time_limit)
         filtering = time.perf_counter()
         self._features = {name: self._filtered({name: plane}) for name, plane in features.items()}
         end = time.perf_counter()
         self.seconds, self.filter_seconds = end - begin, end - filtering
+
+    @property
+    def description(self):
+        """Return metadata for denoised images."""
+        return {"denoise_quality": self.quality, "denoise_feature_spp": self.feature_spp}
 
     def denoise(self, image, channels):
         """Denoise the colour of an image (height, width, channels). Keeps its other channels, and treats non-finite
@@ -92,7 +102,7 @@ class Denoiser:
         network = self._device.new_filter("RT")
         for name, plane in (*arrays.items(), ("output", output)):
             network.set_image(name, plane)
-        for name, value in ({"quality": self._quality} | settings).items():
+        for name, value in ({"quality": self._network} | settings).items():
             setattr(network, name, value)
         network.execute()
         return output
@@ -101,30 +111,32 @@ class Denoiser:
 def _features(scene, sensor, seed, spp, time_limit):
     """Return (albedo and normal, samples per pixel), see `Denoiser` for the limits."""
     fewest, most = FEATURE_SPP
-    wanted = most if spp is None else math.isqrt(min(max(spp, fewest), most)) ** 2
+    wanted = most if spp is None else min(max(spp, fewest), most)
     if time_limit is None:
-        return auxiliary_features(scene, sensor, wanted, seed), wanted
+        return auxiliary_features(scene, sensor, math.isqrt(wanted) ** 2, seed)
     # The first samples tell the time of the others; compilation counts, because people wait for it
     begin = time.perf_counter()
-    found = auxiliary_features(scene, sensor, fewest, seed)
+    first = auxiliary_features(scene, sensor, fewest, seed)
     spent = time.perf_counter() - begin
-    more = math.isqrt(int(min(FEATURE_SHARE * time_limit / spent * fewest, wanted))) ** 2
-    if more < fewest:
-        return found, fewest
-    rest = auxiliary_features(scene, sensor, more, derived_seed(seed, 1))
-    return _mean_of([(fewest, found), (more, rest)]), fewest + more
+    # Mitsuba's stratified samplers round to squares
+    possible = min(FEATURE_SHARE * time_limit / spent * fewest, most if spp is None else wanted - fewest)
+    if possible < fewest:
+        return first
+    more = auxiliary_features(scene, sensor, math.isqrt(int(possible)) ** 2, derived_seed(seed, 1))
+    return _mean_of([first, more])
 
 
-def _mean_of(weighted):
-    """Return the mean of dictionaries of images, from pairs (weight, dictionary)."""
-    whole = sum(weight for weight, _ in weighted)
-    return {name: sum(weight / whole * one[name] for weight, one in weighted) for name in weighted[0][1]}
+def _mean_of(renders):
+    """Return the mean of (images by name, samples) by samples, and the sum of the samples."""
+    whole = sum(samples for _, samples in renders)
+    return {name: sum(samples / whole * one[name] for one, samples in renders) for name in renders[0][0]}, whole
 
 
 def auxiliary_features(scene, sensor, spp, seed):
     """Render "albedo" and "normal", a dict of (height, width, 3) float32, of the first surfaces that are neither mirror
-    nor glass, with `spp` samples per pixel (at least, in large images) and the film's filter; `sensor` is a
-    `mi.Sensor`. The samples are stratified if the sensor's sampler is `independent`.
+    nor glass, with the film's filter and at least `spp` samples per pixel; `sensor` is a `mi.Sensor`. The samples are
+    stratified if the sensor's sampler is `independent`. Return the dict and the samples per pixel, which are more only
+    in large images.
 
     Albedo, 0 to 1: directional albedo, estimated by one BSDF sample, times the throughput of mirrors and glass before
     the surface, plus emission. Normal: shading normal in world space, turned towards the viewer. Both are 0 in empty
@@ -132,7 +144,7 @@ def auxiliary_features(scene, sensor, spp, seed):
     """
     fewest, pixels = FEATURE_SPP[0], int(np.prod(sensor.film().crop_size()))
     each, parts = (spp, 1) if spp * pixels <= FEATURE_WAVEFRONT else (fewest, math.ceil(spp / fewest))
-    return _mean_of([(each, _rendered(scene, sensor, each, (seed, part))) for part in range(parts)])
+    return _mean_of([(_rendered(scene, sensor, each, (seed, part)), each) for part in range(parts)])
 
 
 def _rendered(scene, sensor, spp, key):

@@ -111,7 +111,7 @@ class Image:
 
     def _render(self, output):
         """Render with a progress bar, and write from time to time."""
-        denoise = self._options.denoise and self._options.denoise_quality
+        denoise = self._options.denoise_quality or self._options.denoise
         with ImageBar() as bar, Deadline(output.end_early):
 
             def progress(took, image):
@@ -182,7 +182,7 @@ class Output:
             "statistics": took.statistics,
         }
         if took.raw is not None:
-            described = metadata | {"denoise_seconds": took.denoise_seconds}
+            described = metadata | {"denoise_seconds": took.denoise_seconds} | took.denoiser
             images.write(self.path.with_suffix(".denoised.exr"), image, took.channels, described)
             image = np.array(took.raw)
         images.write(self.path, image, took.channels, metadata)

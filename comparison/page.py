@@ -91,8 +91,7 @@ def _summary(results):
     cells = [
         [_mean_cell(mean[kind], len(rows)) if mean else empty for kind in verdict.KINDS] + [empty] for mean in means
     ]
-    relative_to = sorted({*summary["bases"].values()}, key=lambda label: label != summary["base"])
-    return {**summary, "labels": labels, "rows": rows, "mean_cells": cells, "relative_to": relative_to}
+    return {**summary, "labels": labels, "rows": rows, "mean_cells": cells}
 
 
 def _outcome(outcome, is_base):

@@ -18,7 +18,7 @@ from vpl.core.stages import listening
 
 from .batch import ALL
 from .checkpoint import Checkpoint
-from .denoising import denoiser_for, for_denoising
+from .denoising import check_denoise, denoiser_for, for_denoising
 from .ending import Ending
 from .interruption import Interruption
 from .pass_sizes import PassSizes
@@ -37,8 +37,8 @@ class Took:
     exceed (see convergence.py), before denoising, None for fewer than two passes; `statistics`: counters of the
     integrator, summed over passes; `ended_by`: the limit that was reached ("spp", "time" or "error"), "interruption"
     (Ctrl-C, or `cancel` of the integrator) or "progress", None during the render; `channels`: names of the channels;
-    `denoise_seconds`: the part of `seconds` for denoising; `raw`: the image before denoising (`mi.TensorXf`), None
-    without denoising.
+    `denoise_seconds`: the part of `seconds` for denoising; `denoiser`: metadata, quality of the denoiser and samples of
+    albedo and normal; `raw`: the image before denoising (`mi.TensorXf`), None without denoising.
 
     During a render: `stage`: current stage of the pass, a key of `statistics["seconds"]`, None between passes;
     `seconds_left`: expected seconds until the end, None if unknown.
@@ -52,6 +52,7 @@ class Took:
     ended_by: str | None
     channels: list[str]
     denoise_seconds: float = 0.0
+    denoiser: dict[str, Any] = field(default_factory=dict, repr=False)
     raw: mi.TensorXf | None = field(default=None, repr=False)
     stage: str | None = None
     seconds_left: float | None = None
@@ -95,6 +96,7 @@ def render(
     for a missing scene file; ModuleNotFoundError if the package for `denoise` is missing; RuntimeError if another
     thread renders with the same sensor, or if no variant is set.
     """
+    check_denoise(denoise)
     scene = _scene(scene)
     integrator = _integrator(scene, integrator, denoise)
     if sensor == ALL:
@@ -283,7 +285,7 @@ class _Render:
         image, took = self._image(), self._took()
         if denoiser:
             image, took.raw = denoiser.denoise(image, took.channels), image
-            took.denoise_seconds = denoiser.seconds
+            took.denoise_seconds, took.denoiser = denoiser.seconds, denoiser.description
             took.seconds = self._elapsed()
         return image, took
 

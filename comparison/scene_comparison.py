@@ -10,6 +10,7 @@ from .command_line import failure, own_integrators
 from .pictures import REFERENCE, Pictures
 from .scene_files import SceneFile, short_name
 from .sweeps import order
+from .verdict import denoised_label
 
 FIRST_SPP = 64  # initial samples of an automatic reference
 GROWTH = (1.2, 4.0)  # minimum and maximum factor of its refinement steps
@@ -238,11 +239,6 @@ class SceneComparison:
 
     def _fail(self, error):
         self.result |= failure(error)
-
-
-def denoised_label(label):
-    """Return the label of the denoised images of a label."""
-    return f"{label}, denoised"
 
 
 def _denoised(result):

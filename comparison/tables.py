@@ -187,7 +187,7 @@ def _unequal_times(scene):
     for name, renders in settings(scene).items():
         seconds = [render["seconds"] for render in renders if "error" not in render and render["budget"]]
         if seconds:
-            # The denoiser takes its time after a budget, for all integrators
+            # The denoiser works after the budget, so denoised images have times of their own
             budgets.setdefault((renders[0]["budget"], renders[0]["denoised"]), {})[name] = _mean(seconds)
     found = []
     for (budget, _), seconds in budgets.items():

@@ -12,17 +12,24 @@ import numpy as np
 from . import analysis, curves, metrics, tables
 
 UNBIASED = ("path", "direct", "volpath", "volpathmis", "ptracer")
+DENOISED = ", denoised"  # end of the labels of denoised images
 KINDS = ("error", "time")
 ALIKE = 1.05  # ratios up to this factor count as equal if there is no interval
 PARTS = ("half", "a third", "a quarter", "a fifth", "a sixth", "a seventh", "an eighth", "a ninth", "a tenth")
 
 
+def denoised_label(label):
+    """Return the label of the denoised images of a label."""
+    return f"{label}{DENOISED}"
+
+
 def summarise(scenes, metric):
     """Return the "summary" of results.schema.json for the results of some scenes."""
-    groups = [_summary_of(group, metric) for group in _groups(scenes, metric)]
-    merged = {"base": groups[-1][0] if groups else None, "bases": {}, "scenes": {}, "means": {}, "sentences": []}
-    for base, rows, means, sentences in groups:
-        merged["bases"] |= {label: base for row in rows.values() for label in row}
+    raw = _labels(scenes, lambda render: not render["denoised"])
+    groups = [_summary_of(*group, metric) for group in _groups(scenes, raw, metric)]
+    merged = {"base": raw[0] if raw else None, "bases": {}, "scenes": {}, "means": {}, "sentences": []}
+    for labels, rows, means, sentences in groups:
+        merged["bases"] |= dict.fromkeys(labels, labels[0] if labels else None)
         for name, row in rows.items():
             merged["scenes"].setdefault(name, {}).update(row)
         merged["means"] |= means
@@ -30,24 +37,28 @@ def summarise(scenes, metric):
     return merged
 
 
-def _groups(scenes, metric):
-    """Return the scenes with their denoised images alone, if there are any, and with their raw images alone."""
-    if not any(render["denoised"] for scene in scenes for render in scene["renders"]):
-        return [scenes] if scenes else []
+def _labels(scenes, accepts=lambda _: True):
+    """Return the labels of runs that `accepts`, in the order of the runs."""
+    return list(dict.fromkeys(render["label"] for scene in scenes for render in scene["renders"] if accepts(render)))
+
+
+def _groups(scenes, raw, metric):
+    """Return (scenes, labels) of the denoised images, if there are any, and of the raw images with the labels `raw`."""
+    if not _labels(scenes, lambda render: render["denoised"]):
+        return [(scenes, raw)] if scenes else []
     groups = []
-    for denoised in (True, False):
+    # The order of raw labels, because failed runs have no denoised image
+    for denoised, labels in ((True, [denoised_label(label) for label in raw]), (False, raw)):
         group = []
         for scene in scenes:
             renders = [render for render in scene["renders"] if render["denoised"] is denoised]
-            labels = list(dict.fromkeys(render["label"] for render in renders))
             group.append({**scene, "renders": renders} | analysis.analyse(renders, labels, metric))
-        groups.append(group)
+        groups.append((group, labels))
     return groups
 
 
-def _summary_of(scenes, metric):
-    """Return (label of the first integrator, rows by scene, means by label, sentences) of a group of images."""
-    labels = list(dict.fromkeys(render["label"] for scene in scenes for render in scene["renders"]))
+def _summary_of(scenes, labels, metric):
+    """Return (labels, rows by scene, means by label, sentences) of images with the given labels, the first as base."""
     rows = {scene["name"]: _row(scene, labels, metric) for scene in scenes}
     means = {
         label: {kind: _over_scenes([row[label][kind] for row in rows.values() if label in row]) for kind in KINDS}
@@ -57,7 +68,7 @@ def _summary_of(scenes, metric):
     sentences = [text for label in order if (text := _sentence(label, labels[0], rows))]
     if means and not sentences:
         sentences = [f"These runs do not determine the performance of {_listed(order)} relative to {labels[0]}."]
-    return labels[0] if labels else None, rows, means, sentences
+    return labels, rows, means, sentences
 
 
 def _row(scene, labels, metric):
@@ -179,15 +190,17 @@ def verdict_of(ratio):
 def _sentence(label, base, rows):
     """Compare an integrator with the first in a sentence; None without a known ratio."""
     kind = "time" if any(row.get(label, {}).get("time") for row in rows.values()) else "error"
+    intro = "Denoised, " if label.endswith(DENOISED) and base.endswith(DENOISED) else ""
+    shown, of = (name.removesuffix(DENOISED) if intro else name for name in (label, base))
     ratios = {name: row[label][kind] for name, row in rows.items() if row.get(label, {}).get(kind)}
     if not ratios:
         return None
     if len(rows) == 1:
         ratio = in_words(*ratios.values())
-        return f"{label} {WORDS[kind]['one'].format(ratio=ratio, base=base)} in {next(iter(ratios))}."
+        return f"{intro}{shown} {WORDS[kind]['one'].format(ratio=ratio, base=of)} in {next(iter(ratios))}."
     mean = _over_scenes(ratios.values())
     names = {one: [name for name, ratio in ratios.items() if verdict_of(ratio) == one] for one in ("better", "worse")}
-    text = f"{label} {WORDS[kind]['less'].format(base=base)} in {len(names['better'])} of {len(rows)} scenes"
+    text = f"{intro}{shown} {WORDS[kind]['less'].format(base=of)} in {len(names['better'])} of {len(rows)} scenes"
     if mean:
         over = f" over {mean['scenes']} scenes" if mean["scenes"] < len(rows) else ""
         text += f" (geometric mean{over}: {in_words(mean)} the {kind})"

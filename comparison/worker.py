@@ -171,10 +171,10 @@ def _denoise(job, scene, progressive, described):
         return {"denoise_seconds": None, "cold_denoise_seconds": None}
     seconds = []
     for _ in range(2):
-        denoiser = Denoiser(scene, seed=job.seed, spp=progressive.spp)
+        denoiser = Denoiser(scene, 0, job.seed, None if job.budget else progressive.spp, job.budget)
         image = denoiser.denoise(progressive.image, progressive.channels)
         seconds.append(denoiser.seconds)
-    described = described | {"run": job.run or "", "denoise_seconds": seconds[1]}
+    described = described | {"run": job.run or "", "denoise_seconds": seconds[1]} | denoiser.description
     images.write_exr(job.denoised_output, image, progressive.channels, described)
     return {"denoise_seconds": seconds[1], "cold_denoise_seconds": seconds[0]}
 

@@ -53,10 +53,10 @@ def _hear_interruptions() -> None:
 
 def _for_all_samples(sampler, ray, active):
     """(Camera rays, mask) with a lane for each sample: some sensors, such as ``radiancemeter``, give a single ray."""
-    count = max(dr.width(ray), sampler.wavefront_size())
-    ray, wide = mi.Ray3f(ray), dr.zeros(mi.Float, count)
+    count = dr.width(ray) if dr.width(ray.o, ray.d) > 1 else sampler.wavefront_size()
+    ray, wide = mi.Ray3f(ray), dr.zeros(mi.Float, max(count, 1))
     ray.o, ray.d, ray.time = ray.o + wide, ray.d + wide, ray.time + wide
-    return ray, mi.Bool(active) & dr.full(mi.Bool, True, count)
+    return ray, mi.Bool(active) & dr.full(mi.Bool, True, len(wide))
 
 
 @dataclass

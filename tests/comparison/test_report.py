@@ -194,7 +194,7 @@ def test_times_that_are_not_equal_are_named():
     assert warning == "Not at equal time: of 10 s, a took 10 s and long 14 s."
     given_samples = of_budget("a", 1.0, budget=None) + of_budget("b", 9.0, budget=None)
     assert tables.warnings({"renders": given_samples}, cores=2) == []
-    # The denoiser takes the same time after every image
+    # The denoiser works after the budget
     denoised = [run for label in "ab" for run in of_budget(f"{label}, denoised", 13.0, denoised=True)]
     assert tables.warnings({"renders": of_budget("a", 9.0, 11.0) + denoised}, cores=2) == []
 

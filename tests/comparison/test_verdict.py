@@ -131,7 +131,7 @@ def with_denoised(*renders):
 def test_denoised_images_are_compared_with_denoised_images_and_come_first():
     found = verdict.summarise([with_denoised(run("path", "", 10.0, 0.1), run("ours", "", 10.0, 0.01))], "relmse")
     assert found["sentences"] == [
-        "ours, denoised has half of the error of path, denoised at equal time in box.",
+        "Denoised, ours has half of the error of path at equal time in box.",
         "ours needs about a tenth of the time of path for the same error in box.",
     ]
     assert found["base"] == "path" and next(iter(found["scenes"]["box"])) == "path, denoised"
@@ -141,6 +141,17 @@ def test_denoised_images_are_compared_with_denoised_images_and_come_first():
     # The denoised error does not fall with the number of samples at a known rate
     assert found["scenes"]["box"]["ours, denoised"]["time"] is None
     assert set(found["means"]) == {"ours", "ours, denoised"}
+
+
+def test_the_first_integrator_stays_the_base_of_denoised_images_where_it_failed():
+    """A failed run has no denoised image."""
+    failed = with_denoised(run("path", "", 10.0, 0.1), run("ours", "", 10.0, 0.01)) | {"name": "first"}
+    failed["renders"] = [one for one in failed["renders"] if one["label"] != "path, denoised"]
+    good = with_denoised(run("path", "", 10.0, 0.1), run("ours", "", 10.0, 0.01))
+    found = verdict.summarise([failed, good], "relmse")
+    assert found["bases"]["ours, denoised"] == found["bases"]["path, denoised"] == "path, denoised"
+    assert found["scenes"]["first"]["ours, denoised"]["error"] is None
+    assert found["scenes"]["box"]["ours, denoised"]["error"]["value"] == pytest.approx(0.5)
 
 
 def test_curves_of_denoised_images_are_relative_to_the_denoised_curve():
