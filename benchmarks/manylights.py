@@ -4,7 +4,8 @@
     python benchmarks/manylights.py --parts product --scenes kitchen     one part, one scene
     python benchmarks/manylights.py --parts product --views 2            from two random cameras of each scene
 
-Each part runs both integrators in turn, ``path`` with the better of the samplers ``independent`` and ``multijitter``.
+Each part runs both integrators in turn, ``path`` with the better of the samplers ``independent`` and ``multijitter``,
+in ``product`` also ``manylights``.
 
 - ``product``: variance between passes × seconds of a pass.  Variance is relative to the squared reference (without
   reference: mean of all passes) plus a hundredth of its squared mean, without the worst 0.1% of the pixels.  The
@@ -79,7 +80,11 @@ def reference_of(name: str) -> tuple[np.ndarray, np.ndarray]:
 def scale_of(name: str, images: list, width: int, view: int = 0) -> np.ndarray:
     """What squared errors are relative to."""
     known = scenes.reference_file(name) and width == 256 and not view
-    truth = reference_of(name)[0] if known else np.mean(images, axis=0)
+    return scale_of_truth(reference_of(name)[0] if known else np.mean(images, axis=0))
+
+
+def scale_of_truth(truth: np.ndarray) -> np.ndarray:
+    """Denominator of relative squared errors."""
     return truth**2 + 0.01 * truth.mean() ** 2
 
 
@@ -97,11 +102,11 @@ def product(names, width: int, seconds: float, passes: int, views: int) -> dict:
     return rows
 
 
-def print_mean(rows: dict) -> None:
-    """Print the geometric mean and the least of the speedups."""
-    ratios = [row["speedup"] for row in rows.values()]
+def print_mean(rows: dict, speedup: str = "speedup", of: str = "") -> None:
+    """Print the geometric mean and the least of the speedups, a key of the rows; ``of``: description."""
+    ratios = [row[speedup] for row in rows.values()]
     if ratios:
-        print(f"geometric mean {scenes.geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
+        print(f"{of}geometric mean {scenes.geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
 
 
 def best_of(rivals: list, scale: np.ndarray) -> dict:
@@ -175,25 +180,24 @@ def denoised(names, width: int, seconds: float, passes: int) -> dict:
             continue
         rows[name] = denoised_of(name, width, seconds, passes)
     print_mean(rows)
-    same = [row["independent_speedup"] for row in rows.values()]
-    if same:
-        print(f"with the sampler independent: {scenes.geometric_mean(same):.2f}, worst {min(same):.2f}")
+    print_mean(rows, "independent_speedup", "with the sampler independent: ")
     return rows
 
 
 def denoised_of(name: str, width: int, seconds: float, passes: int) -> dict:
     """Print the denoised errors of a scene, and the relative times of ``path`` for equal error; returns the row."""
+    from comparison.denoising import Denoiser
+
     scene = load(name, width)
     rivals = [Rival(name, scene, "path", sampler, width, seconds) for sampler in SAMPLERS]
     # manylights stratifies the samples of this sampler
     rivals.append(Rival(name, scene, "manylights", "independent", width, seconds, denoised=True))
     measure_in_turn(rivals, passes)
-    from comparison.denoising import Denoiser
-
     # The same denoiser for all; the first one compiles
     denoiser = [Denoiser(scene) for _ in range(2)][-1]
     fixed = denoiser.seconds + denoiser.filter_seconds
-    points = [(denoised_error(name, rival.images, denoiser), float(np.median(rival.seconds))) for rival in rivals]
+    reference = reference_of(name)
+    points = [(denoised_error(rival.images, denoiser, *reference), float(np.median(rival.seconds))) for rival in rivals]
     *theirs, (ours, our_time) = points
     # Denoised errors fall by 1.37 where samples double; the denoiser works once
     ratios = [
@@ -213,10 +217,9 @@ def denoised_of(name: str, width: int, seconds: float, passes: int) -> dict:
     return row | {"independent_speedup": float(ratios[0]), "speedup": float(min(ratios))}
 
 
-def denoised_error(name: str, images: list, denoiser) -> float:
+def denoised_error(images: list, denoiser, truth: np.ndarray, noise: np.ndarray) -> float:
     """Trimmed relative squared error of denoised images without the noise of the reference."""
-    truth, noise = reference_of(name)
-    scale = truth**2 + 0.01 * truth.mean() ** 2
+    scale = scale_of_truth(truth)
     clean = [denoiser.denoise(image, ["R", "G", "B"])[..., :3] for image in images]
     error = np.mean([((image - truth) ** 2 - noise**2) / scale for image in clean], axis=0).mean(-1)
     return float(np.sort(error.ravel())[int(TRIMMED * error.size) : int((1 - TRIMMED) * error.size)].mean())

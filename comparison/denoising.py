@@ -43,19 +43,14 @@ def import_oidn():
     return mitsuba_oidn
 
 
-def denoiser_for(denoise, *scene_and_limits):
-    """Return a `Denoiser` of the remaining arguments, or None without `denoise`; True means the first of
-    `QUALITIES`. Raises ValueError for another value."""
-    check_denoise(denoise)
-    if not denoise:
-        return None
-    return Denoiser(*scene_and_limits, quality=denoise if isinstance(denoise, str) else QUALITIES[0])
-
-
-def check_denoise(denoise):
-    """Raise ValueError for a string that is not one of `QUALITIES`."""
-    if isinstance(denoise, str) and denoise not in QUALITIES:
+def quality_of(denoise):
+    """Return the quality that the value of a parameter `denoise` names, the best one for True. Raises ValueError for a
+    string that is not one of `QUALITIES`."""
+    if not isinstance(denoise, str):
+        return QUALITIES[0]
+    if denoise not in QUALITIES:
         raise ValueError(f"denoise must be True, False or one of {', '.join(QUALITIES)}, got {denoise!r}")
+    return denoise
 
 
 class Denoiser:

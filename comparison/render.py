@@ -18,7 +18,7 @@ from vpl.core.stages import listening
 
 from .batch import ALL
 from .checkpoint import Checkpoint
-from .denoising import check_denoise, denoiser_for, for_denoising
+from .denoising import Denoiser, for_denoising, quality_of
 from .ending import Ending
 from .interruption import Interruption
 from .pass_sizes import PassSizes
@@ -96,7 +96,7 @@ def render(
     for a missing scene file; ModuleNotFoundError if the package for `denoise` is missing; RuntimeError if another
     thread renders with the same sensor, or if no variant is set.
     """
-    check_denoise(denoise)
+    quality = quality_of(denoise)
     scene = _scene(scene)
     integrator = _integrator(scene, integrator, denoise)
     if sensor == ALL:
@@ -113,7 +113,7 @@ def render(
     if error is None and time is None and spp is None:
         spp = scene.sensors()[sensor].sampler().sample_count()
     begin = clock.perf_counter()
-    denoiser = denoiser_for(denoise, scene, sensor, seed, spp, time)
+    denoiser = Denoiser(scene, sensor, seed, spp, time, quality) if denoise else None
     progressive = Progressive(scene, seed, sensor, integrator)
     reserved = denoiser.filter_seconds if denoiser else 0.0
     sizes = PassSizes(

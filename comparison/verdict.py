@@ -25,11 +25,11 @@ def denoised_label(label):
 
 def summarise(scenes, metric):
     """Return the "summary" of results.schema.json for the results of some scenes."""
-    raw = _labels(scenes, lambda render: not render["denoised"])
-    groups = [_summary_of(*group, metric) for group in _groups(scenes, raw, metric)]
+    raw = _labels(scenes, denoised=False)
     merged = {"base": raw[0] if raw else None, "bases": {}, "scenes": {}, "means": {}, "sentences": []}
-    for labels, rows, means, sentences in groups:
-        merged["bases"] |= dict.fromkeys(labels, labels[0] if labels else None)
+    for group, labels in _groups(scenes, raw, metric):
+        rows, means, sentences = _summary_of(group, labels, metric)
+        merged["bases"] |= dict.fromkeys(labels, *labels[:1])
         for name, row in rows.items():
             merged["scenes"].setdefault(name, {}).update(row)
         merged["means"] |= means
@@ -37,28 +37,29 @@ def summarise(scenes, metric):
     return merged
 
 
-def _labels(scenes, accepts=lambda _: True):
-    """Return the labels of runs that `accepts`, in the order of the runs."""
-    return list(dict.fromkeys(render["label"] for scene in scenes for render in scene["renders"] if accepts(render)))
+def _labels(scenes, denoised):
+    """Return the labels of raw or of denoised images, in the order of the runs."""
+    renders = [render for scene in scenes for render in scene["renders"]]
+    return list(dict.fromkeys(render["label"] for render in renders if render["denoised"] is denoised))
 
 
 def _groups(scenes, raw, metric):
     """Return (scenes, labels) of the denoised images, if there are any, and of the raw images with the labels `raw`."""
-    if not _labels(scenes, lambda render: render["denoised"]):
-        return [(scenes, raw)] if scenes else []
-    groups = []
+    if not _labels(scenes, denoised=True):
+        return [(scenes, raw)]
     # The order of raw labels, because failed runs have no denoised image
-    for denoised, labels in ((True, [denoised_label(label) for label in raw]), (False, raw)):
-        group = []
-        for scene in scenes:
-            renders = [render for render in scene["renders"] if render["denoised"] is denoised]
-            group.append({**scene, "renders": renders} | analysis.analyse(renders, labels, metric))
-        groups.append((group, labels))
-    return groups
+    kinds = (True, [denoised_label(label) for label in raw]), (False, raw)
+    return [([_only(scene, denoised, labels, metric) for scene in scenes], labels) for denoised, labels in kinds]
+
+
+def _only(scene, denoised, labels, metric):
+    """Return the results of a scene with its raw or its denoised images alone."""
+    renders = [render for render in scene["renders"] if render["denoised"] is denoised]
+    return {**scene, "renders": renders} | analysis.analyse(renders, labels, metric)
 
 
 def _summary_of(scenes, labels, metric):
-    """Return (labels, rows by scene, means by label, sentences) of images with the given labels, the first as base."""
+    """Return (rows by scene, means by label, sentences) of images with the given labels, the first as base."""
     rows = {scene["name"]: _row(scene, labels, metric) for scene in scenes}
     means = {
         label: {kind: _over_scenes([row[label][kind] for row in rows.values() if label in row]) for kind in KINDS}
@@ -68,7 +69,7 @@ def _summary_of(scenes, labels, metric):
     sentences = [text for label in order if (text := _sentence(label, labels[0], rows))]
     if means and not sentences:
         sentences = [f"These runs do not determine the performance of {_listed(order)} relative to {labels[0]}."]
-    return labels, rows, means, sentences
+    return rows, means, sentences
 
 
 def _row(scene, labels, metric):
@@ -190,8 +191,8 @@ def verdict_of(ratio):
 def _sentence(label, base, rows):
     """Compare an integrator with the first in a sentence; None without a known ratio."""
     kind = "time" if any(row.get(label, {}).get("time") for row in rows.values()) else "error"
-    intro = "Denoised, " if label.endswith(DENOISED) and base.endswith(DENOISED) else ""
-    shown, of = (name.removesuffix(DENOISED) if intro else name for name in (label, base))
+    intro = "Denoised, " if base.endswith(DENOISED) else ""
+    shown, of = (name.removesuffix(DENOISED) for name in (label, base))
     ratios = {name: row[label][kind] for name, row in rows.items() if row.get(label, {}).get(kind)}
     if not ratios:
         return None

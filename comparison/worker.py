@@ -171,7 +171,7 @@ def _denoise(job, scene, progressive, described):
         return {"denoise_seconds": None, "cold_denoise_seconds": None}
     seconds = []
     for _ in range(2):
-        denoiser = Denoiser(scene, 0, job.seed, None if job.budget else progressive.spp, job.budget)
+        denoiser = Denoiser(scene, seed=job.seed, spp=None if job.budget else progressive.spp, time_limit=job.budget)
         image = denoiser.denoise(progressive.image, progressive.channels)
         seconds.append(denoiser.seconds)
     described = described | {"run": job.run or "", "denoise_seconds": seconds[1]} | denoiser.description

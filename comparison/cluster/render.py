@@ -3,7 +3,7 @@
 import math
 import time as clock
 
-from ..denoising import denoiser_for
+from ..denoising import Denoiser, quality_of
 from ..ending import Ending
 from ..pass_sizes import PassSizes
 from ..render import check, render_passes
@@ -52,7 +52,7 @@ class DistributedRender:
         begin = clock.perf_counter() - self._seconds
         try:
             limits = self._seed, self.spp, self._time
-            denoiser = denoiser_for(denoise, self._scene.get(), self._sensor, *limits) if denoise else None
+            denoiser = Denoiser(self._scene.get(), self._sensor, *limits, quality_of(denoise)) if denoise else None
             reserved = denoiser.filter_seconds if denoiser else 0.0
             ending = Ending(self.spp, self._time and self._time - reserved, self._error, reserved)
             if self._time:

@@ -249,7 +249,7 @@ def test_workers_are_let_go_where_an_image_cannot_be_denoised(two, monkeypatch):
     def broken(*_):
         raise RuntimeError("no albedo")
 
-    monkeypatch.setattr("comparison.cluster.render.denoiser_for", broken)
+    monkeypatch.setattr("comparison.cluster.render.Denoiser", broken)
     with connection.connected(two, 1) as workers:
         render = prepared(workers, spp=4)
         with pytest.raises(RuntimeError, match="no albedo"):
