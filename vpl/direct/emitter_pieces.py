@@ -13,8 +13,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import download, finite_or_zero, select_record, upload
+from ..core.arrays import finite_or_zero, select_record, upload
 from ..core.cones import mean_axes
+from ..core.meshes import coordinates_of, faces_of, is_triangle_mesh, normals_of, positions_of
 from ..core.parameters import matrix_of, parameters_of
 from ..lights.emitters import AreaEmitters, registered_shapes
 from ..lights.spheres import Sphere, sphere_coordinates
@@ -60,7 +61,7 @@ class EmitterPieces:
         smooth = (np.abs(shading - _constant(normal)) > _ROUNDING).any(1)
         self._shading = upload(mi.Float, np.pad(shading, ((0, 0), (0, 3)))) if smooth.any() else None
         self._first_piece = upload(mi.UInt32, np.cumsum(counts) - counts)
-        self._has_meshes = upload(mi.UInt32, np.array([_is_mesh(shape) for shape in shapes], np.uint32))
+        self._has_meshes = upload(mi.UInt32, np.array([is_triangle_mesh(shape) for shape in shapes], np.uint32))
         self._kinds = set(np.unique(kind).tolist())
         self._hollow = bool((first[kind == SPHERE, 1] < 0).any())
         self._bound(kind, corner, first, second, size, row, shapes)
@@ -287,14 +288,9 @@ def _areas(kind, first, second) -> np.ndarray:
     return size
 
 
-def _is_mesh(shape) -> bool:
-    """Whether a shape consists of triangles.  Mitsuba's ``is_mesh`` holds for rectangles, too."""
-    return shape.is_mesh() and shape.class_name() != "Rectangle"
-
-
 def _pieces_of(shape, textured: bool) -> _Pieces:
     name = shape.class_name()
-    if _is_mesh(shape):
+    if is_triangle_mesh(shape):
         return _triangles(shape, textured)
     matrix = np.eye(4)
     if name in ("Rectangle", "Disk", "Sphere"):
@@ -327,9 +323,7 @@ def _constant(normal: np.ndarray) -> np.ndarray:
 
 
 def _triangles(mesh, textured: bool) -> _Pieces:
-    parameters = parameters_of(mesh, below=False)
-    faces = download(parameters["faces"]).reshape(-1, 3)
-    vertices = download(parameters["vertex_positions"]).astype(np.float64).reshape(-1, 3)
+    faces, vertices = faces_of(mesh), positions_of(mesh)
     corner, second, third = (vertices[faces[:, k]] for k in range(3))
     first, second = second - corner, third - corner
     normal = np.cross(first, second)
@@ -338,12 +332,12 @@ def _triangles(mesh, textured: bool) -> _Pieces:
     normal = np.where(length > 0, normal / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
     shading = _constant(normal)
     if mesh.has_vertex_normals() and not mesh.has_face_normals():
-        at = download(parameters["vertex_normals"]).astype(np.float64).reshape(-1, 3)[faces]
+        at = normals_of(mesh)[faces]
         shading = np.concatenate([at[:, 0], at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]], 1)
     if mesh.has_flipped_normals():
         normal, shading = -normal, -shading
     uv = np.tile([0.0, 0, 1, 0, 0, 1], (len(faces), 1))
     if textured and mesh.has_vertex_texcoords():
-        at = download(parameters["vertex_texcoords"]).astype(np.float64).reshape(-1, 2)[faces]
+        at = coordinates_of(mesh)[faces]
         uv = np.concatenate([at[:, 0], at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]], 1)
     return _Pieces(np.full(len(faces), TRIANGLE, np.uint32), corner, first, second, normal, shading, uv)

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import download, finite_or_zero, rgb_to_spectrum, upload
-from ..core.parameters import parameters_of
+from ..core.meshes import positions_of
 from ..core.sampling import Choice, independent_sampler
 from .emitters import Emitters
 from .focus import Focus
@@ -49,10 +49,9 @@ def bounding_box(scene):
     box = scene.bbox()
     for shape in scene.shapes():
         if shape.is_mesh() and shape.vertex_count() and not shape.bbox().valid():
-            vertices = parameters_of(shape, below=False).get("vertex_positions")
+            vertices = positions_of(shape)
             if vertices is None:
                 raise ValueError(f'the shape "{shape.id()}" has no bounding box: its size must be finite')
-            vertices = np.asarray(vertices).reshape(-1, 3)
             box.expand(mi.ScalarPoint3f(vertices.min(0)))
             box.expand(mi.ScalarPoint3f(vertices.max(0)))
     return box

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..core.meshes import faces_of, is_triangle_mesh, normals_of, positions_of
 from ..core.sampling import derived_seed
 from ..lights.emitters import Emitters
 from ..lights.light_set import ScatteredGroup, area_lights
@@ -80,13 +81,9 @@ def has_true_normals(shape) -> bool:
     Meshes may have other vertex normals.  Mitsuba uses those for densities and for the side that shines, so virtual
     lights, which use geometric normals, would disagree.
     """
-    if not shape.is_mesh() or not shape.has_vertex_normals():
+    if not is_triangle_mesh(shape) or not shape.has_vertex_normals():
         return True
-    faces = np.array(shape.faces_buffer()).reshape(-1, 3)
-    positions, normals = (
-        np.array(buffer, np.float64).reshape(-1, 3)
-        for buffer in (shape.vertex_positions_buffer(), shape.vertex_normals_buffer())
-    )
+    faces, positions, normals = faces_of(shape), positions_of(shape), normals_of(shape)
     corner, second, third = (positions[faces[:, k]] for k in range(3))
     flat, normals = _unit(np.cross(second - corner, third - corner)), _unit(normals)
     cosine = (normals[faces] * flat[:, None]).sum(2)[flat.any(1)]

@@ -23,6 +23,7 @@ import numpy as np
 
 from ..core.arrays import download, select_record, upload, upload_vectors
 from ..core.loops import recorded_once
+from ..core.meshes import corners_of
 from ..lights.emitters import registered_shapes
 from .line_sampling import Lines
 
@@ -118,8 +119,7 @@ def has_large_curves(scene) -> bool:
 
 def _longest_edges(mesh, triangle: mi.UInt32) -> np.ndarray:
     """Longest edge of each ``triangle`` of a mesh, (n,) float32, world units."""
-    faces, positions = mesh.faces_buffer(), mesh.vertex_positions_buffer()
-    corners = [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * triangle + k)) for k in range(3)]
+    corners = corners_of(mesh, triangle)
     lengths = [dr.norm(corners[k] - corners[k - 1]) for k in range(3)]
     return download(dr.maximum(dr.maximum(lengths[0], lengths[1]), lengths[2]))
 
