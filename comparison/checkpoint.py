@@ -38,7 +38,7 @@ class Checkpoint:
     def __init__(self, path, made_by, resume=True):
         self.path, self._made_by, self._resume = Path(path), made_by, resume
         self._passes, self._kept, self._saved = None, None, None
-        self._writer = OccasionalWriter("The checkpoint", self.save, CHECKPOINT_SECONDS)
+        self._writer = OccasionalWriter("The checkpoint", CHECKPOINT_SECONDS)
 
     def restore(self, passes):
         """Add the passes of the file, if it exists, to the empty `Passes`; return their seconds. Raises ValueError with
@@ -86,7 +86,7 @@ class Checkpoint:
         }
         estimate = {_ESTIMATE + name: value for name, value in passes.estimate.state.items()}
         self._kept = described, {"sum": passes.sum, **estimate}
-        self._writer.offer()
+        self._writer.offer(self.save)
 
     def save(self):
         """Write the file if there are new passes. Raises OSError with the name of the file if that fails; an earlier
@@ -103,7 +103,7 @@ class Checkpoint:
     def leave(self):
         """Write the file at the end of an unfinished render; return whether that succeeded. A failure is logged, as the
         image is not lost."""
-        return self._writer.write()
+        return self._writer.write(self.save)
 
     def remove(self):
         """Remove the file of a finished render. A failure is logged, as the image is not lost."""

@@ -1,4 +1,4 @@
-"""Curves of error against time or shadow rays, and values interpolated on them. NumPy only.
+"""Curves of error against time or shadow rays, and values interpolated on them.
 
 A point is a setting; its coordinates are means over seeds. The curve of an integrator is its Pareto front, connected by
 straight lines in logarithmic axes. An error below the reference's noise is not part of a curve; the noise is an upper
@@ -12,20 +12,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.special import stdtrit
 
-# Quantiles of Student's t at 97.5% for 1 to 10 degrees of freedom; above by an expansion with an error of 1e-4
-_QUANTILES = (12.7062, 4.3027, 3.1824, 2.7764, 2.5706, 2.4469, 2.3646, 2.3060, 2.2622, 2.2281)
-_NORMAL = 1.959964
 TARGETS = 4  # maximum number of errors, and of times, in a comparison of integrators
 
 
 def quantile(freedom):
     """Return the 97.5% quantile of Student's t for `freedom` (at least 1) degrees of freedom."""
-    if freedom <= len(_QUANTILES):
-        return _QUANTILES[freedom - 1]
-    z = _NORMAL
-    terms = (z, (z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384)
-    return sum(term / freedom**power for power, term in enumerate(terms))
+    return float(stdtrit(freedom, 0.975))
 
 
 def spread(values):

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from vpl.core.garbage import garbage_kept
 from vpl.core.sampling import derived_seed, independent_sampler
 
 from .images import colour
@@ -148,7 +149,7 @@ def _rendered(scene, sensor, spp, key):
     # The module belongs to the variant
     from integrators.camera_samples import stratified
 
-    with stratified(sensor, spp) as wrapper:
+    with stratified(sensor, spp) as wrapper, garbage_kept():
         mi.render(scene, sensor=wrapper, integrator=_feature_integrator(mi.variant()), spp=spp, seed=seed)
     bitmap = sensor.film().bitmap()
     names = [entry.name for entry in bitmap.struct_()]

@@ -6,21 +6,21 @@ import mitsuba as mi
 
 
 class OccasionalWriter:
-    """Writes a file by calling `write`, at most once per `seconds`; `title` names the file in the log."""
+    """Writes a file at most once per `seconds`; `title` names the file in the log."""
 
-    def __init__(self, title, write, seconds):
-        self._title, self._write, self._seconds = title, write, seconds
+    def __init__(self, title, seconds):
+        self._title, self._seconds = title, seconds
         self._written = time.monotonic()
 
-    def offer(self):
-        """Write new content if the last attempt is more than `seconds` ago."""
+    def offer(self, write):
+        """Write new content by `write()` if the last attempt is more than `seconds` ago."""
         if time.monotonic() - self._written > self._seconds:
-            self.write()
+            self.write(write)
 
-    def write(self):
-        """Write the file; return success. A full disk does not end the render."""
+    def write(self, write):
+        """Write the file by `write()`; return success. A full disk does not end the render."""
         try:
-            self._write()
+            write()
         except OSError as error:
             mi.Log(mi.LogLevel.Warn, f"{self._title} could not be written: {error}")
             return False

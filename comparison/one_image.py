@@ -147,12 +147,12 @@ class Output:
     def __init__(self, path, exposure=None, checkpoint=None):
         self.path, self.metadata, self._exposure, self._checkpoint = path, {}, exposure, checkpoint
         self._image, self._took = None, None
-        self._writer = OccasionalWriter("The image so far", self.write, WRITE_SECONDS)
+        self._writer = OccasionalWriter("The image so far", WRITE_SECONDS)
 
     def keep(self, took, image):
         """Take an image, and write it from time to time."""
         self._image, self._took = np.array(image), took
-        self._writer.offer()
+        self._writer.offer(self.write)
 
     def end_early(self):
         """Write the last image, report that on the standard error, and return the exit status."""

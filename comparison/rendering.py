@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from vpl.core.garbage import garbage_kept
+
 from .convergence import ErrorEstimate
 from .images import colour
 
@@ -77,7 +79,7 @@ def render_pass(scene, sensor, integrator, spp, seed, first=None, shared=None):
 def _render(scene, sensor, integrator, spp, seed):
     """Render to the film of a sensor; return the samples per pixel, as the sampler rounds them."""
     # Set before the render, as integrators such as `prb` clone the sampler
-    with _sample_count(sensor.sampler(), spp) as spp:
+    with _sample_count(sensor.sampler(), spp) as spp, garbage_kept():
         dr.eval(mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp))
         dr.sync_thread()
         return spp

@@ -11,6 +11,8 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
+from vpl.core.garbage import garbage_kept
+
 # Object types of the camera
 _OF_CAMERA = ("Sensor", "Film", "Sampler", "ReconstructionFilter")
 # Parameters that a new integrator inherits: they select light paths, not an algorithm
@@ -174,7 +176,8 @@ class SceneFile:
         mi.file_resolver().prepend(str(self.path.parent))
         try:
             mi.parser.transform_all(self._configuration, self._state)
-            return mi.parser.instantiate(self._configuration, self._state)
+            with garbage_kept():
+                return mi.parser.instantiate(self._configuration, self._state)
         finally:
             mi.set_file_resolver(resolver)
             # No kernel may run while Dr.Jit ends threads: a render has waited for ever afterwards

@@ -22,7 +22,15 @@ include_patterns = [
 ]  # fmt: skip
 exclude_patterns = [".*", "build", "dist", "output", "shared"]
 
-extensions = ["myst_parser", "sphinx_tabs.tabs", "plugin_parameters", "generated", "contents", "formulas"]
+extensions = [
+    "myst_parser",
+    "sphinx_tabs.tabs",
+    "sphinx_copybutton",
+    "plugin_parameters",
+    "generated",
+    "contents",
+    "formulas",
+]
 myst_heading_anchors = 4  # anchors of headings as on GitHub
 
 html_theme = "furo"

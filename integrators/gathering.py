@@ -13,6 +13,7 @@ import numpy as np
 from vpl.core.arrays import add_at, download, usable
 from vpl.core.clock import Clock
 from vpl.core.exclusive import exclusive
+from vpl.core.garbage import garbage_kept
 from vpl.core.shared_code import share_code
 from vpl.core.stages import Stage
 from vpl.lights.emitters import Emitters, read_emitters
@@ -137,7 +138,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         self._refuse_recording()
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         _hear_interruptions()
-        with exclusive(sensor=sensor, integrator=self):
+        with exclusive(sensor=sensor, integrator=self), garbage_kept():
             outer, self._sensor = self._sensor, sensor
             own = sensor.sampler().sample_count()
             try:

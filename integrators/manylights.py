@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from vpl.core.clock import Clock
 from vpl.core.exclusive import exclusive
+from vpl.core.garbage import garbage_kept
 from vpl.core.stages import Stage
 from vpl.lights.perturbed import Perturbed
 from vpl.split.cost_model import CostModel
@@ -198,7 +199,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
                 f'manylights: the variant "{mi.variant()}" has no derivatives: set one that has, such as llvm_ad_rgb'
             )
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        with exclusive(sensor=sensor, integrator=self):
+        with exclusive(sensor=sensor, integrator=self), garbage_kept():
             self.check_scene(scene)
             depth = self.max_depth if self.max_depth <= _DEEPEST else -1
             paths = {"max_depth": depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}

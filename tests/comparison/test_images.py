@@ -115,8 +115,8 @@ def test_files_that_take_long_to_write_are_not_written_all_the_time(monkeypatch)
         written.append(now[0])
 
     monkeypatch.setattr("comparison.occasional.time.monotonic", lambda: now[0])
-    writer = OccasionalWriter("The image", write, 10.0)
+    writer = OccasionalWriter("The image", 10.0)
     for _ in range(100):
         now[0] += 1.0
-        writer.offer()
+        writer.offer(write)
     assert len(written) == 9 and min(np.diff(written)) > 25.0

@@ -15,8 +15,10 @@ _LOCK = Lock()
 def garbage_kept():
     """Suspend Python's cyclic garbage collector in all threads while the block runs.
 
-    A scene collected during the recording of a frozen function makes the recording fail or ends the process; a scene
-    collected between two calls makes Dr.Jit record again.
+    The collector runs in any thread, for example in the event loop of a notebook or of Dask.  Mitsuba renders without
+    Python's global lock and records calls of all objects in Dr.Jit's registry: a scene that another thread collects at
+    this time ends the process or makes the render wait forever.  A scene collected during the recording of a frozen
+    function makes the recording fail, and a scene collected between two calls makes Dr.Jit record again.
     """
     with _LOCK:
         if not _STOPPED["blocks"]:
