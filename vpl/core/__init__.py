@@ -12,6 +12,7 @@
 - ``clock``: seconds of a render by stage
 - ``stages``: names of the stages of a render, keys of its timings
 - ``parameters``: parameters of scene objects, read without ``mitsuba.traverse``
+- ``meshes``: triangles of meshes, by the names that Mitsuba gives them
 - ``registry``: table from shapes or emitters to numbers
 - ``exclusive``: objects for use by one thread at a time
 - ``backend``: checks of the system libraries below Mitsuba
