@@ -55,6 +55,7 @@ from comparison import batch, command_line
 from comparison.cluster.connection import connected, workers
 from comparison.command_line import UsageError, parameter, positive
 from comparison.denoising import QUALITIES, for_denoising, import_oidn
+from comparison.features import FEATURES, channels_of
 from comparison.images import check_extension, write
 from comparison.one_image import INTERRUPTED, Failed, Image, LazyScene
 from comparison.render import Took, render
@@ -66,6 +67,16 @@ avoid_single_thread()
 __all__ = ["Took", "main", "render", "write"]
 DEFAULT, OWN = "manylights", "scene"  # the default of --integrator, and the value that keeps the scene's integrator
 SAME_IMAGE = ("path", "prb", "volpath", "volpathmis")  # have the expectation of DEFAULT, without participating media
+
+
+def feature_names(text):
+    """Return the names of features in a comma-separated list, as a tuple; for `type` of argparse."""
+    names = tuple(name.strip() for name in text.split(","))
+    try:
+        channels_of(names)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return names
 
 
 def parse(arguments):
@@ -101,6 +112,9 @@ def parse(arguments):
     add("--denoise", action="store_true", help="denoise by Open Image Denoise (pip install 'manylights[denoise]')")
     add("--denoise-quality", choices=QUALITIES,
         help=f"with --denoise: network, from best to quickest (default: {QUALITIES[0]})")  # fmt: skip
+    add("--aovs", type=feature_names, default=(), metavar="NAMES",
+        help=f"layers of EXR files, out of {', '.join(FEATURES)}, separated by commas: of the first surface that is "
+             "neither mirror nor glass, as the denoiser gets them")  # fmt: skip
     add("-s", "--seed", type=command_line.seed, default=0, metavar="N", help="seed (default: 0)")
     add("--pass-spp", type=positive(int), metavar="N",
         help="samples per pixel of a pass (default: for passes of two to ten seconds; with --workers, by the size of "
@@ -117,6 +131,8 @@ def parse(arguments):
     options = parser.parse_args(arguments)
     if options.denoise_quality and not options.denoise:
         parser.error("--denoise-quality needs --denoise")
+    if options.aovs and options.output and options.output.suffix == ".png":
+        parser.error("--aovs needs an .exr file: a PNG file has no layers")
     if options.output and not options.output.is_dir():
         try:
             check_extension(options.output)

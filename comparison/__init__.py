@@ -10,6 +10,7 @@
 `occasional`    files written periodically
 `cluster/`      passes and runs on several processes or machines
 `denoising`     Open Image Denoise with albedo and normal
+`features`      albedo, normal and depth, for the denoiser and as layers of images
 `images`        EXR files with metadata, tone mapping, false colours
 `metrics`       errors against a reference
 `references`    references from files, and cached path-traced references

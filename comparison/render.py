@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -20,6 +20,7 @@ from .batch import ALL
 from .checkpoint import Checkpoint
 from .denoising import Denoiser, for_denoising, quality_of
 from .ending import Ending
+from .features import Layers, channels_of, features_of
 from .interruption import Interruption
 from .pass_sizes import PassSizes
 from .rendering import Progressive, TotalStatistics
@@ -38,7 +39,8 @@ class Took:
     integrator, summed over passes; `ended_by`: the limit that was reached ("spp", "time" or "error"), "interruption"
     (Ctrl-C, or `cancel` of the integrator) or "progress", None during the render; `channels`: names of the channels;
     `denoise_seconds`: the part of `seconds` for denoising; `denoiser`: metadata, quality of the denoiser and samples of
-    albedo and normal; `raw`: the image before denoising (`mi.TensorXf`), None without denoising.
+    albedo and normal; `raw`: the image before denoising (`mi.TensorXf`), None without denoising; `aov_spp`: samples per
+    pixel of the requested features, None without.
 
     During a render: `stage`: current stage of the pass, a key of `statistics["seconds"]`, None between passes;
     `seconds_left`: expected seconds until the end, None if unknown.
@@ -54,6 +56,7 @@ class Took:
     denoise_seconds: float = 0.0
     denoiser: dict[str, Any] = field(default_factory=dict, repr=False)
     raw: mi.TensorXf | None = field(default=None, repr=False)
+    aov_spp: int | None = None
     stage: str | None = None
     seconds_left: float | None = None
 
@@ -71,6 +74,7 @@ def render(
     progress: Callable[[Took, mi.TensorXf | None], bool | None] | None = None,
     pass_spp: int | None = None,
     checkpoint: Checkpoint | None = None,
+    aovs: Sequence[str] = (),
 ) -> tuple[mi.TensorXf, Took]:
     """Render a scene in passes; return the image, a `mi.TensorXf` of shape (height, width, channels) as of `mi.render`,
     and the cost (`Took`). Passes take about two seconds, with `manylights` up to ten.
@@ -86,17 +90,19 @@ def render(
     `progress`: called after each pass with the cost and the image so far; integrators of this project also call it at
     the start of each stage of a pass, with None for the image. If it returns False, no other pass begins; an exception
     ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a `checkpoint.Checkpoint` of the
-    same render with one sensor, whose samples and seconds count; it is kept unless a limit ends the render.
+    same render with one sensor, whose samples and seconds count; it is kept unless a limit ends the render. `aovs`:
+    names of features.py, "albedo", "normal" and "depth", which become channels such as "albedo.R".
 
     Ctrl-C, or `cancel()` of the integrator, returns the image of the finished passes. Without a finished pass Ctrl-C
     raises KeyboardInterrupt and `cancel()` RuntimeError. A second Ctrl-C raises KeyboardInterrupt.
 
-    Raises ValueError for limits that are not positive, for another `denoise`, for a sensor that does not exist, for a
-    scene without an integrator, and for a participating medium that the integrator does not support; FileNotFoundError
+    Raises ValueError for limits that are not positive, for another `denoise` or other `aovs`, for a sensor that does
+    not exist, for a scene without an integrator, for a participating medium that the integrator does not support, and
+    for channels in `aovs` that the integrator has; FileNotFoundError
     for a missing scene file; ModuleNotFoundError if the package for `denoise` is missing; RuntimeError if another
     thread renders with the same sensor, or if no variant is set.
     """
-    quality = quality_of(denoise)
+    quality, _ = quality_of(denoise), channels_of(aovs)
     scene = _scene(scene)
     integrator = _integrator(scene, integrator, denoise)
     if sensor == ALL:
@@ -104,7 +110,7 @@ def render(
             raise ValueError(f"checkpoint must be None where sensor is '{ALL}': it is of one image")
         return _render_all(
             scene, integrator, error=error, time=time, spp=spp, seed=seed, denoise=denoise, progress=progress,
-            pass_spp=pass_spp,
+            pass_spp=pass_spp, aovs=aovs,
         )  # fmt: skip
     check(error=error, time=time, spp=spp, pass_spp=pass_spp)
     doubt_percentage("error", error or 0)
@@ -114,6 +120,7 @@ def render(
         spp = scene.sensors()[sensor].sampler().sample_count()
     begin = clock.perf_counter()
     denoiser = Denoiser(scene, sensor, seed, spp, time, quality) if denoise else None
+    layers = layers_of(aovs, scene, sensor, integrator, denoiser, seed=seed, spp=spp, time_limit=time)
     progressive = Progressive(scene, seed, sensor, integrator)
     reserved = denoiser.filter_seconds if denoiser else 0.0
     sizes = PassSizes(
@@ -124,7 +131,19 @@ def render(
     if checkpoint:
         begin -= checkpoint.restore(progressive)
     with exclusive(sensor=scene.sensors()[sensor]):
-        return render_passes(progressive, sizes, ending, begin, progress, denoiser, checkpoint)
+        return render_passes(progressive, sizes, ending, begin, progress, denoiser, checkpoint, layers)
+
+
+def layers_of(aovs, scene, sensor, integrator, denoiser, **limits):
+    """Return the `Layers` with the names `aovs` of a sensor (an index), None for no names: those of the denoiser if
+    there is one. `limits`: see `features_of`. Raises ValueError for a channel that the integrator has."""
+    if not aovs:
+        return None
+    if own := set(channels_of(aovs)) & set(integrator.aov_names()):
+        raise ValueError(f"aovs must not name channels of the integrator, got {', '.join(sorted(own))}")
+    if denoiser:
+        return Layers.of(aovs, denoiser.features, denoiser.feature_spp)
+    return Layers.of(aovs, *features_of(scene, scene.sensors()[sensor], **limits))
 
 
 def _render_all(scene, integrator, **limits):
@@ -137,14 +156,14 @@ def _render_all(scene, integrator, **limits):
     return found
 
 
-def render_passes(progressive, sizes, ending, begin, progress=None, denoiser=None, checkpoint=None):
+def render_passes(progressive, sizes, ending, begin, progress=None, denoiser=None, checkpoint=None, layers=None):
     """Render passes until the end of the render; return the image and the cost, as `render` does.
 
     `progressive`: renders and adds passes (`rendering.Progressive` or `cluster.passes.DistributedPasses`), and may have
     passes of the checkpoint; `sizes`: the `PassSizes`; `ending`: the limits (`Ending`); `begin`: start of the render by
-    `perf_counter`, less the seconds of the checkpoint.
+    `perf_counter`, less the seconds of the checkpoint; `layers`: the `Layers` of the image, or None.
     """
-    running = _Render(progressive, ending, begin, progress, checkpoint)
+    running = _Render(progressive, ending, begin, progress, checkpoint, layers)
     with Interruption() as interruption:
         running.run(sizes, interruption)
     if not progressive.passes:
@@ -194,9 +213,9 @@ def _integrator(scene, integrator, denoise):
 class _Render:
     """A render that began at the time `begin` (of `perf_counter`): passes, and the reason for the end."""
 
-    def __init__(self, progressive, ending, begin, progress, checkpoint):
+    def __init__(self, progressive, ending, begin, progress, checkpoint, layers):
         self.progressive, self._ending, self._begin, self._progress = progressive, ending, begin, progress
-        self._checkpoint = checkpoint
+        self._checkpoint, self._layers = checkpoint, layers
         self._error, self._ended_by, self._statistics = None, None, TotalStatistics()
         self._raised = None
         if ending.goal:
@@ -293,13 +312,15 @@ class _Render:
         return clock.perf_counter() - self._begin
 
     def _image(self):
-        return mi.TensorXf(np.float32(self.progressive.image))
+        image = np.float32(self.progressive.image)
+        return mi.TensorXf(self._layers.added_to(image) if self._layers else image)
 
     def _took(self):
         one, seconds = self.progressive, self._elapsed()
-        statistics = self._statistics.of(one.passes)
+        statistics, layers = self._statistics.of(one.passes), self._layers
         return Took(
-            one.spp, len(one.passes), seconds, self._error, statistics, self._ended_by, one.channels,
+            one.spp, len(one.passes), seconds, self._error, statistics, self._ended_by,
+            one.channels + (layers.channels if layers else []), aov_spp=layers.spp if layers else None,
             seconds_left=None if self._ended_by else self._ending.seconds_left(seconds),
         )  # fmt: skip
 

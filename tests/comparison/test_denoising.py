@@ -11,94 +11,14 @@ import pytest
 
 import compare
 import manylights
-from comparison import denoising, images
-from comparison.denoising import Denoiser, _features, auxiliary_features
+from comparison import images
+from comparison.denoising import Denoiser
 from tests.support.comparisons import results_of
 from tests.support.marks import stress
 from tests.support.paths import CORNELL
 from tests.support.rendering import render
-from tests.support.scenes import cornell, sensor, wall
+from tests.support.scenes import cornell
 from vpl.split.cost_model import CostModel
-
-RED = (0.6, 0.1, 0.2)
-
-
-def features(spp=64, size=8, **things):
-    scene = mi.load_dict({"type": "scene", "sensor": sensor(size), **things})
-    found, _ = auxiliary_features(scene, scene.sensors()[0], spp, 0)
-    assert all(plane.shape == (size, size, 3) and plane.dtype == np.float32 for plane in found.values())
-    assert np.isfinite(found["albedo"]).all() and np.isfinite(found["normal"]).all()
-    return found["albedo"], found["normal"]
-
-
-def red_wall(**more):
-    """Behind what is at the origin, and larger than the image."""
-    return {"behind": wall([0, 0, -1], [0, 1, 0], 0, 5, RED), **more}
-
-
-def screen(bsdf):
-    return wall([0, 0, 0], [0, 1, 0], 0, 5, bsdf=bsdf)
-
-
-def test_features_are_those_of_the_surface_that_is_seen():
-    albedo, normal = features(**red_wall())
-    np.testing.assert_allclose(albedo, np.broadcast_to(RED, albedo.shape), rtol=1e-4)
-    np.testing.assert_allclose(normal, np.broadcast_to((0, 0, 1), normal.shape), atol=1e-5)
-
-
-def test_normals_are_turned_towards_the_viewer():
-    two_sided = {"type": "twosided", "bsdf": {"type": "diffuse"}}
-    _, normal = features(away=wall([0, 0, 0], [0, 1, 0], 180, 5, bsdf=two_sided))
-    np.testing.assert_allclose(normal, np.broadcast_to((0, 0, 1), normal.shape), atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("bsdf", "passed"),
-    [
-        ({"type": "thindielectric"}, 1.0),
-        ({"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0}, 1.0),
-        ({"type": "mask", "opacity": 0.0, "nested": {"type": "diffuse"}}, 1.0),
-        ({"type": "null"}, 1.0),
-        ({"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse", "reflectance": 0.0}}, 0.5),
-    ],
-)
-def test_features_are_those_behind_glass_and_masks(bsdf, passed):
-    albedo, normal = features(512, screen=screen(bsdf), **red_wall())
-    np.testing.assert_allclose(albedo.mean((0, 1)), passed * np.array(RED), rtol=0.12 if passed == 1 else 0.05)
-    np.testing.assert_allclose(normal[..., 2].mean(), 1, rtol=0.12)
-
-
-def test_features_are_those_in_a_mirror():
-    """A mirror at 45 degrees shows a wall at the side."""
-    mirror = {"type": "conductor", "specular_reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
-    albedo, normal = features(
-        mirror=wall([0, 0, 0], [0, 1, 0], 45, 5, bsdf=mirror), side=wall([9, 0, 0], [0, 1, 0], -90, 50, RED)
-    )
-    np.testing.assert_allclose(albedo, np.broadcast_to(0.5 * np.array(RED), albedo.shape), rtol=1e-3)
-    np.testing.assert_allclose(normal, np.broadcast_to((-1, 0, 0), normal.shape), atol=1e-5)
-
-
-def test_plastic_is_what_is_seen_of_it():
-    albedo, normal = features(512, screen=screen({"type": "plastic", "diffuse_reflectance": 0.4}), **red_wall())
-    np.testing.assert_allclose(normal, np.broadcast_to((0, 0, 1), normal.shape), atol=1e-5)
-    np.testing.assert_allclose(albedo[..., 0], albedo[..., 1], rtol=1e-4)  # nothing of what is behind
-    assert 0.2 < albedo.mean() < 0.5
-
-
-def test_emitters_are_seen_and_nothing_is_black():
-    albedo, normal = features()
-    assert (albedo == 0).all() and (normal == 0).all()
-    albedo, normal = features(sky={"type": "constant", "radiance": {"type": "rgb", "value": [0.25, 0.5, 30.0]}})
-    np.testing.assert_allclose(albedo, np.broadcast_to((0.25, 0.5, 1), albedo.shape), rtol=1e-4)
-    assert (normal == 0).all()
-
-
-def test_mirrors_that_face_each_other_end():
-    mirrors = {
-        f"m{z}": wall([0, 0, z], [0, 1, 0], 0 if z < 0 else 180, 50, bsdf={"type": "conductor"}) for z in (-1, 5)
-    }
-    albedo, normal = features(**mirrors)
-    assert (albedo == 0).all() and (normal == 0).all()
 
 
 def squared_error(image, exact):
@@ -246,21 +166,6 @@ def test_albedo_and_normal_have_as_many_samples_as_the_image_within_limits(spp, 
 @pytest.mark.parametrize(("time_limit", "samples"), [(1e-3, 16), (1e6, 80)])
 def test_albedo_and_normal_take_a_small_part_of_a_time_limit(time_limit, samples):
     assert Denoiser(cornell(16).load(), time_limit=time_limit).feature_spp == samples
-
-
-def test_features_of_more_samples_are_those_of_fewer_with_less_noise(monkeypatch):
-    """Large images are rendered in parts, images with a time limit in two renders."""
-    scene = cornell(16).load()
-    sensor = scene.sensors()[0]
-    exact, _ = auxiliary_features(scene, sensor, 1024, 7)
-    few, _ = _features(scene, sensor, 0, 16, None)
-    timed, count = _features(scene, sensor, 0, None, 1e6)
-    monkeypatch.setattr(denoising, "FEATURE_WAVEFRONT", 1)
-    in_parts, of_parts = auxiliary_features(scene, sensor, 50, 0)
-    assert (count, of_parts) == (80, 64)
-    for name, plane in exact.items():
-        first, *others = (np.square(found[name] - plane).mean() for found in (few, timed, in_parts))
-        assert max(others) < 0.5 * first < 0.05
 
 
 def test_mono_variant(tmp_path):

@@ -7,7 +7,7 @@ import mitsuba as mi
 import pytest
 
 import manylights
-from comparison import denoising
+from comparison import features
 from comparison.checkpoint import Checkpoint
 from comparison.scene_files import SceneFile
 from tests.support.distributed_renders import TINY
@@ -63,9 +63,9 @@ def test_the_collector_is_off_in_passes_of_any_integrator(scene, observed):
 
 
 def test_the_collector_is_off_while_features_are_rendered(scene, observed, monkeypatch):
-    monkeypatch.setattr(denoising, "_feature_integrator", lambda _: mi.load_dict({"type": "observer"}))
+    monkeypatch.setattr(features, "_feature_integrator", lambda _: mi.load_dict({"type": "observer"}))
     with pytest.raises(ValueError, match="is not in list"):
-        denoising.auxiliary_features(scene, scene.sensors()[0], 0, 1)
+        features.auxiliary_features(scene, scene.sensors()[0], 0, 1)
     assert observed == [False]
 
 

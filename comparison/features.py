@@ -1,0 +1,168 @@
+"""Albedo, normal and depth of the first surfaces that are neither mirror nor glass.
+
+They guide the denoiser, and are layers of images on request. They have as many samples as the image, but at least 16
+and at most 64 per pixel; if time is limited, 16 and up to 64 more in a twenty-fifth of the limit.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from vpl.core.garbage import garbage_kept
+from vpl.core.sampling import derived_seed, independent_sampler
+
+# Fewest and most samples per pixel: squares, to which some of Mitsuba's samplers round
+FEATURE_SPP = 16, 64  # 64 instead of 16: denoised error 2 to 10% less in four scenes (decisions.md)
+FEATURE_WAVEFRONT = 1 << 22  # most samples of an image rendered at once, some 400 MB, or the fewest per pixel
+FEATURE_SHARE = 0.04  # of a time limit; the samples of a path take about 25 times as long
+FEATURE_SEED = 0xFEA7  # combined with the seed of the image, to avoid correlated noise
+DEEPEST = 16  # interactions with mirrors, panes and masks
+# Channels of each feature; the names are those of Cycles' layers
+FEATURES = {"albedo": ("R", "G", "B"), "normal": ("X", "Y", "Z"), "depth": ("Z",)}
+
+
+def channels_of(names):
+    """Return the names of the channels of features, in order. Raises ValueError for a name that is not in `FEATURES`,
+    and for a repeated name."""
+    if not set(names) <= set(FEATURES) or len(set(names)) < len(names):
+        raise ValueError(f"aovs must be distinct names out of {', '.join(FEATURES)}, got {', '.join(names)}")
+    return [f"{name}.{channel}" for name in names for channel in FEATURES[name]]
+
+
+@dataclass
+class Layers:
+    """Features that an image has as additional channels: `planes` (height, width, channels) float32, names of the
+    `channels`, and samples per pixel `spp`."""
+
+    planes: np.ndarray
+    channels: list
+    spp: int
+
+    @classmethod
+    def of(cls, names: Sequence[str], features: dict, spp: int):
+        """Layers by the `names` of features, a dict as of `auxiliary_features` with `spp` samples per pixel."""
+        return cls(np.concatenate([features[name] for name in names], axis=-1), channels_of(names), spp)
+
+    def added_to(self, image):
+        """Return an image (height, width, channels) with these channels after its own."""
+        return np.concatenate((image, self.planes), axis=-1)
+
+
+def features_of(scene, sensor, seed=0, spp=None, time_limit=None):
+    """Return (the features of an image, a dict as of `auxiliary_features`; samples per pixel). `sensor`: a `mi.Sensor`;
+    `seed`, `spp`, `time_limit`: of the image, None if unlimited."""
+    fewest, most = FEATURE_SPP
+    wanted = most if spp is None else min(max(spp, fewest), most)
+    if time_limit is None:
+        return auxiliary_features(scene, sensor, math.isqrt(wanted) ** 2, seed)
+    # The first samples tell the time of the others; compilation counts, because people wait for it
+    begin = time.perf_counter()
+    first = auxiliary_features(scene, sensor, fewest, seed)
+    spent = time.perf_counter() - begin
+    # Mitsuba's stratified samplers round to squares
+    possible = min(FEATURE_SHARE * time_limit / spent * fewest, most if spp is None else wanted - fewest)
+    if possible < fewest:
+        return first
+    more = auxiliary_features(scene, sensor, math.isqrt(int(possible)) ** 2, derived_seed(seed, 1))
+    return _mean_of([first, more])
+
+
+def _mean_of(renders):
+    """Return the mean of (images by name, samples) by samples, and the sum of the samples."""
+    whole = sum(samples for _, samples in renders)
+    return {name: sum(samples / whole * one[name] for one, samples in renders) for name in renders[0][0]}, whole
+
+
+def auxiliary_features(scene, sensor, spp, seed):
+    """Render "albedo", "normal" and "depth", a dict of (height, width, channels) float32, of the first surfaces that
+    are neither mirror nor glass, with the film's filter and at least `spp` samples per pixel; `sensor` is a
+    `mi.Sensor`. The samples are stratified if the sensor's sampler is `independent`. Return the dict and the samples
+    per pixel, which are more only in large images.
+
+    Albedo, 0 to 1: directional albedo, estimated by one BSDF sample, times the throughput of mirrors and glass before
+    the surface, plus emission. Normal: shading normal in world space, turned towards the viewer. Depth: length of the
+    path from the near clipping distance of the camera, world units, as in Mitsuba's `aov`. All are 0 in empty
+    directions.
+    """
+    fewest, pixels = FEATURE_SPP[0], int(np.prod(sensor.film().crop_size()))
+    each, parts = (spp, 1) if spp * pixels <= FEATURE_WAVEFRONT else (fewest, math.ceil(spp / fewest))
+    return _mean_of([(_rendered(scene, sensor, each, (seed, part)), each) for part in range(parts)])
+
+
+def _rendered(scene, sensor, spp, key):
+    """Render the features of `auxiliary_features` at once; `key`: integers that make the seed."""
+    seed = int(np.random.SeedSequence((FEATURE_SEED, *key)).generate_state(1)[0])
+    # The module belongs to the variant
+    from integrators.camera_samples import stratified
+
+    with stratified(sensor, spp) as wrapper, garbage_kept():
+        mi.render(scene, sensor=wrapper, integrator=_feature_integrator(mi.variant()), spp=spp, seed=seed)
+    bitmap = sensor.film().bitmap()
+    names = [entry.name for entry in bitmap.struct_()]
+    planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
+    found = {
+        name: np.nan_to_num(planes[..., [names.index(channel) for channel in channels_of([name])]]) for name in FEATURES
+    }
+    return found | {"albedo": np.clip(found["albedo"], 0, 1), "normal": np.clip(found["normal"], -1, 1)}
+
+
+@cache
+def _feature_integrator(variant):
+    """Return an integrator that renders a black image with the features as AOVs. Mitsuba's base class depends on the
+    variant; `variant`, the current one, is the cache key."""
+
+    class FeatureIntegrator(mi.SamplingIntegrator):
+        def aov_names(self):
+            return channels_of(list(FEATURES))
+
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            # Stratified numbers are for camera rays alone
+            number = sampler.next_1d()
+            own = independent_sampler(int(dr.reinterpret_array(mi.UInt32, number)[0]), dr.width(number))
+            albedo, normal, depth, valid = _first_rough_surface(scene, own, mi.Ray3f(ray), mi.Bool(active))
+            finite = dr.all(dr.isfinite(albedo)) & dr.all(dr.isfinite(normal)) & dr.isfinite(depth)
+            albedo, normal = dr.select(finite, dr.minimum(albedo, 1), 0), dr.select(finite, normal, 0)
+            return mi.Spectrum(0), valid, [*albedo, *normal, dr.select(finite, depth, 0)]
+
+    return FeatureIntegrator(mi.Properties())
+
+
+@dr.syntax
+def _first_rough_surface(scene, sampler, ray, active):
+    """Trace camera rays through mirrors, glass and masks; return albedo, normal, depth, and the mask of hits."""
+    throughput, bounces = mi.Color3f(1), mi.UInt32(0)
+    albedo, normal, valid = mi.Color3f(0), mi.Normal3f(0), mi.Bool(False)
+    depth, length = mi.Float(0), mi.Float(0)
+    while active:
+        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=bounces == 0, active=active)
+        hit = active & si.is_valid()
+        length += dr.select(hit, si.t, 0)
+        albedo += throughput * _three(si.emitter(scene).eval(si, active))
+        bsdf = si.bsdf(ray)
+        sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(hit), sampler.next_2d(hit), hit)
+        throughput *= _three(weight)
+        # A surface with a delta and a smooth lobe, such as plastic, counts by its smooth lobe
+        smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        passed = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
+        onward = hit & (passed | (mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta) & ~smooth))
+        ends = hit & ~onward
+        albedo[ends] += throughput
+        normal[ends] = mi.Normal3f(dr.mulsign(si.sh_frame.n, si.wi.z))
+        depth[ends] = length
+        valid |= hit
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        bounces += 1
+        active = onward & (bounces < DEEPEST)
+    return albedo, normal, depth, valid
+
+
+def _three(value):
+    """Convert a spectrum to three channels; without RGB, the mean over the wavelengths."""
+    value = mi.unpolarized_spectrum(value)
+    return mi.Color3f(value) if mi.is_rgb else mi.Color3f(dr.mean(value))
