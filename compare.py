@@ -34,7 +34,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 MISSING = "the package '{}' is missing; pip install 'manylights[compare]' brings it"
-OPTIONAL = ("flip_evaluator", "matplotlib")  # imported after the options are parsed: --help does not need them
+OPTIONAL = ("flip_evaluator", "matplotlib", "scipy")  # imported after the options are parsed: --help does not need them
 
 try:
     from comparison import baseline, command_line, machine, metrics, references, report, sweeps, tables, worker

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.special import stdtrit
 
 TARGETS = 4  # maximum number of errors, and of times, in a comparison of integrators
 
 
 def quantile(freedom):
     """Return the 97.5% quantile of Student's t for `freedom` (at least 1) degrees of freedom."""
+    from scipy.special import stdtrit  # here, because --help works without optional packages
+
     return float(stdtrit(freedom, 0.975))
 
 

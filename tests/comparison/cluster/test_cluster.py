@@ -246,7 +246,7 @@ def test_bad_workers_are_refused(text, capsys):
 
 
 def test_workers_are_let_go_where_an_image_cannot_be_denoised(two, monkeypatch):
-    def broken(*_):
+    def broken(*_, **__):
         raise RuntimeError("no albedo")
 
     monkeypatch.setattr("comparison.cluster.render.Denoiser", broken)
