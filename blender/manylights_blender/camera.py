@@ -53,7 +53,7 @@ def _perspective(camera, matrix, size, wide, problems):
         return {**found, "type": "thinlens", **lens}
     # Blender shifts the view, in units of the fitted side; Mitsuba shifts the image, in units of its own side
     unit = size[0] if wide else size[1]
-    offsets = (-data.shift_x * unit / size[0], data.shift_y * unit / size[1])
+    offsets = (data.shift_x * unit / size[0], -data.shift_y * unit / size[1])
     return {**found, "principal_point_offset_x": offsets[0], "principal_point_offset_y": offsets[1]}
 
 

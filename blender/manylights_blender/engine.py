@@ -22,17 +22,20 @@ class ManylightsEngine(bpy.types.RenderEngine):
     def render(self, depsgraph):
         """Render a view layer. Called by Blender, in a thread of its own if Blender has a window."""
         try:
-            import manylights
             import mitsuba as mi
+
+            import manylights
         except ModuleNotFoundError as error:
-            self.error_set(f"{error}: install the package manylights into Blender's Python (see docs/blender.md)")
+            self.report(
+                {"ERROR"}, f"{error}: install the package manylights into Blender's Python (see docs/blender.md)"
+            )
             return
         if mi.variant() != VARIANT:
             mi.set_variant(VARIANT)
         try:
             self._render(manylights, depsgraph)
         except (ValueError, RuntimeError, ModuleNotFoundError) as error:
-            self.error_set(str(error))
+            self.report({"ERROR"}, str(error))
 
     def _render(self, manylights, depsgraph):
         import mitsuba as mi
@@ -52,7 +55,8 @@ class ManylightsEngine(bpy.types.RenderEngine):
                 "denoised": settings.use_denoising,
             }
         )
-        screen = Screen(self, depsgraph.view_layer_eval.name, _background(exported.background))
+        opaque = not depsgraph.scene.render.film_transparent
+        screen = Screen(self, depsgraph.view_layer_eval.name, _background(exported.background), opaque)
         image, _ = manylights.render(
             exported.scene, integrator, progress=Progress(self, screen, integrator), **limits(settings)
         )
@@ -84,16 +88,18 @@ def _background(scene):
 
 
 class Screen:
-    """Shows images of one render in Blender. `background` (height, width, 3): lies behind the image, or None."""
+    """Shows images of one render in Blender. `background` (height, width, 3): lies behind the image, or None; `opaque`:
+    whether the film is not transparent."""
 
-    def __init__(self, engine, layer, background):
-        self._engine, self._layer, self._background = engine, layer, background
+    def __init__(self, engine, layer, background, opaque):
+        self._engine, self._layer, self._background, self._opaque = engine, layer, background, opaque
 
     def show(self, image):
         """Show an image (height, width, 4), highest row first."""
         pixels = np.array(image, np.float32)
         if self._background is not None:
             pixels[..., :3] += (1 - pixels[..., 3:]) * self._background
+        if self._opaque:
             pixels[..., 3] = 1
         height, width = pixels.shape[:2]
         result = self._engine.begin_result(0, 0, width, height, layer=self._layer)
@@ -115,11 +121,15 @@ class Progress:
             self._engine.update_progress(took.seconds / (took.seconds + took.seconds_left))
         if image is not None and took.ended_by is None:
             self._screen.show(image)
-        if self._engine.test_break():
+        if self.is_stopped():
             if took.passes:
                 self._integrator.cancel()  # not before the first pass is finished, as there would be no image
             return False
         return None
+
+    def is_stopped(self):
+        """Whether the user pressed Esc."""
+        return self._engine.test_break()
 
 
 def register():

@@ -1,8 +1,8 @@
 """Blender's lights as Mitsuba's emitters.
 
-A light of Blender shines along its −Z axis. Power is in watts, for suns in W/m². With power P: a point or spot light has
-the radiant intensity P / 4π, an area light of area A the radiance P / πA. Both are those of Cycles (a test compares
-them). No light reflects or scatters.
+A light of Blender shines along its −Z axis. Power is in watts, for suns in W/m². With power P, a point or spot light
+has the radiant intensity P / 4π, and an area light of area A has the radiance P / πA, as in Cycles. Lights reflect
+nothing.
 """
 
 import math

@@ -4,7 +4,7 @@ Blender's roughness r is the root of the microfacet roughness α of Mitsuba. Eve
 two-sided, as in Blender.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
@@ -21,10 +21,12 @@ GREY = 0.8  # reflectance of an object without a material in Blender
 
 @dataclass
 class Surface:
-    """A material: dictionary of a BSDF, and of the radiance of an area emitter, each None if there is none."""
+    """A material: dictionary of a BSDF, and of the radiance of an area emitter, each None if there is none; `passes`:
+    whether light passes straight, as by 'Alpha'."""
 
     bsdf: dict | None = None
     radiance: dict | None = None
+    passes: bool = False
 
 
 def two_sided(bsdf):
@@ -45,11 +47,11 @@ class Materials:
         self._textures, self._problems, self._made = textures, textures.problems, {}
 
     def surface(self, material):
-        """Return the (BSDF object of Mitsuba, dictionary of the radiance or None) of a material, or of None."""
+        """Return the `Surface` of a material, or of None, with an object of Mitsuba for its BSDF."""
         key = material and material.name_full
         if key not in self._made:
             found = Surface(diffuse(rgb([GREY] * 3))) if material is None else self._read(material)
-            self._made[key] = mi.load_dict(found.bsdf or BLACK), found.radiance
+            self._made[key] = replace(found, bsdf=mi.load_dict(found.bsdf or BLACK))
         return self._made[key]
 
     def _read(self, material):
@@ -96,41 +98,44 @@ class Materials:
                 self._problems.add(material, f"'{name}' of the Principled BSDF is not exported")
         bsdf = self._principled_bsdf(material, node)
         alpha = self._number(material, node, "Alpha")
-        if alpha != 1.0:
+        passes = alpha != 1.0
+        if passes:
             bsdf = {"type": "mask", "opacity": alpha, "bsdf": bsdf}
         strength = self._constant(material, node, "Emission Strength")
-        return Surface(bsdf, self._colour(material, node, "Emission Color", scale=strength) if strength else None)
+        radiance = self._colour(material, node, "Emission Color", scale=strength) if strength else None
+        return Surface(bsdf, radiance, passes)
 
     def _principled_bsdf(self, material, node):
-        """The plugins for pure dielectrics are closer to Blender's model than Mitsuba's `principled`, whose diffuse
-        part is brighter at grazing angles."""
+        """Blender weakens the diffuse part by what the interface reflects, and Mitsuba's `principled` does not: the
+        base colour of the dielectric share is scaled by the transmittance at normal incidence."""
         metallic, roughness = self._number(material, node, "Metallic"), self._number(material, node, "Roughness")
         transmission = self._number(material, node, "Transmission Weight")
-        ior = self._specular_ior(material, node)
         if (metallic, transmission) == (0.0, 1.0) and isinstance(roughness, float):
             colour = self._colour(material, node, "Base Color", power=0.5)  # of each of two interfaces
             return glass(self._constant(material, node, "IOR"), roughness, transmittance=colour)
-        colour = self._colour(material, node, "Base Color")
-        if (metallic, transmission) == (0.0, 0.0) and isinstance(roughness, float):
-            return plastic(ior, roughness, colour)
+        reflected = self._reflectance(material, node)
+        dielectric = 1 - metallic if isinstance(metallic, float) else 0
+        opaque = 1 - transmission if isinstance(transmission, float) else 0
+        colour = self._colour(material, node, "Base Color", scale=1 - reflected * dielectric * opaque)
+        if (metallic, transmission, reflected) == (0.0, 0.0, 0.0):
+            return diffuse(colour)
+        ior = (1 + reflected**0.5) / (1 - reflected**0.5)
         bsdf = {
             "type": "principled", "base_color": colour, "roughness": roughness, "metallic": metallic, "eta": ior,
             "spec_trans": transmission,
         }  # fmt: skip
         return two_sided(bsdf) if transmission == 0.0 else bsdf
 
-    def _specular_ior(self, material, node):
-        """Index of refraction of reflection: 'Specular IOR Level' scales the reflectance at normal incidence by twice
-        its value."""
-        ior = self._constant(material, node, "IOR")
-        level = self._constant(material, node, "Specular IOR Level")
-        root = abs(ior - 1) / (ior + 1) * (2 * level) ** 0.5
-        if root >= 1:
+    def _reflectance(self, material, node):
+        """Reflectance of the interface at normal incidence, which 'Specular IOR Level' scales by twice its value."""
+        ior, level = (self._constant(material, node, name) for name in ("IOR", "Specular IOR Level"))
+        reflected = ((ior - 1) / (ior + 1)) ** 2 * 2 * level
+        if reflected >= 1:
             raise ValueError(
-                f"material '{material.name}': 'Specular IOR Level' {level:g} with 'IOR' {ior:g} reflects more than all "
-                "light; twice the level times ((IOR - 1) / (IOR + 1))² must be below 1"
+                f"material '{material.name}': twice 'Specular IOR Level' times ((IOR - 1) / (IOR + 1))² must be below "
+                f"1, got {reflected:g} with 'IOR' {ior:g} and level {level:g}"
             )
-        return (1 + root) / (1 - root)
+        return reflected
 
     def _diffuse(self, material, node):
         if differs(node.inputs["Roughness"], 0):
@@ -157,7 +162,7 @@ class Materials:
     def _transparent(self, material, node):
         if list(node.inputs["Color"].default_value[:3]) != [1, 1, 1] or node.inputs["Color"].is_linked:
             self._problems.add(material, f"'Color' of node '{node.name}' is not exported; the surface passes all light")
-        return Surface({"type": "null"})
+        return Surface({"type": "null"}, passes=True)
 
     def _emission(self, material, node):
         strength = self._constant(material, node, "Strength")
@@ -169,14 +174,14 @@ class Materials:
         if first.radiance or second.radiance:
             self._problems.add(material, f"emission below node '{node.name}' is not exported")
         bsdfs = {"first": first.bsdf or BLACK, "second": second.bsdf or BLACK}
-        return Surface({"type": "blendbsdf", "weight": share, **bsdfs})
+        return Surface({"type": "blendbsdf", "weight": share, **bsdfs}, passes=first.passes or second.passes)
 
     def _add(self, material, node):
         first, second = (self._shader(material, node.inputs[index]) for index in (0, 1))
         for name in ("bsdf", "radiance"):
             if getattr(first, name) and getattr(second, name):
                 self._problems.add(material, f"node '{node.name}' adds two of a kind; only the first is exported")
-        return Surface(first.bsdf or second.bsdf, first.radiance or second.radiance)
+        return Surface(first.bsdf or second.bsdf, first.radiance or second.radiance, first.passes or second.passes)
 
 
 READERS = {
@@ -189,16 +194,6 @@ READERS = {
     "ShaderNodeMixShader": Materials._mix,
     "ShaderNodeAddShader": Materials._add,
 }
-
-
-def plastic(ior, roughness, colour):
-    """Dictionary of a diffuse surface of a linear `colour` below a dielectric interface."""
-    if ior == 1:
-        return diffuse(colour)
-    kind = {"type": "plastic"} if roughness**2 < SMOOTHEST else {
-        "type": "roughplastic", "distribution": "ggx", "alpha": roughness**2
-    }  # fmt: skip
-    return two_sided({**kind, "int_ior": ior, "ext_ior": 1.0, "diffuse_reflectance": colour})
 
 
 def glass(ior, roughness, transmittance, reflectance=None):

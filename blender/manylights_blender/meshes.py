@@ -76,12 +76,12 @@ def is_open(part):
     return bool((np.unique(edges, axis=0, return_counts=True)[1] == 1).any())
 
 
-def shape(name, part, bsdf, radiance=None):
-    """Return a `mi.Mesh` of a `Part`. `bsdf`: an object of Mitsuba; `radiance`: dictionary of its emission."""
+def shape(name, part, surface):
+    """Return a `mi.Mesh` of a `Part` with a `materials.Surface`, whose BSDF is an object of Mitsuba."""
     properties = mi.Properties()
-    properties["bsdf"] = bsdf
-    if radiance is not None:
-        properties["emitter"] = mi.load_dict({"type": "area", "radiance": radiance})
+    properties["bsdf"] = surface.bsdf
+    if surface.radiance:
+        properties["emitter"] = mi.load_dict({"type": "area", "radiance": surface.radiance})
     mesh = mi.Mesh(
         name, len(part.positions), len(part.faces), has_vertex_normals=True, has_vertex_texcoords=part.uvs is not None,
         props=properties,

@@ -48,7 +48,7 @@ class _Exporter:
         self._materials, self._lights = Materials(self._textures), Lights(self._problems)
         self._meshes = {}  # parts and materials of a mesh, by key
         self._places = defaultdict(list)  # matrices of its instances, by key
-        self._entries, self._emissive = {}, False
+        self._entries, self._emissive, self._passes = {}, False, False
 
     def collect(self):
         """Read all objects and their instances."""
@@ -100,32 +100,36 @@ class _Exporter:
         return Exported(scene, self._problems.sentences, hide, behind)
 
     def _visibility(self, transparent):
-        """Return whether the world is added behind the image, and whether the integrator hides emitters. In Blender the
-        camera sees the world and emissive meshes, but no lights. Mitsuba hides all or none."""
-        hide = transparent or (self._lights.extended and not self._emissive)
-        if transparent and self._emissive:
-            self._problems.add_setting(
-                "Transparent", "the camera does not see emissive meshes before a transparent film"
-            )
-        if self._lights.extended and not hide:
-            self._problems.add_setting("Lights", "the camera sees lights with a size, as the scene has emissive meshes")
+        """Return whether the world is added behind the image, and whether the integrator hides emitters.
+
+        In Blender the camera sees the world and emissive meshes, but no lights. Mitsuba hides all or none. Hidden, the
+        world still lies behind surfaces that light passes straight, where alpha is 0: it must not be added.
+        """
+        seen = [name for name, there in (("emissive", self._emissive), ("transparent", self._passes)) if there]
+        meshes_ = f"{' and '.join(seen)} meshes"
+        hide = transparent or (self._lights.extended and not seen)
+        if transparent and seen:
+            self._problems.add_setting("Transparent", f"a transparent film is not exact for {meshes_}")
+        elif self._lights.extended and not hide:
+            self._problems.add_setting("Lights", f"the camera sees lights with a size, as the scene has {meshes_}")
         return hide and not transparent, hide
 
     def _add_mesh(self, name, label, parts, materials, places):
         """Add a mesh at all its places: once, if it has one, else as instances of a group."""
         surfaces = [self._surface(part, materials) for part in parts]
-        emissive = any(radiance is not None for _, radiance in surfaces)
+        emissive = any(surface.radiance for surface in surfaces)
         self._emissive |= emissive
-        if emissive and any(meshes.is_open(part) for part, (_, light) in zip(parts, surfaces, strict=True) if light):
+        self._passes |= any(surface.passes for surface in surfaces)
+        if any(surface.radiance and meshes.is_open(part) for part, surface in zip(parts, surfaces, strict=True)):
             self._problems.add_setting(f"Mesh '{label}'", "an open mesh emits light on its front only")
         if len(places) == 1 or emissive:  # Mitsuba's groups contain no emitters
             for place, matrix in enumerate(places):
                 for part, surface in zip(parts, surfaces, strict=True):
                     one = f"{name}_{place}_{part.slot}"
-                    self._entries[one] = meshes.shape(one, meshes.to_world(part, matrix), *surface)
+                    self._entries[one] = meshes.shape(one, meshes.to_world(part, matrix), surface)
             return
         shapes = {
-            f"part{part.slot}": meshes.shape(f"{name}_{part.slot}", part, *surface)
+            f"part{part.slot}": meshes.shape(f"{name}_{part.slot}", part, surface)
             for part, surface in zip(parts, surfaces, strict=True)
         }
         if shapes:

@@ -1,6 +1,7 @@
 """Blender's world, and suns with a disc, as Mitsuba's environment emitter.
 
-Rows of equirectangular images are heights from +Z down, columns are azimuths from −X by way of +Y... see `AXES`.
+In Blender's equirectangular images, rows go from +Z down, and columns from −X by way of +Y to +X and −Y. Row i of n is
+at the polar angle π (i + ½) / n in Blender and π i / (n − 1) in Mitsuba: an image of the world is up to half a row off.
 """
 
 import math
@@ -65,13 +66,16 @@ class Sky:
 
 
 def _directions(width):
-    """Directions of the pixels of an equirectangular image (width / 2, width, 3), and solid angles (width / 2, 1)."""
-    height = math.ceil(width / 2)
+    """Directions of the pixels of Mitsuba's environment map (width / 2 + 1, width, 3), and their solid angles
+    (width / 2 + 1, 1). The first and the last row are at the poles, and values between pixels are linear."""
+    step = math.pi / math.ceil(width / 2)
     azimuth = 2 * math.pi * (0.5 - (np.arange(width) + 0.5) / width)
-    polar = math.pi * (np.arange(height) + 0.5)[:, None] / height
+    polar = step * np.arange(math.ceil(width / 2) + 1)[:, None]
     x, y = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth)
     towards = np.stack([x, y, np.broadcast_to(np.cos(polar), x.shape)], axis=-1)
-    return towards, 2 * math.pi / width * (math.pi / height) * np.sin(polar)
+    heights = np.sin(polar) * 2 * (1 - math.cos(step)) / step  # integral of a row's linear weight times the sine
+    heights[[0, -1]] = 1 - math.sin(step) / step
+    return towards, 2 * math.pi / width * heights
 
 
 def _disc(sun, towards, solid_angles, width):
