@@ -6,6 +6,7 @@ two-sided, as in Blender.
 
 from dataclasses import dataclass, replace
 
+import bpy
 import mitsuba as mi
 
 from .problems import differs
@@ -16,7 +17,7 @@ IGNORED = (
     "Subsurface Weight", "Anisotropic", "Coat Weight", "Sheen Weight", "Thin Film Thickness", "Diffuse Roughness",
 )  # fmt: skip
 SMOOTHEST = 1e-3  # α below which a surface is a mirror: Mitsuba's microfacets lose precision there
-GREY = 0.8  # reflectance of an object without a material in Blender
+GREY, GREY_ROUGHNESS, GREY_IOR = 0.8, 0.5, 1.5  # of an object without a material in Blender
 
 
 @dataclass
@@ -40,6 +41,14 @@ def diffuse(reflectance):
 BLACK = diffuse(rgb((0, 0, 0)))
 
 
+def without_material():
+    """Dictionary of the BSDF of an object without a material: a Principled BSDF since Blender 5.0, diffuse before."""
+    if bpy.app.version < (5, 0, 0):
+        return diffuse(rgb([GREY] * 3))
+    colour = rgb([GREY] * 3, 1 - ((GREY_IOR - 1) / (GREY_IOR + 1)) ** 2)
+    return two_sided({"type": "principled", "base_color": colour, "roughness": GREY_ROUGHNESS, "eta": GREY_IOR})
+
+
 class Materials:
     """Materials of one export. `surface` returns the `Surface` of a material, made once."""
 
@@ -50,7 +59,7 @@ class Materials:
         """Return the `Surface` of a material, or of None, with an object of Mitsuba for its BSDF."""
         key = material and material.name_full
         if key not in self._made:
-            found = Surface(diffuse(rgb([GREY] * 3))) if material is None else self._read(material)
+            found = Surface(without_material()) if material is None else self._read(material)
             self._made[key] = replace(found, bsdf=mi.load_dict(found.bsdf or BLACK))
         return self._made[key]
 

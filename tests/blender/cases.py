@@ -119,11 +119,11 @@ def view(**properties):
 
 @cases("focus", sharp={"focus_distance": 4}, near={"focus_distance": 2}, on_object={"distance": 2.5})
 def focus(distance=None, **properties):
-    """Small bright ball below a lens with a large aperture."""
+    """A bright ball that is smaller than the circle of confusion, below a lens with a large aperture."""
     scene = new_scene(spp=256)
-    add_sphere(material("Emission", Color=(1, 1, 1), Strength=1.0), radius=0.5)
+    add_sphere(material("Emission", Color=(1, 1, 1), Strength=1.0), radius=0.2)
     dof = scene.camera.data.dof
-    dof.use_dof, dof.aperture_fstop = True, 0.1
+    dof.use_dof, dof.aperture_fstop = True, 0.05
     if distance:
         dof.focus_object = add("target", None, location=(1, 0, 4 - distance))
     for key, value in properties.items():
