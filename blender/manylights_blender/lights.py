@@ -44,7 +44,7 @@ class Lights:
     def add(self, name, light, matrix):
         """Add a light of Blender under a `name` of its own. `matrix`: (4, 4), its place in the world."""
         strength = self._strength(light)
-        if not strength.any():
+        if not strength.any() or _is_portal(light):
             return
         made = {"POINT": self._point, "SUN": self._sun, "SPOT": self._spot, "AREA": self._area}[light.type](
             light, strength, matrix
@@ -117,6 +117,11 @@ class Lights:
             "bsdf": BLACK,
             "emitter": _emission(rgb(strength / (math.pi * area))),
         }
+
+
+def _is_portal(light):
+    """Whether a light only helps Cycles to sample the world, and shines no light."""
+    return light.type == "AREA" and getattr(getattr(light, "cycles", None), "is_portal", False)
 
 
 def _emission(radiance):

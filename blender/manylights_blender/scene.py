@@ -67,10 +67,13 @@ class _Exporter:
         key = (one.data.as_pointer(), *(material and material.name_full for material in materials))
         if key not in self._meshes:
             self._meshes[key] = one.name, meshes.parts_of(one), materials
-            self._check_visibility(one.original)
+            self._check_object(one.original)
         self._places[key].append(matrix)
 
-    def _check_visibility(self, one):
+    def _check_object(self, one):
+        """Report settings of an object that are not exported."""
+        if any(system.settings.render_type == "PATH" for system in one.particle_systems):
+            self._problems.add(one, "hair of particles is not exported")
         rays = ("camera", "diffuse", "glossy", "transmission", "shadow")
         hidden = [ray for ray in rays if not getattr(one, f"visible_{ray}")]
         if hidden:

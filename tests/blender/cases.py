@@ -220,6 +220,7 @@ PRINCIPLED = "BsdfPrincipled"
     strong_coat={"kind": PRINCIPLED, "Base_Color": COLOUR, "IOR": 2.0, "Specular_IOR_Level": 0.8},
     no_reflection={"kind": PRINCIPLED, "Base_Color": COLOUR, "Specular_IOR_Level": 0.0},
     metal={"kind": PRINCIPLED, "Base_Color": COLOUR, "Roughness": 0.2, "Metallic": 1.0},
+    rough_metal={"kind": PRINCIPLED, "Base_Color": COLOUR, "Roughness": 0.9, "Metallic": 1.0},
     half_metal={"kind": PRINCIPLED, "Base_Color": COLOUR, "Metallic": 0.5},
     principled_glass={"kind": PRINCIPLED, "Base_Color": COLOUR, "Roughness": 0.3, "Transmission_Weight": 1.0},
     half_glass={"kind": PRINCIPLED, "Base_Color": COLOUR, "Roughness": 0.3, "Transmission_Weight": 0.5},
@@ -286,7 +287,9 @@ def unsupported():
     add_plane(glow, size=0.1, location=(0, 0, 0.1)).name = "panel"
     toon = material("BsdfToon")
     toon.name = "toon"
-    add_sphere(toon, radius=0.1).visible_camera = False
+    ball = add_sphere(toon, radius=0.1)
+    ball.visible_camera = False
+    ball.modifiers.new("hair", "PARTICLE_SYSTEM").particle_system.settings.type = "HAIR"
     scene.render.use_motion_blur = scene.render.use_border = True
     world = set_world()
     link(world, "Color", "TexSky")
@@ -318,6 +321,14 @@ def ended_by_escape():
     add_plane()
     add_light("POINT", shadow_soft_size=0)
     Progress.is_stopped = lambda self: True  # `main` restores it
+
+
+@case
+def ended_by_late_escape():
+    """Esc is pressed within a later pass, which is thrown away."""
+    ended_by_escape()
+    calls = iter(range(1 << 20))
+    Progress.is_stopped = lambda self: next(calls) > 30
 
 
 @case

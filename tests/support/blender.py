@@ -1,6 +1,6 @@
 """Small scenes in the module `bpy`, Blender without a window, rendered by Cycles and by the add-on.
 
-Imports `bpy`: tests import this module after `pytest.importorskip("bpy")`.
+Imports `bpy`: no test imports this module in its own process.
 """
 
 import sys
