@@ -180,8 +180,6 @@ class SceneFile:
                 return mi.parser.instantiate(self._configuration, self._state)
         finally:
             mi.set_file_resolver(resolver)
-            # No kernel may run while Dr.Jit ends threads: a render has waited for ever afterwards
-            dr.sync_thread()
             dr.set_thread_count(threads)
 
     def _nodes(self, kind):
