@@ -112,7 +112,7 @@ def parse(arguments):
     add("--denoise", action="store_true", help="denoise by Open Image Denoise (pip install 'manylights[denoise]')")
     add("--denoise-quality", choices=QUALITIES,
         help=f"with --denoise: network, from best to quickest (default: {QUALITIES[0]})")  # fmt: skip
-    add("--aovs", type=feature_names, default=(), metavar="NAMES",
+    add("--layers", type=feature_names, default=(), metavar="NAMES",
         help=f"layers of EXR files, out of {', '.join(FEATURES)}, separated by commas: of the first surface that is "
              "neither mirror nor glass, as the denoiser gets them")  # fmt: skip
     add("-s", "--seed", type=command_line.seed, default=0, metavar="N", help="seed (default: 0)")
@@ -131,8 +131,8 @@ def parse(arguments):
     options = parser.parse_args(arguments)
     if options.denoise_quality and not options.denoise:
         parser.error("--denoise-quality needs --denoise")
-    if options.aovs and options.output and options.output.suffix == ".png":
-        parser.error("--aovs needs an .exr file: a PNG file has no layers")
+    if options.layers and options.output and options.output.suffix == ".png":
+        parser.error("--layers needs an .exr file: a PNG file has no layers")
     if options.output and not options.output.is_dir():
         try:
             check_extension(options.output)

@@ -29,9 +29,9 @@ FEATURES = {"albedo": ("R", "G", "B"), "normal": ("X", "Y", "Z"), "depth": ("Z",
 
 def channels_of(names):
     """Return the names of the channels of features, in order. Raises ValueError for a name that is not in `FEATURES`,
-    and for a repeated name."""
-    if not set(names) <= set(FEATURES) or len(set(names)) < len(names):
-        raise ValueError(f"aovs must be distinct names out of {', '.join(FEATURES)}, got {', '.join(names)}")
+    for a repeated name, and for a string in place of a sequence of names."""
+    if isinstance(names, str) or not set(names) <= set(FEATURES) or len(set(names)) < len(names):
+        raise ValueError(f"layers must be a list of distinct names out of {', '.join(FEATURES)}, got {names!r}")
     return [f"{name}.{channel}" for name in names for channel in FEATURES[name]]
 
 
@@ -103,7 +103,7 @@ def _rendered(scene, sensor, spp, key):
 
     with stratified(sensor, spp) as wrapper, garbage_kept():
         mi.render(scene, sensor=wrapper, integrator=_feature_integrator(mi.variant()), spp=spp, seed=seed)
-    bitmap = sensor.film().bitmap()
+        bitmap = sensor.film().bitmap()
     names = [entry.name for entry in bitmap.struct_()]
     planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
     found = {

@@ -120,11 +120,11 @@ class Image:
                     output.keep(took, image)
 
             if self._remote:
-                return self._remote.render(denoise=denoise, progress=progress, aovs=self._options.aovs)
+                return self._remote.render(denoise=denoise, progress=progress, layers=self._options.layers)
             scene = self._scene.get()
             return render(
                 scene, self._scene.integrator, self._sensor, denoise=denoise, progress=progress,
-                checkpoint=self._checkpoint, aovs=self._options.aovs, **self._limits(),
+                checkpoint=self._checkpoint, layers=self._options.layers, **self._limits(),
             )  # fmt: skip
 
 
@@ -181,8 +181,8 @@ class Output:
             "ended_by": took.ended_by,
             "statistics": took.statistics,
         }
-        if took.aov_spp is not None:
-            metadata["aov_spp"] = took.aov_spp
+        if took.layer_spp is not None:
+            metadata["layer_spp"] = took.layer_spp
         if took.raw is not None:
             described = metadata | {"denoise_seconds": took.denoise_seconds} | took.denoiser
             images.write(self.path.with_suffix(".denoised.exr"), image, took.channels, described)

@@ -39,8 +39,8 @@ class Took:
     integrator, summed over passes; `ended_by`: the limit that was reached ("spp", "time" or "error"), "interruption"
     (Ctrl-C, or `cancel` of the integrator) or "progress", None during the render; `channels`: names of the channels;
     `denoise_seconds`: the part of `seconds` for denoising; `denoiser`: metadata, quality of the denoiser and samples of
-    albedo and normal; `raw`: the image before denoising (`mi.TensorXf`), None without denoising; `aov_spp`: samples per
-    pixel of the requested features, None without.
+    albedo and normal; `raw`: the image before denoising (`mi.TensorXf`), None without denoising; `layer_spp`: samples
+    per pixel of the requested layers, None without.
 
     During a render: `stage`: current stage of the pass, a key of `statistics["seconds"]`, None between passes;
     `seconds_left`: expected seconds until the end, None if unknown.
@@ -56,7 +56,7 @@ class Took:
     denoise_seconds: float = 0.0
     denoiser: dict[str, Any] = field(default_factory=dict, repr=False)
     raw: mi.TensorXf | None = field(default=None, repr=False)
-    aov_spp: int | None = None
+    layer_spp: int | None = None
     stage: str | None = None
     seconds_left: float | None = None
 
@@ -74,7 +74,7 @@ def render(
     progress: Callable[[Took, mi.TensorXf | None], bool | None] | None = None,
     pass_spp: int | None = None,
     checkpoint: Checkpoint | None = None,
-    aovs: Sequence[str] = (),
+    layers: Sequence[str] = (),
 ) -> tuple[mi.TensorXf, Took]:
     """Render a scene in passes; return the image, a `mi.TensorXf` of shape (height, width, channels) as of `mi.render`,
     and the cost (`Took`). Passes take about two seconds, with `manylights` up to ten.
@@ -90,27 +90,28 @@ def render(
     `progress`: called after each pass with the cost and the image so far; integrators of this project also call it at
     the start of each stage of a pass, with None for the image. If it returns False, no other pass begins; an exception
     ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a `checkpoint.Checkpoint` of the
-    same render with one sensor, whose samples and seconds count; it is kept unless a limit ends the render. `aovs`:
+    same render with one sensor, whose samples and seconds count; it is kept unless a limit ends the render. `layers`:
     names of features.py, "albedo", "normal" and "depth", which become channels such as "albedo.R".
 
     Ctrl-C, or `cancel()` of the integrator, returns the image of the finished passes. Without a finished pass Ctrl-C
     raises KeyboardInterrupt and `cancel()` RuntimeError. A second Ctrl-C raises KeyboardInterrupt.
 
-    Raises ValueError for limits that are not positive, for another `denoise` or other `aovs`, for a sensor that does
+    Raises ValueError for limits that are not positive, for another `denoise` or other `layers`, for a sensor that does
     not exist, for a scene without an integrator, for a participating medium that the integrator does not support, and
-    for channels in `aovs` that the integrator has; FileNotFoundError
-    for a missing scene file; ModuleNotFoundError if the package for `denoise` is missing; RuntimeError if another
-    thread renders with the same sensor, or if no variant is set.
+    for channels in `layers` that the integrator has; FileNotFoundError for a missing scene file; ModuleNotFoundError if
+    the package for `denoise` is missing; RuntimeError if another thread renders with the same sensor, or if no variant
+    is set.
     """
-    quality, _ = quality_of(denoise), channels_of(aovs)
+    quality, _ = quality_of(denoise), channels_of(layers)
     scene = _scene(scene)
     integrator = _integrator(scene, integrator, denoise)
+    check_layers(layers, integrator)
     if sensor == ALL:
         if checkpoint:
             raise ValueError(f"checkpoint must be None where sensor is '{ALL}': it is of one image")
         return _render_all(
             scene, integrator, error=error, time=time, spp=spp, seed=seed, denoise=denoise, progress=progress,
-            pass_spp=pass_spp, aovs=aovs,
+            pass_spp=pass_spp, layers=layers,
         )  # fmt: skip
     check(error=error, time=time, spp=spp, pass_spp=pass_spp)
     doubt_percentage("error", error or 0)
@@ -120,7 +121,7 @@ def render(
         spp = scene.sensors()[sensor].sampler().sample_count()
     begin = clock.perf_counter()
     denoiser = Denoiser(scene, sensor, seed, spp, time, quality) if denoise else None
-    layers = layers_of(aovs, scene, sensor, integrator, denoiser, seed=seed, spp=spp, time_limit=time)
+    planes = layers_of(layers, scene, sensor, denoiser, seed=seed, spp=spp, time_limit=time)
     progressive = Progressive(scene, seed, sensor, integrator)
     reserved = denoiser.filter_seconds if denoiser else 0.0
     sizes = PassSizes(
@@ -131,19 +132,23 @@ def render(
     if checkpoint:
         begin -= checkpoint.restore(progressive)
     with exclusive(sensor=scene.sensors()[sensor]):
-        return render_passes(progressive, sizes, ending, begin, progress, denoiser, checkpoint, layers)
+        return render_passes(progressive, sizes, ending, begin, progress, denoiser, checkpoint, planes)
 
 
-def layers_of(aovs, scene, sensor, integrator, denoiser, **limits):
-    """Return the `Layers` with the names `aovs` of a sensor (an index), None for no names: those of the denoiser if
-    there is one. `limits`: see `features_of`. Raises ValueError for a channel that the integrator has."""
-    if not aovs:
+def check_layers(layers, integrator):
+    """Raise ValueError for `layers` that are not names of features, and for those that the integrator has."""
+    if own := set(channels_of(layers)) & set(integrator.aov_names()):
+        raise ValueError(f"layers must not name channels of the integrator, got {', '.join(sorted(own))}")
+
+
+def layers_of(names, scene, sensor, denoiser, **limits):
+    """Return the `Layers` with some `names` for a sensor (an index), None for no names: those of the denoiser if there
+    is one. `limits`: see `features_of`."""
+    if not names:
         return None
-    if own := set(channels_of(aovs)) & set(integrator.aov_names()):
-        raise ValueError(f"aovs must not name channels of the integrator, got {', '.join(sorted(own))}")
     if denoiser:
-        return Layers.of(aovs, denoiser.features, denoiser.feature_spp)
-    return Layers.of(aovs, *features_of(scene, scene.sensors()[sensor], **limits))
+        return Layers.of(names, denoiser.features, denoiser.feature_spp)
+    return Layers.of(names, *features_of(scene, scene.sensors()[sensor], **limits))
 
 
 def _render_all(scene, integrator, **limits):
@@ -320,7 +325,7 @@ class _Render:
         statistics, layers = self._statistics.of(one.passes), self._layers
         return Took(
             one.spp, len(one.passes), seconds, self._error, statistics, self._ended_by,
-            one.channels + (layers.channels if layers else []), aov_spp=layers.spp if layers else None,
+            one.channels + (layers.channels if layers else []), layer_spp=layers.spp if layers else None,
             seconds_left=None if self._ended_by else self._ending.seconds_left(seconds),
         )  # fmt: skip
 

@@ -40,10 +40,14 @@ class ManylightsEngine(bpy.types.RenderEngine):
     def _render(self, manylights, depsgraph):
         import mitsuba as mi
 
+        from vpl.core.garbage import garbage_kept
+
         from .scene import export
 
         self.update_stats("", "Exporting the scene")
-        exported = export(depsgraph)
+        # Blender's own Python runs beside this thread
+        with garbage_kept():
+            exported = export(depsgraph)
         for sentence in exported.problems:
             self.report({"WARNING"}, sentence)
         settings = depsgraph.scene.manylights
@@ -83,8 +87,11 @@ def _background(scene):
         return None
     import mitsuba as mi
 
+    from vpl.core.garbage import garbage_kept
+
     path = mi.load_dict({"type": "path", "max_depth": BACKGROUND_DEPTH})
-    return np.array(mi.render(scene, integrator=path, spp=BACKGROUND_SPP))[..., :3]
+    with garbage_kept():
+        return np.array(mi.render(scene, integrator=path, spp=BACKGROUND_SPP))[..., :3]
 
 
 class Screen:

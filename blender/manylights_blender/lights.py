@@ -59,6 +59,8 @@ class Lights:
     def _strength(self, light):
         """Colour times power (3), with the factors of a node Emission."""
         strength = np.array(light.color) * light.energy * 2.0 ** getattr(light, "exposure", 0.0)
+        if not getattr(light, "normalize", True):
+            self.problems.add(light, "'Normalize' switched off is not exported")
         if getattr(light, "use_temperature", False):
             strength *= np.array(light.temperature_color)
         if not light.use_nodes or light.node_tree is None:

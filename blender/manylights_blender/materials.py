@@ -31,10 +31,12 @@ class Surface:
 
 
 def two_sided(bsdf):
+    """Dictionary of a BSDF on both sides of a surface."""
     return {"type": "twosided", "bsdf": bsdf}
 
 
 def diffuse(reflectance):
+    """Dictionary of a two-sided diffuse BSDF; `reflectance`: a dictionary."""
     return two_sided({"type": "diffuse", "reflectance": reflectance})
 
 

@@ -62,9 +62,12 @@ def to_world(part, matrix):
     the normals."""
     linear = matrix[:3, :3]
     positions = part.positions @ linear.T + matrix[:3, 3]
-    normals = part.normals @ np.linalg.inv(linear)
+    # The matrix of cofactors: the transposed inverse times the determinant, which a flattened object has as well
+    x, y, z = linear.T
+    cofactors = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)], axis=1)
+    normals = part.normals @ cofactors.T * (-1 if np.linalg.det(linear) < 0 else 1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float32).tiny)
-    faces = part.faces if np.linalg.det(linear) > 0 else part.faces[:, ::-1]
+    faces = part.faces[:, ::-1] if np.linalg.det(linear) < 0 else part.faces
     return Part(part.slot, positions, normals, part.uvs, faces)
 
 

@@ -12,6 +12,7 @@ from .materials import Materials
 from .problems import Problems
 from .textures import Textures
 
+RAYS = ("diffuse", "glossy", "transmission", "shadow")  # of 'Ray Visibility', besides those of the camera
 # Objects that show something, and that the export leaves out
 LEFT_OUT = ("CURVES", "POINTCLOUD", "VOLUME", "GPENCIL", "GREASEPENCIL")
 
@@ -56,8 +57,10 @@ class _Exporter:
             one = instance.object
             matrix = np.array(instance.matrix_world)
             if one.type == "LIGHT":
+                self._check_rays(one.original, RAYS)
                 self._lights.add(f"light{index}", one.data, matrix)
             elif one.type in meshes.HAS_MESH and instance.show_self:
+                self._check_object(one.original)
                 self._collect_mesh(one, matrix)
             elif one.type in LEFT_OUT:
                 self._problems.add(one, f"objects of type {one.type} are not exported")
@@ -67,22 +70,24 @@ class _Exporter:
         key = (one.data.as_pointer(), *(material and material.name_full for material in materials))
         if key not in self._meshes:
             self._meshes[key] = one.name, meshes.parts_of(one), materials
-            self._check_object(one.original)
         self._places[key].append(matrix)
 
     def _check_object(self, one):
         """Report settings of an object that are not exported."""
         if any(system.settings.render_type == "PATH" for system in one.particle_systems):
             self._problems.add(one, "hair of particles is not exported")
-        rays = ("camera", "diffuse", "glossy", "transmission", "shadow")
+        self._check_rays(one, ("camera", *RAYS))
+        for name, label in (("is_holdout", "Holdout"), ("is_shadow_catcher", "Shadow Catcher")):
+            if getattr(one, name):
+                self._problems.add(one, f"'{label}' is not exported")
+
+    def _check_rays(self, one, rays):
+        """Report kinds of rays that do not see an object."""
         hidden = [ray for ray in rays if not getattr(one, f"visible_{ray}")]
         if hidden:
             self._problems.add(
                 one, f"'Ray Visibility' is not exported; the object is visible to rays of: {', '.join(hidden)}"
             )
-        for name, label in (("is_holdout", "Holdout"), ("is_shadow_catcher", "Shadow Catcher")):
-            if getattr(one, name):
-                self._problems.add(one, f"'{label}' is not exported")
 
     def finish(self, source):
         """Make the scene of Mitsuba from the collected objects."""

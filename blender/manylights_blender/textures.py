@@ -49,6 +49,17 @@ class Textures:
             values = socket.default_value
         return rgb([value**power for value in values[:3]], scale)
 
+    def constant(self, owner, socket):
+        """Linear colour (3) or number of a socket of the world, which has no texture coordinates of a mesh."""
+        node, _ = source(socket)
+        if node is not None and node.bl_idname == "ShaderNodeTexImage":
+            self._refuse(owner, node, socket)
+            value = socket.default_value
+            return float(value) if isinstance(value, float) else np.array(value[:3])
+        read = self.number if isinstance(socket.default_value, float) else self.colour
+        found = read(owner, socket)
+        return np.array(found["value"]) if isinstance(found, dict) else found
+
     def number(self, owner, socket):
         """Number of a socket: a float, or the dictionary of a `bitmap` with one channel."""
         node, output = source(socket)

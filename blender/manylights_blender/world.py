@@ -103,11 +103,11 @@ def read(world, textures):
     if node.bl_idname != "ShaderNodeBackground":
         textures.problems.add(world, f"shader '{node.name}' is not exported; the world becomes black")
         return Sky(np.zeros(3))
-    strength = textures.number(world, node.inputs["Strength"])
+    strength = textures.constant(world, node.inputs["Strength"])
     image_node, _ = source(node.inputs["Color"])
     if image_node is not None and image_node.bl_idname == "ShaderNodeTexEnvironment":
         return _environment(world, image_node, textures, strength)
-    return Sky(np.array(textures.colour(world, node.inputs["Color"])["value"]) * strength)
+    return Sky(textures.constant(world, node.inputs["Color"]) * strength)
 
 
 def _environment(world, node, textures, strength):

@@ -6,7 +6,7 @@ import time as clock
 from ..denoising import Denoiser, quality_of
 from ..ending import Ending
 from ..pass_sizes import PassSizes
-from ..render import check, layers_of, render_passes
+from ..render import check, check_layers, layers_of, render_passes
 from .passes import DistributedPasses, samples_of_a_pass
 from .pool import TASKS_PER_WORKER
 from .scene_travel import bundle
@@ -46,21 +46,23 @@ class DistributedRender:
         """Number of passes of each worker, by address."""
         return dict(self.passes.workers)
 
-    def render(self, denoise=False, progress=None, aovs=()):
+    def render(self, denoise=False, progress=None, layers=()):
         """Render; return the image and the cost, as `comparison.render.render` does. Raises ClusterError if the workers
         fail."""
         begin = clock.perf_counter() - self._seconds
         try:
-            scene = self._scene.get() if denoise or aovs else None
+            scene = self._scene.get() if denoise or layers else None
+            if layers:
+                check_layers(layers, self._scene.integrator)
             limits = {"seed": self._seed, "spp": self.spp, "time_limit": self._time}
             denoiser = Denoiser(scene, self._sensor, **limits, quality=quality_of(denoise)) if denoise else None
-            layers = layers_of(aovs, scene, self._sensor, self._scene.integrator, denoiser, **limits)
+            planes = layers_of(layers, scene, self._sensor, denoiser, **limits)
             reserved = denoiser.filter_seconds if denoiser else 0.0
             ending = Ending(self.spp, self._time and self._time - reserved, self._error, reserved)
             if self._time:
                 self.passes.deadline = begin + self._time - reserved
             sizes = PassSizes(self.passes.pixels, self.spp, fixed=self._pass_spp)
-            return render_passes(self.passes, sizes, ending, begin, progress, denoiser, self._checkpoint, layers)
+            return render_passes(self.passes, sizes, ending, begin, progress, denoiser, self._checkpoint, planes)
         finally:
             self.close()
 

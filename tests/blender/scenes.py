@@ -274,11 +274,30 @@ def unsupported():
     toon = material("BsdfToon")
     toon.name = "toon"
     ball = add_sphere(toon, radius=0.1)
-    ball.visible_camera = False
+    # Objects of one mesh, of which the second is hidden
+    add("first", ball.data)
+    add("twin", ball.data).visible_camera = False
     ball.modifiers.new("hair", "PARTICLE_SYSTEM").particle_system.settings.type = "HAIR"
     scene.render.use_motion_blur = scene.render.use_border = True
     world = set_world()
     link(world, "Color", "TexSky")
+
+
+@case
+def unsupported_world():
+    """An Image Texture has no coordinates in a world."""
+    new_scene(spp=1)
+    world = set_world((0.1, 0.2, 0.3))
+    for name in ("Color", "Strength"):
+        link(world, name, "TexImage").image = picture("speckles", np.full((2, 2, 3), 0.5))
+
+
+@case
+def flat():
+    """An object without extent along one axis."""
+    new_scene()
+    add_plane(scale=(1, 1, 0))
+    add_light("POINT", shadow_soft_size=0)
 
 
 @case

@@ -31,7 +31,7 @@ def power_law(label, factor=1.0, scatter=0.0, first_seed=0):
 
 def test_quantiles_of_student():
     for freedom in (1, 2, 3, 10, 11, 15, 30, 1000):
-        assert curves.quantile(freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=3e-4)
+        assert curves.quantile(freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=1e-9)
 
 
 def test_spread():

@@ -139,11 +139,11 @@ def command(*arguments):
 
 def test_layers_follow_the_channels_of_the_image():
     scene = cornell(16).load()
-    image, took = manylights.render(scene, "path", spp=4, aovs=("depth", "albedo"))
-    assert took.channels == ["R", "G", "B", "depth.Z", "albedo.R", "albedo.G", "albedo.B"] and took.aov_spp == 16
+    image, took = manylights.render(scene, "path", spp=4, layers=("depth", "albedo"))
+    assert took.channels == ["R", "G", "B", "depth.Z", "albedo.R", "albedo.G", "albedo.B"] and took.layer_spp == 16
     plain, usual = manylights.render(scene, "path", spp=4)
     np.testing.assert_allclose(image.numpy()[..., :3], plain.numpy(), rtol=1e-4, atol=1e-6)
-    assert usual.aov_spp is None and usual.channels == ["R", "G", "B"]
+    assert usual.layer_spp is None and usual.channels == ["R", "G", "B"]
     expected, _ = features.features_of(scene, scene.sensors()[0], 0, 4)
     np.testing.assert_allclose(image.numpy()[..., 3:4], expected["depth"], rtol=1e-4)
     np.testing.assert_allclose(image.numpy()[..., 4:], expected["albedo"], rtol=1e-4, atol=1e-6)
@@ -157,24 +157,24 @@ def test_layers_are_in_every_image_of_a_render():
             seen.append((image.shape[-1], took.channels[3:]))
 
     scene = cornell(16).load()
-    _, took = manylights.render(scene, "path", spp=4, pass_spp=2, aovs=["normal"], denoise=True, progress=progress)
+    _, took = manylights.render(scene, "path", spp=4, pass_spp=2, layers=["normal"], denoise=True, progress=progress)
     assert seen == [(6, ["normal.X", "normal.Y", "normal.Z"])] * 2
     assert took.raw.shape == (16, 16, 6)
 
 
 def test_files_have_layers_with_the_samples_behind_them(tmp_path):
-    assert command("-o", tmp_path / "a.exr", "--spp", 4, "--aovs", "albedo, normal,depth", "--denoise") == 0
+    assert command("-o", tmp_path / "a.exr", "--spp", 4, "--layers", "albedo, normal,depth", "--denoise") == 0
     for name in ("a.exr", "a.denoised.exr"):
         image, channels, metadata = images.read_exr(tmp_path / name)
-        assert set(channels) == {"R", "G", "B", *features.channels_of(list(FEATURES))} and metadata["aov_spp"] == 16
+        assert set(channels) == {"R", "G", "B", *features.channels_of(list(FEATURES))} and metadata["layer_spp"] == 16
         assert (image[..., channels.index("depth.Z")] > 0).all()
 
 
 def test_layers_of_an_image_by_workers(tmp_path):
     pytest.importorskip("distributed")
-    assert command("-o", tmp_path / "here.exr", "--spp", 8, "--pass-spp", 4, "--aovs", "depth") == 0
+    assert command("-o", tmp_path / "here.exr", "--spp", 8, "--pass-spp", 4, "--layers", "depth") == 0
     there = tmp_path / "there.exr"
-    assert command("-o", there, "--spp", 8, "--pass-spp", 4, "--aovs", "depth", "--workers", 1) == 0
+    assert command("-o", there, "--spp", 8, "--pass-spp", 4, "--layers", "depth", "--workers", 1) == 0
     here, there = (images.read_exr(file) for file in (tmp_path / "here.exr", there))
     assert here[1] == there[1] and "depth.Z" in here[1]
     np.testing.assert_allclose(here[0], there[0], rtol=1e-4, atol=1e-6)
@@ -182,18 +182,18 @@ def test_layers_of_an_image_by_workers(tmp_path):
 
 @pytest.mark.parametrize("names", ["shape", "albedo,albedo", "", "albedo,"])
 def test_other_layers_are_refused(names, capsys):
-    assert command("--aovs", names) == 2
-    assert "aovs must be distinct names out of albedo, normal, depth, got" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="aovs must be distinct names out of albedo, normal, depth"):
-        manylights.render(cornell(16).load(), aovs=names.split(","))
+    assert command("--layers", names) == 2
+    assert "layers must be a list of distinct names out of albedo, normal, depth, got" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="layers must be a list of distinct names out of albedo, normal, depth"):
+        manylights.render(cornell(16).load(), layers=names.split(","))
 
 
 def test_layers_need_an_exr_file(tmp_path, capsys):
-    assert command("-o", tmp_path / "a.png", "--aovs", "depth") == 2
-    assert "--aovs needs an .exr file" in capsys.readouterr().err
+    assert command("-o", tmp_path / "a.png", "--layers", "depth") == 2
+    assert "--layers needs an .exr file" in capsys.readouterr().err
 
 
 def test_a_channel_of_the_integrator_is_no_layer():
     wrapper = mi.load_dict({"type": "aov", "aovs": "albedo:albedo", "image": {"type": "path"}})
-    with pytest.raises(ValueError, match=r"aovs must not name channels of the integrator, got albedo\.B, albedo\.G"):
-        manylights.render(cornell(16).load(), wrapper, spp=1, aovs=["albedo"])
+    with pytest.raises(ValueError, match=r"layers must not name channels of the integrator, got albedo\.B, albedo\.G"):
+        manylights.render(cornell(16).load(), wrapper, spp=1, layers=["albedo"])

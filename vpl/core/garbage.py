@@ -17,8 +17,10 @@ def garbage_kept():
 
     The collector runs in any thread, for example in the event loop of a notebook or of Dask.  Mitsuba renders without
     Python's global lock and records calls of all objects in Dr.Jit's registry: a scene that another thread collects at
-    this time ends the process or makes the render wait forever.  A scene collected during the recording of a frozen
-    function makes the recording fail, and a scene collected between two calls makes Dr.Jit record again.
+    this time ends the process or makes the render wait forever.  A collection that another thread has begun before the
+    block goes on, which matters only if one of its finalizers releases Python's lock.  A scene collected during the
+    recording of a frozen function makes the recording fail, and a scene collected between two calls makes Dr.Jit record
+    again.
     """
     with _LOCK:
         if not _STOPPED["blocks"]:

@@ -1,7 +1,7 @@
 """Triangles of Mitsuba's meshes.
 
-The only module that names parameters and buffers of meshes: Mitsuba 3.10 renames them (``vertex_positions`` becomes
-``positions``, ``faces_buffer`` becomes ``faces``).
+The only module of ``vpl`` and ``integrators`` that names parameters and buffers of meshes: Mitsuba 3.10 renames them
+(``vertex_positions`` becomes ``positions``, ``faces_buffer`` becomes ``faces``).
 """
 
 from __future__ import annotations

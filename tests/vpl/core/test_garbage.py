@@ -7,7 +7,7 @@ import mitsuba as mi
 import pytest
 
 import manylights
-from comparison import features
+from comparison import features, one_image
 from comparison.checkpoint import Checkpoint
 from comparison.scene_files import SceneFile
 from tests.support.distributed_renders import TINY
@@ -81,6 +81,41 @@ def test_the_collector_is_off_in_renders_of_our_integrators(name, scene, monkeyp
     monkeypatch.setattr(type(integrator), "_render", render)
     mi.render(scene, integrator=integrator, spp=1)
     assert seen and not any(seen) and gc.isenabled()
+
+
+def test_the_collector_is_off_while_a_scene_is_created(tmp_path, observed):
+    """A plugin in Python records the state of the collector when Mitsuba creates it."""
+
+    class Watcher(mi.SamplingIntegrator):
+        def __init__(self, props):
+            super().__init__(props)
+            observed.append(gc.isenabled())
+
+    mi.register_integrator("watcher", Watcher)
+    (tmp_path / "a.xml").write_text(
+        '<scene version="3.0.0"><sensor type="perspective"/><integrator type="watcher"/></scene>'
+    )
+    SceneFile(tmp_path / "a.xml").load()
+    assert observed and not any(observed)
+
+
+@pytest.mark.parametrize("way", ["render_forward", "render_backward"])
+def test_the_collector_is_off_while_derivatives_are_rendered(way, scene, monkeypatch):
+    seen, prb = [], type(mi.load_dict({"type": "prb"}))
+    monkeypatch.setattr(prb, way, lambda *_: seen.append(gc.isenabled()) or mi.TensorXf([0.0]))
+    arguments = (
+        (scene, mi.traverse(scene)) if way == "render_forward" else (scene, mi.traverse(scene), mi.TensorXf([0.0]))
+    )
+    getattr(mi.load_dict({"type": "manylights"}), way)(*arguments)
+    assert seen == [False] and gc.isenabled()
+
+
+def test_files_of_images_are_in_no_cycle(tmp_path):
+    with garbage_kept():
+        output = one_image.Output(tmp_path / "a.exr")
+        dead = weakref.ref(output)
+        del output
+        assert dead() is None
 
 
 def test_renders_leave_no_scene_to_the_collector(scene, tmp_path):
