@@ -96,6 +96,9 @@ def test_the_example_of_tls(port, tmp_path):
     ):
         with socket.socket() as one:
             wait_until(lambda: one.connect_ex(("127.0.0.1", port)) == 0)
+        # A render waits a minute for a worker, which takes longer to start on a busy machine
+        waiting = f"import distributed; distributed.Client({address!r}, timeout={PATIENCE}).wait_for_workers(1)"
+        subprocess.run([sys.executable, "-c", waiting], env=environment, check=True, timeout=PATIENCE)
         small = ["-D", "resx=16", "-D", "resy=16", "-i", "path"]
         command = [sys.executable, "-m", arguments[0], *arguments[1:], *small]
         subprocess.run(command, cwd=ROOT, env=environment, check=True, timeout=PATIENCE, capture_output=True)
