@@ -42,23 +42,20 @@ class Textures:
         node, _ = source(socket)
         if node is not None and node.bl_idname == "ShaderNodeTexImage":
             return self._bitmap(owner, node, lambda pixels: pixels[..., :3] ** power * scale)
-        if node is not None and node.bl_idname == "ShaderNodeRGB":
-            values = node.outputs[0].default_value
-        else:
-            self._refuse(owner, node, socket)
-            values = socket.default_value
-        return rgb([value**power for value in values[:3]], scale)
+        return rgb([value**power for value in self.constant(owner, socket)], scale)
 
     def constant(self, owner, socket):
-        """Linear colour (3) or number of a socket of the world, which has no texture coordinates of a mesh."""
-        node, _ = source(socket)
-        if node is not None and node.bl_idname == "ShaderNodeTexImage":
-            self._refuse(owner, node, socket)
-            value = socket.default_value
-            return float(value) if isinstance(value, float) else np.array(value[:3])
-        read = self.number if isinstance(socket.default_value, float) else self.colour
-        found = read(owner, socket)
-        return np.array(found["value"]) if isinstance(found, dict) else found
+        """Linear colour (3) or number of a socket, without textures: of a node with one value, or of the socket itself,
+        which replaces any other node."""
+        (node, _), value = source(socket), socket.default_value
+        is_number = isinstance(value, float)
+        if node is not None and node.bl_idname == ("ShaderNodeValue" if is_number else "ShaderNodeRGB"):
+            value = node.outputs[0].default_value
+        elif node is not None:
+            self.problems.add(
+                owner, f"node '{node.name}' at '{socket.name}' is not exported; the value of the socket replaces it"
+            )
+        return float(value) if is_number else np.array(value[:3])
 
     def number(self, owner, socket):
         """Number of a socket: a float, or the dictionary of a `bitmap` with one channel."""
@@ -67,16 +64,7 @@ class Textures:
             alpha = output.name == "Alpha"
             channel = (lambda pixels: pixels[..., 3:]) if alpha else (lambda pixels: pixels[..., :3] @ LUMINANCE)
             return self._bitmap(owner, node, lambda pixels: channel(pixels).reshape(*pixels.shape[:2], 1))
-        if node is not None and node.bl_idname == "ShaderNodeValue":
-            return float(node.outputs[0].default_value)
-        self._refuse(owner, node, socket)
-        return float(socket.default_value)
-
-    def _refuse(self, owner, node, socket):
-        if node is not None:
-            self.problems.add(
-                owner, f"node '{node.name}' at '{socket.name}' is not exported; the value of the socket replaces it"
-            )
+        return self.constant(owner, socket)
 
     def _bitmap(self, owner, node, convert):
         """Dictionary of the bitmap of an Image Texture node; `convert` computes its channels from (h, w, 4) pixels."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from .textures import rgb, source
+from .textures import MISSING, rgb, source
 
 # From Mitsuba's environment map, whose pole is +Y, to Blender's equirectangular images, whose pole is +Z
 AXES = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
@@ -115,7 +115,7 @@ def _environment(world, node, textures, strength):
         textures.problems.add(world, f"projection '{node.projection}' of node '{node.name}' is not exported")
     pixels = textures.pixels(world, node.image)
     if pixels is None:
-        return Sky(np.array((1.0, 0.0, 1.0)) * strength)
+        return Sky(np.array(MISSING) * strength)
     return Sky(np.full(3, strength), pixels[::-1, :, :3], _rotation(world, node.inputs["Vector"], textures))
 
 

@@ -300,13 +300,18 @@ def flat():
     add_light("POINT", shadow_soft_size=0)
 
 
+def long_render(seconds):
+    """Make a lit plane, whose many samples a time limit ends."""
+    scene = new_scene(bounces=2)
+    scene.manylights.samples, scene.manylights.time_limit, scene.cycles.samples = 1 << 24, seconds, SPP
+    add_plane()
+    add_light("POINT", shadow_soft_size=0)
+
+
 @case
 def ended_by_time():
     """A second limits a render of many samples."""
-    scene = new_scene(bounces=2)
-    scene.manylights.samples, scene.manylights.time_limit, scene.cycles.samples = 1 << 24, 1.0, SPP
-    add_plane()
-    add_light("POINT", shadow_soft_size=0)
+    long_render(1.0)
 
 
 @case
@@ -321,10 +326,7 @@ def ended_by_noise_and_denoised():
 @case
 def ended_by_escape():
     """The first pass is shown though Esc was pressed before."""
-    scene = new_scene(bounces=2)
-    scene.manylights.samples, scene.manylights.time_limit, scene.cycles.samples = 1 << 24, 30.0, SPP
-    add_plane()
-    add_light("POINT", shadow_soft_size=0)
+    long_render(30.0)
     Progress.is_stopped = lambda self: True  # cases.py restores it
 
 
