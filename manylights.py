@@ -55,12 +55,13 @@ from comparison import batch, command_line
 from comparison.cluster.connection import connected, workers
 from comparison.command_line import UsageError, parameter, positive
 from comparison.denoising import QUALITIES, for_denoising, import_oidn
-from comparison.features import FEATURES, channels_of
+from comparison.features import FEATURES
 from comparison.images import check_extension, write
 from comparison.one_image import INTERRUPTED, Failed, Image, LazyScene
 from comparison.render import Took, render
 from comparison.scene_files import SceneFile
 from comparison.threads import avoid_single_thread
+from vpl.split.contributions import LENGTHS
 
 avoid_single_thread()
 
@@ -69,13 +70,12 @@ DEFAULT, OWN = "manylights", "scene"  # the default of --integrator, and the val
 SAME_IMAGE = ("path", "prb", "volpath", "volpathmis")  # have the expectation of DEFAULT, without participating media
 
 
-def feature_names(text):
-    """Return the names of features in a comma-separated list, as a tuple; for `type` of argparse."""
+def layer_names(text):
+    """Return the distinct names of layers in a comma-separated list, as a tuple; for `type` of argparse."""
     names = tuple(name.strip() for name in text.split(","))
-    try:
-        channels_of(names)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+    if not set(names) <= {*FEATURES, *LENGTHS} or len(set(names)) < len(names):
+        known = ", ".join([*FEATURES, *LENGTHS])
+        raise argparse.ArgumentTypeError(f"must be a list of distinct names out of {known}, got '{text}'")
     return names
 
 
@@ -112,9 +112,13 @@ def parse(arguments):
     add("--denoise", action="store_true", help="denoise by Open Image Denoise (pip install 'manylights[denoise]')")
     add("--denoise-quality", choices=QUALITIES,
         help=f"with --denoise: network, from best to quickest (default: {QUALITIES[0]})")  # fmt: skip
-    add("--layers", type=feature_names, default=(), metavar="NAMES",
-        help=f"layers of EXR files, out of {', '.join(FEATURES)}, separated by commas: of the first surface that is "
-             "neither mirror nor glass, as the denoiser gets them")  # fmt: skip
+    add("--layers", type=layer_names, default=(), metavar="NAMES",
+        help=f"layers of EXR files, separated by commas: {', '.join(FEATURES)}, of the first surface that is neither "
+             f"mirror nor glass, as the denoiser gets them; {', '.join(LENGTHS)}, the light of paths with one, two, "
+             "and more edges (manylights only)")  # fmt: skip
+    add("--light-groups", metavar="GROUPS",
+        help="layers with the light of groups of emitters, by patterns of their ids or classes, such as "
+             "'lamps=lamp*,bulb; sky=env' (manylights only)")  # fmt: skip
     add("-s", "--seed", type=command_line.seed, default=0, metavar="N", help="seed (default: 0)")
     add("--pass-spp", type=positive(int), metavar="N",
         help="samples per pixel of a pass (default: for passes of two to ten seconds; with --workers, by the size of "
@@ -131,8 +135,15 @@ def parse(arguments):
     options = parser.parse_args(arguments)
     if options.denoise_quality and not options.denoise:
         parser.error("--denoise-quality needs --denoise")
-    if options.layers and options.output and options.output.suffix == ".png":
-        parser.error("--layers needs an .exr file: a PNG file has no layers")
+    for name in ("layers", "light_groups"):
+        if getattr(options, name) and options.output and options.output.suffix == ".png":
+            parser.error(f"--{name.replace('_', '-')} needs an .exr file: a PNG file has no layers")
+    # The integrator renders these layers, as parameters; the other layers are separate images
+    of_light = ",".join(name for name in options.layers if name in LENGTHS)
+    options.layers = tuple(name for name in options.layers if name in FEATURES)
+    options.param += [
+        (name, text) for name, text in (("layers", of_light), ("light_groups", options.light_groups)) if text
+    ]
     if options.output and not options.output.is_dir():
         try:
             check_extension(options.output)

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks import scenes
 from benchmarks.rivals import DEPTH, trimmed_variance
 from comparison.rendering import SharedStart
-from vpl.split import estimator, path_tracer
+from vpl.split import contributions, estimator, path_tracer
 
 # x1, x2: first and second surface with a BSDF that has a density.  NEE: next-event estimation.  BSDF: an emitter that a
 # BSDF sample meets, straight or by way of mirrors, glass and masks ("via")
@@ -47,7 +47,7 @@ def single_classes():
     """
     chosen = SimpleNamespace(wanted=_ALL, gathers=True, now=None, found=None)
     less_carried, lit, trace = path_tracer._less_carried, path_tracer._lit, estimator.trace_camera_rays
-    add, light = path_tracer.Contributions.add, estimator.Gatherer.light
+    add, light = contributions.Contributions.add, estimator.Gatherer.light
 
     def of_met(path, *others):
         chosen.found = class_of_met(path)
@@ -61,10 +61,10 @@ def single_classes():
         wanted = (chosen.now == _ALL) | (chosen.found == chosen.now)
         add(self, dr.select(wanted, contribution, 0), *others)
 
-    def trace_image(*arguments):
+    def trace_image(*arguments, **layers):
         chosen.now = dr.opaque(mi.UInt32, chosen.wanted)
         try:
-            return trace(*arguments)
+            return trace(*arguments, **layers)
         finally:
             chosen.now = dr.opaque(mi.UInt32, _ALL)
 
@@ -77,7 +77,7 @@ def single_classes():
         for place, name, function in (
             (path_tracer, "_less_carried", of_met),
             (path_tracer, "_lit", of_nee),
-            (path_tracer.Contributions, "add", add_wanted),
+            (contributions.Contributions, "add", add_wanted),
             (estimator, "trace_camera_rays", trace_image),
             (estimator.Gatherer, "light", gathered),
         ):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -205,6 +206,43 @@ class Words(_Worded):
 
     def _stated(self, default):
         return f"``{default}``" if default else "none"
+
+
+@dataclass(frozen=True)
+class Groups(Knob):
+    """Named lists of words, such as ``"lamps=lamp*,bulb; sky=env"``, stored as a dict of tuples by name.
+
+    ``reserved``: names that are not allowed.
+    """
+
+    reserved: tuple[str, ...] = field(default=(), kw_only=True)
+
+    type = "string"
+
+    @property
+    def allowed(self):
+        return (
+            'groups such as "lamps=lamp*,bulb; sky=env" with distinct names of letters, digits, "_" and "-", except '
+            f"{', '.join(self.reserved)}"
+        )
+
+    def parse(self, value):
+        if not isinstance(value, str):
+            return None
+        found: dict[str, tuple[str, ...]] = {}
+        for entry in value.split(";") if value.strip() else ():
+            name, _, words = (part.strip() for part in entry.partition("="))
+            patterns = tuple(word.strip() for word in words.split(","))
+            if not re.fullmatch(r"[\w-]+", name) or name in (*found, *self.reserved) or not all(patterns):
+                return None
+            found[name] = patterns
+        return found
+
+    def show(self, value):
+        return "; ".join(f"{name}={','.join(patterns)}" for name, patterns in value.items())
+
+    def _stated(self, default):
+        return "none"
 
 
 # Path settings of every integrator, with the defaults of Mitsuba's ``path``

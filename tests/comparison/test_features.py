@@ -180,10 +180,33 @@ def test_layers_of_an_image_by_workers(tmp_path):
     np.testing.assert_allclose(here[0], there[0], rtol=1e-4, atol=1e-6)
 
 
+def test_files_have_layers_of_light(tmp_path):
+    size = ("-i", "manylights", "--spp", 4, "--denoise")
+    layers = ("--layers", "direct,depth,emission,indirect", "--light-groups", "lamp=light*")
+    assert command("-o", tmp_path / "a.exr", *size, *layers) == 0
+    for name in ("a.exr", "a.denoised.exr"):
+        image, channels, metadata = images.read_exr(tmp_path / name)
+        planes = {
+            layer: image[..., [channels.index(f"{layer}.{channel}") for channel in "RGB"]]
+            for layer in ("emission", "direct", "indirect", "lamp", "other")
+        }
+        assert "depth.Z" in channels and "lamp=light*" in metadata["parameters"]
+        whole = planes["emission"] + planes["direct"] + planes["indirect"]
+        np.testing.assert_allclose(planes["lamp"], whole, rtol=1e-4, atol=1e-5 * whole.max())
+        assert planes["other"].max() == 0 and planes["indirect"].max() > 0
+
+
+def test_only_manylights_has_layers_of_light(tmp_path, capsys):
+    assert command("-o", tmp_path / "a.exr", "--spp", 1, "--layers", "direct") == 1
+    assert 'unreferenced property in integrator plugin of type "path": - string "layers"' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("names", ["shape", "albedo,albedo", "", "albedo,"])
 def test_other_layers_are_refused(names, capsys):
     assert command("--layers", names) == 2
-    assert "layers must be a list of distinct names out of albedo, normal, depth, got" in capsys.readouterr().err
+    assert (
+        "--layers: must be a list of distinct names out of albedo, normal, depth, emission" in capsys.readouterr().err
+    )
     with pytest.raises(ValueError, match="layers must be a list of distinct names out of albedo, normal, depth"):
         manylights.render(cornell(16).load(), layers=names.split(","))
 

@@ -7,6 +7,7 @@ projectors and textured spot emitters keep their objects, which kernels call one
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
@@ -30,14 +31,15 @@ class AreaEmitters:
     """Area emitters as n rows.
 
     ``shape_index`` (n,) uint32: registry index of the shape; ``radiance`` (n, 3) float32: RGB, of textured emitters the
-    mean; ``area`` (n,) float32, world units squared; ``textured``: (row, emitter object) of textured emitters;
-    ``shapes``: the n shape objects, or None if kernels may call shape pointers, see :meth:`on_shape`; ``spheres``: None
-    if no shape is a sphere.
+    mean; ``area`` (n,) float32, world units squared; ``group`` (n,) uint32, see :func:`read_emitters`; ``textured``:
+    (row, emitter object) of textured emitters; ``shapes``: the n shape objects, or None if kernels may call shape
+    pointers, see :meth:`on_shape`; ``spheres``: None if no shape is a sphere.
     """
 
     shape_index: np.ndarray
     radiance: np.ndarray
     area: np.ndarray
+    group: np.ndarray
     textured: list[tuple[int, mi.Emitter]] = field(default_factory=list)
     shapes: list[mi.Shape] | None = None
     spheres: SphereRows | None = None
@@ -169,9 +171,9 @@ def _can_be_sampled(shape) -> bool:
     return shape.is_mesh() or shape.class_name() in SAMPLED_SHAPES
 
 
-def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
+def _read_areas(scene, group_of: Callable) -> tuple[AreaEmitters, int, list]:
     """(Area emitters, number of rows with invalid values, shape-bound emitters of further classes)."""
-    indices, radiances, textured, spheres, unusual = [], [], [], [], []
+    indices, radiances, groups, textured, spheres, unusual = [], [], [], [], [], []
     emitting = [(index, shape) for index, shape in registered_shapes(scene) if shape.is_emitter()]
     # Mitsuba loads shapes in parallel, in an order that changes from run to run; the same seed must give the same image
     emitting.sort(key=lambda row: (row[1].id(), *map(float, (*row[1].bbox().min, *row[1].bbox().max))))
@@ -187,6 +189,7 @@ def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
             radiance = _textured_radiance(emitter, shape)
         indices.append(index)
         radiances.append(radiance)
+        groups.append(group_of(emitter))
         spheres.append(shape if shape.class_name() == "Sphere" else None)
     radiance = np.array(radiances, np.float32).reshape(-1, 3)
     bad = ~usable(radiance).all(1)
@@ -195,7 +198,8 @@ def _read_areas(scene) -> tuple[AreaEmitters, int, list]:
     by_index = dict(emitting)
     area, shapes = _surface_areas(scene, shape_index, [by_index[index] for index in indices])
     rows = SphereRows(spheres) if any(spheres) else None
-    return AreaEmitters(shape_index, radiance, area, textured, shapes, rows), int(bad.sum()), unusual
+    group = np.array(groups, np.uint32)
+    return AreaEmitters(shape_index, radiance, area, group, textured, shapes, rows), int(bad.sum()), unusual
 
 
 def _require_supported(shape, constant: bool) -> None:
@@ -270,15 +274,22 @@ def _lights_nothing(emitter) -> bool:
     return emitter.class_name() == "DirectionalArea" or (is_delta and emitter.sampling_weight() == 0)
 
 
-def read_emitters(scene) -> Emitters:
+def _in_one_group(emitter) -> int:
+    return 0
+
+
+def read_emitters(scene, group_of: Callable[[mi.Emitter], int] | None = None) -> Emitters:
     """Read the emitters of ``scene`` that contribute in Mitsuba's ``path``.
+
+    ``group_of``: number of the group of an emitter; None: every emitter is in group 0.
 
     Emitters with negative or non-finite values are dropped, counted and logged.  Raises ValueError for environment maps
     with invalid texels and for emitters on shapes that Mitsuba cannot sample.
     """
     points, spots, suns, others = [], [], [], []
+    group_of = group_of or _in_one_group
     environment, dropped = _read_environment(scene)
-    area, bad_areas, others_on_shapes = _read_areas(scene)
+    area, bad_areas, others_on_shapes = _read_areas(scene, group_of)
     dropped += bad_areas
     for emitter in scene.emitters():
         name = emitter.class_name()
@@ -287,18 +298,20 @@ def read_emitters(scene) -> Emitters:
         parameters = parameters_of(emitter)
         intensity = _constant_rgb(parameters, "irradiance" if name == "DirectionalEmitter" else "intensity")
         if name == "PointLight" and intensity is not None:
-            points.append([*numbers(parameters["position"]), *intensity])
+            points.append([*numbers(parameters["position"]), *intensity, group_of(emitter)])
         elif name == "SpotLight" and intensity is not None and "texture.value" in parameters:
             cone = np.deg2rad([*numbers(parameters["cutoff_angle"]), *numbers(parameters["beam_width"])])
-            spots.append([*np.concatenate(_frame_of(parameters["to_world"])), *intensity, *cone])
+            spots.append([*np.concatenate(_frame_of(parameters["to_world"])), *intensity, *cone, group_of(emitter)])
         elif name == "DirectionalEmitter" and intensity is not None:
-            suns.append([*_frame_of(parameters["to_world"])[1], *intensity])
+            suns.append([*_frame_of(parameters["to_world"])[1], *intensity, group_of(emitter)])
         elif not any(emitter is known for _, known in others_on_shapes):
             others.append((name, emitter))
-    points, spots, suns = (_sorted_rows(rows, n) for rows, n in ((points, 6), (spots, 11), (suns, 6)))
-    omni = VirtualLights.of("point", points[:, :3], np.tile([0, 0, 1], (len(points), 1)), points[:, 3:])
-    spot = VirtualLights.of("spot", spots[:, :3], spots[:, 3:6], spots[:, 6:9], 0, spots[:, 9:])
-    sun = VirtualLights.of("directional", None, suns[:, :3], suns[:, 3:])
+    points, spots, suns = (_sorted_rows(rows, n) for rows, n in ((points, 7), (spots, 12), (suns, 7)))
+    omni = VirtualLights.of("point", points[:, :3], np.tile([0, 0, 1], (len(points), 1)), points[:, 3:6])
+    spot = VirtualLights.of("spot", spots[:, :3], spots[:, 3:6], spots[:, 6:9], 0, spots[:, 9:11])
+    sun = VirtualLights.of("directional", None, suns[:, :3], suns[:, 3:6])
+    for lights, rows in ((omni, points), (spot, spots), (sun, suns)):
+        lights.group = rows[:, -1].astype(np.uint32)
     kept = []
     for lights in (omni, spot, sun):
         lights, bad = lights.without_bad()

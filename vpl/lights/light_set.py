@@ -273,7 +273,9 @@ def area_lights(emitters: Emitters, count: int, seed: int, weight: np.ndarray | 
     intensity /= dr.opaque(mi.Float, float(count))
     # One kernel, because it contains the code of every kind of shape
     dr.eval(ps.p, ps.n, intensity)
-    return VirtualLights.of("oriented", download(ps.p), download(ps.n), download(intensity))
+    lights = VirtualLights.of("oriented", download(ps.p), download(ps.n), download(intensity))
+    lights.group = area.group[download(row)]
+    return lights
 
 
 def environment_lights(scene, emitters: Emitters, count: int, seed: int) -> VirtualLights:

@@ -19,7 +19,7 @@ KINDS = ("point", "spot", "oriented", "directional", "environment", "surface")
 AT_INFINITY = ("directional", "environment")
 
 _RECORD = 16
-_COLUMNS = ("position", "direction", "intensity", "depth", "cone", "facing", "uncertainty")
+_COLUMNS = ("position", "direction", "intensity", "depth", "cone", "group", "facing", "uncertainty")
 
 
 @dataclass
@@ -32,6 +32,7 @@ class VirtualLights:
     (radiance times area), irradiance of lights at infinity;
     ``depth`` (n,) uint32: edges of the light path up to the light, 0 for lights representing an emitter;
     ``cone`` (n, 2) float32: cut-off angle and beam angle of spots in radians, (pi, pi) elsewhere;
+    ``group`` (n,) uint32: of the emitter of the light, see :class:`vpl.lights.emitter_groups.EmitterGroups`;
     ``facing`` (n, 3) float32: normal of the lit half-space of lights on surfaces, for example a shading normal (None:
     only ``direction`` limits the light);
     ``uncertainty`` (n,) float32: of the position of lights on surfaces along ``direction``, world units (None: 0).
@@ -43,6 +44,7 @@ class VirtualLights:
     intensity: np.ndarray
     depth: np.ndarray
     cone: np.ndarray
+    group: np.ndarray
     facing: np.ndarray | None = None
     uncertainty: np.ndarray | None = None
 
@@ -62,6 +64,7 @@ class VirtualLights:
             intensity,
             np.broadcast_to(np.asarray(depth, np.uint32), (count,)).copy(),
             np.full((count, 2), np.pi, np.float32) if cone is None else np.asarray(cone, np.float32).reshape(-1, 2),
+            np.zeros(count, np.uint32),
             None if facing is None else np.asarray(facing, np.float32).reshape(-1, 3),
         )
 
@@ -99,6 +102,7 @@ class Light:
     intensity: mi.Color3f
     depth: mi.UInt32
     cone: mi.Vector2f
+    group: mi.UInt32
     facing: mi.Vector3f | None = None
     uncertainty: mi.Float | None = None
 
@@ -115,6 +119,7 @@ class DeviceLights:
         if lights.uncertainty is not None:
             records[:, 7] = lights.uncertainty
         records[:, 8:11] = lights.intensity
+        records[:, 11] = lights.group.view(np.float32)
         records[:, 12:14] = lights.cone
         if lights.facing is not None:
             records[:, 12:15] = lights.facing
@@ -135,7 +140,8 @@ class DeviceLights:
             cone, facing = mi.Vector2f(fourth.x, fourth.y), fourth.xyz if self._facing else None
         depth = dr.reinterpret_array(mi.UInt32, first.w)
         color = mi.Color3f(third.x, third.y, third.z)
-        return Light(first.xyz, second.xyz, color, depth, cone, facing, second.w)
+        group = dr.reinterpret_array(mi.UInt32, third.w)
+        return Light(first.xyz, second.xyz, color, depth, cone, group, facing, second.w)
 
 
 def spot_falloff(cosine, cone):

@@ -17,6 +17,7 @@ The terms of the estimator:
 
 - ``view``: camera rays, settings of their paths, streams of random numbers
 - ``roulette``: Russian roulette and the choice of its probabilities
+- ``contributions``: sums of the contributions of paths, for the image and for its layers
 - ``gather_vertices``: vertices where virtual lights are added, the choice of lit vertices, and both normalisations
 - ``pixel_clusters``: a light cut for the vertices of a pixel with similar normals
 - ``lattice``: stratified random numbers for the samples of a pixel

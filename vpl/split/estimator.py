@@ -23,6 +23,7 @@ from ..core.sampling import derived_seed
 from ..core.stages import Stage
 from ..points.camera_paths import SceneTraits
 from ..transport.evaluation import Transport
+from .contributions import LayerSums
 from .emitters.base import EmitterSampler
 from .emitters.learned import learning_rays
 from .gather_vertices import LitVertices
@@ -44,10 +45,12 @@ _OPAQUE = SceneTraits(False, False, True, False, False, (), (), None)
 
 @dataclass(frozen=True)
 class Estimate:
-    """``radiance`` of each camera ray; ``valid``: whether the ray is opaque in the film's alpha; ``statistics``."""
+    """``radiance`` of each camera ray; ``valid``: whether the ray is opaque in the film's alpha; ``layers``: radiance
+    by name of the layer; ``statistics``."""
 
     radiance: mi.UnpolarizedSpectrum
     valid: mi.Bool
+    layers: dict[str, mi.UnpolarizedSpectrum]
     statistics: dict
 
 
@@ -87,9 +90,9 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
     view, roulette = with_roulette(view, decision)
     mi.Log(mi.LogLevel.Info, f"manylights: {decision.plan}")
     lights, of_lights = make_lights(view, decision, kept, clock)
-    radiance, valid, of_image = render_image(view, lights, decision, stopped, clock)
+    radiance, valid, layers, of_image = render_image(view, lights, decision, stopped, clock)
     statistics = {"plan": decision.plan.reason} | roulette | of_lights | of_image
-    return Estimate(radiance, valid, statistics | {"seconds": clock.seconds})
+    return Estimate(radiance, valid, layers, statistics | {"seconds": clock.seconds})
 
 
 # ---------------------- Start ----------------------
@@ -240,10 +243,11 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
 
 
 def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Callable[[], bool], clock: Clock):
-    """(Radiance, valid, statistics) of the camera rays, traced in parts of whole pixels of about the same size."""
+    """(Radiance, valid, layers, statistics) of the camera rays, traced in parts of whole pixels of about equal size."""
     settings = view.settings(lights)
     gatherer = Gatherer.of(view, lights, decision) if lights.all else None
     radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
+    layers = view.layers.sums(view.count)
     parts = max(round(view.count / np.clip(view.count / 2, *_WAVEFRONT)), 1)
     most = -(-view.pixels // parts) * view.samples
     statistics: dict[str, int] = {}
@@ -252,12 +256,13 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
             break
         lane = dr.arange(mi.UInt32, min(most, view.count - first)) + dr.opaque(mi.UInt32, first)
         dr.eval(lane)
-        traced, points = _traced_part(view, lane, first, settings, lights, decision.plan, clock)
+        sums = layers.part(first) if layers else None
+        traced, points = _traced_part(view, lane, first, settings, lights, decision.plan, sums, clock)
         part, opaque = traced.radiance, traced.valid
         # Frees the memory of unlit gather vertices
         del traced
         if points is not None:
-            light, counts = gatherer.light(points, part, first, clock)
+            light, counts = gatherer.light(points, part, first, sums, clock)
             part += light
             for name, number in counts.items():
                 statistics[name] = statistics.get(name, 0) + number
@@ -272,15 +277,18 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
     if dropped:
         mi.Log(mi.LogLevel.Warn, f"{dropped} sample(s) with values that are not finite were dropped.")
     shown = view.rules.max_depth > 0
-    return dr.select(finite & shown, radiance, 0), valid & shown, statistics | {"dropped": dropped}
+    kept = finite & shown
+    found = {name: layers.of(name, kept) for name in view.layers.names}
+    return dr.select(kept, radiance, 0), valid & shown, found, statistics | {"dropped": dropped}
 
 
 def _traced_part(
-    view: View, lane: mi.UInt32, first: int, settings: PathSettings, lights: ViewLights, plan: Plan, clock: Clock
-) -> tuple[Traced, LitVertices | None]:
+    view: View, lane: mi.UInt32, first: int, settings: PathSettings, lights: ViewLights, plan: Plan,
+    layers: LayerSums | None, clock: Clock,
+) -> tuple[Traced, LitVertices | None]:  # fmt: skip
     """(Traced part of the camera rays ``lane``, from the ray ``first`` on; gather vertices that are lit)."""
     clock.begin(Stage.TRACED)
-    traced = trace_camera_rays(view, lane, settings, Stream.IMAGE, first)
+    traced = trace_camera_rays(view, lane, settings, Stream.IMAGE, first, layers=layers)
     if not lights.all:
         return traced, None
     clock.begin(Stage.CLUSTERS)
@@ -311,10 +319,13 @@ class Gatherer:
         darkest = view.model.dark_pixel * max(float(np.mean(decision.pilot.radiance)), 0.0)
         return cls(view, decision.plan, transports, decision.expected_light(lights), darkest)
 
-    def light(self, points: LitVertices, found, first: int, clock: Clock) -> tuple[mi.UnpolarizedSpectrum, dict]:
+    def light(
+        self, points: LitVertices, found, first: int, layers: LayerSums | None, clock: Clock
+    ) -> tuple[mi.UnpolarizedSpectrum, dict]:
         """(Light at the ``points``, per camera ray; counters) for a part of the image, from the ray ``first`` on.
 
         The brightness of a pixel is the radiance ``found`` by paths plus the expected light of virtual lights.
+        ``layers``: sums by layer of this part.
         """
         view, samples, count = self.view, self.view.samples, dr.width(found)
         lit = dr.zeros(mi.UnpolarizedSpectrum, count)
@@ -330,7 +341,7 @@ class Gatherer:
         shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, first)
         for number, transport in enumerate(self.transports):
             stream = derived_seed(seed, 1, number)
-            shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit)
+            shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit, layers)
         clock.stop()
         counts = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}
         return lit, counts | {"later": points.alone}

@@ -31,6 +31,7 @@ from ..core.sampling import derived_seed, independent_sampler
 from ..direct.emitter_sampling import power_heuristic
 from ..transport.carried_share import carried_share
 from ..transport.minorant import agrees, is_diffuse, minorant_of, side_of
+from .contributions import Contributions, LayerSums
 from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
 from .gather_vertices import Gathered, GatherVertices, SecondVertices
 from .lattice import Lattice
@@ -103,44 +104,18 @@ class Hit:
 
 
 @dataclass
-class Contributions:
-    """Contributions found by paths.
-
-    ``radiance``: sum; ``drawn``: a contribution, drawn in proportion to absolute value; ``length``: edges of the path
-    of ``drawn``; ``level``: sum of absolute values.
-    """
-
-    radiance: mi.UnpolarizedSpectrum
-    drawn: mi.UnpolarizedSpectrum
-    length: mi.UInt32
-    level: mi.Float
-
-    @classmethod
-    def none(cls, count: int) -> Contributions:
-        """No contribution yet."""
-        radiance, drawn = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UnpolarizedSpectrum, count)
-        return cls(radiance, drawn, mi.UInt32(0), mi.Float(0))
-
-    def add(self, contribution, length, sample) -> None:
-        """Add the contribution of paths with ``length`` edges; ``sample``: a uniform number."""
-        self.radiance += contribution
-        level = dr.sum(dr.abs(contribution))
-        taken = sample * (self.level + level) < level
-        self.drawn, self.length = dr.select(taken, contribution, self.drawn), dr.select(taken, length, self.length)
-        self.level += level
-
-
-@dataclass
 class Traced:
     """Result of :func:`trace_paths`, one record per lane, evaluated.
 
-    ``radiance``; ``drawn``: a contribution over its probability, from a path of ``length`` edges; ``valid``: whether a
-    surface counts in the film's alpha; ``edges`` without the last; ``gathered``: gather vertices.
+    ``radiance``; ``drawn``: a contribution over its probability, from a path of ``length`` edges to an emitter of
+    ``group``; ``valid``: whether a surface counts in the film's alpha; ``edges`` without the last; ``gathered``: gather
+    vertices.
     """
 
     radiance: mi.UnpolarizedSpectrum
     drawn: mi.UnpolarizedSpectrum
     length: mi.UInt32
+    group: mi.UInt32
     valid: mi.Bool
     edges: mi.UInt32
     gathered: Gathered
@@ -152,15 +127,17 @@ class Traced:
 @recorded_once
 @dr.syntax
 def trace_paths(
-    scene, emitters: EmitterSampler, first: FirstEdge, lattice: Lattice, sampler, settings: PathSettings
-) -> Traced:
+    scene, emitters: EmitterSampler, first: FirstEdge, lattice: Lattice, sampler, settings: PathSettings,
+    layers: LayerSums | None = None,
+) -> Traced:  # fmt: skip
     """Trace paths to their ends.
 
     ``lattice``: numbers for the choice of emitter, point, lobe and direction at scattering vertices; ``sampler``: the
-    remaining random numbers.
+    remaining random numbers; ``layers``: sums by layer, for camera rays.
     """
     context, count = mi.BSDFContext(), dr.width(first.throughput)
-    path, found, gathered = Path.of(first), Contributions.none(count), Gathered.none(count)
+    path, found, gathered = Path.of(first), Contributions.none(count, layers), Gathered.none(count)
+    lane = dr.arange(mi.UInt32, count)
 
     while dr.hint(path.active, exclude=[first, lattice, settings, emitters, context]):
         # ---------------------- Hit ----------------------
@@ -169,7 +146,8 @@ def trace_paths(
         # ---------------------- Emission, by BSDF sampling ----------------------
         met = emitters.met(path.vertex, path.cell, path.ray, hit.si, ~path.delta, path.active & ~hit.hidden)
         mis = power_heuristic(path.density, met.density)
-        found.add(_less_carried(path, met, settings) * met.radiance * mis, path.depth + 1, sampler.next_1d())
+        emission = _less_carried(path, met, settings) * met.radiance * mis
+        found.add(emission, path.depth + 1, met.group, sampler.next_1d(), lane)
 
         # ---------------------- Subtraction: w β F1 F2 of x2 ----------------------
         connects = _carry(path, hit, settings, found.radiance, gathered)
@@ -195,7 +173,7 @@ def trace_paths(
         value, density, turned, bsdf_weight = hit.bsdf.eval_pdf_sample(context, hit.si, toward, lobe, turn, scatters)
         lit = _lit(path, hit, sample, toward.z, value, density, weight, settings, sampler)
         arriving = sample.arriving(scene, dr.max(dr.abs(lit)) > 0)
-        found.add(lit * arriving, path.depth + 2, sampler.next_1d())
+        found.add(lit * arriving, path.depth + 2, sample.group, sampler.next_1d(), lane)
 
         # ---------------------- BSDF sampling ----------------------
         survival = _turn(path, hit, turned, bsdf_weight, gathers, weight)
@@ -206,21 +184,22 @@ def trace_paths(
             _pass_hidden(path, hit, first)
 
     gathered.finish()
-    drawn = found.drawn * dr.select(found.level > 0, found.level / dr.sum(dr.abs(found.drawn)), 0)
-    traced = Traced(found.radiance, drawn, found.length, path.valid, path.depth, gathered)
+    traced = Traced(found.radiance, found.one, found.length, found.group, path.valid, path.depth, gathered)
     dr.eval(traced)
     return traced
 
 
-def trace_camera_rays(view: View, lane: mi.UInt32, settings: PathSettings, *stream: int) -> Traced:
-    """Trace the camera rays ``lane`` of a view; ``stream``: of random numbers."""
+def trace_camera_rays(
+    view: View, lane: mi.UInt32, settings: PathSettings, *stream: int, layers: LayerSums | None = None
+) -> Traced:
+    """Trace the camera rays ``lane`` of a view; ``stream``: of random numbers; ``layers``: sums by layer."""
     seed, ray = derived_seed(view.seed, *stream), view.ray
     part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
     importance = dr.gather(mi.Float, view.importance, lane // dr.opaque(mi.UInt32, view.samples))
     edge = FirstEdge.of_camera(part, importance, dr.gather(mi.Bool, view.active, lane))
     lattice = Lattice.of_lanes(lane, view.samples, derived_seed(seed, 0))
     sampler = independent_sampler(derived_seed(seed, 1), dr.width(lane))
-    return trace_paths(view.scene, view.emitters, edge, lattice, sampler, settings)
+    return trace_paths(view.scene, view.emitters, edge, lattice, sampler, settings, layers)
 
 
 def _less_carried(path: Path, met: MetEmitter, settings: PathSettings):

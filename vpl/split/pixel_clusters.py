@@ -20,6 +20,7 @@ from ..cuts.light_cuts import collect_cuts, limited_cuts, upload_thresholds
 from ..points.bsdf_proxies import MaterialProxy
 from ..points.surfaces import LambertianSurface, Receiver
 from ..transport.evaluation import Transport, evaluate_pairs
+from .contributions import LayerSums
 from .gather_vertices import LitVertices
 from .spatial_cells import FACINGS, facing
 
@@ -123,10 +124,15 @@ class PixelClusters:
         )
 
 
-def light_clusters(transport: Transport, clusters: PixelClusters, allowed: np.ndarray, max_cut: int, seed: int, result):
+def light_clusters(
+    transport: Transport, clusters: PixelClusters, allowed: np.ndarray, max_cut: int, seed: int, result,
+    layers: LayerSums | None,
+) -> int:  # fmt: skip
     """Add the light of virtual lights at the clusters to ``result``, per camera ray; returns the number of shadow rays.
 
-    ``allowed`` (clusters,): largest bound of a pair, as a contribution to the sum over the samples of the pixel.
+    ``allowed`` (clusters,): largest bound of a pair, as a contribution to the sum over the samples of the pixel;
+    ``layers``: sums by layer.  A light of a node is drawn in proportion to intensity, so the drawn lights of a group
+    have the expectation of the lights of the group.
     """
     with np.errstate(over="ignore"):  # a cluster without weight may have any error
         allowed = allowed / np.maximum(clusters.weight, np.finfo(np.float64).tiny)
@@ -139,7 +145,10 @@ def light_clusters(transport: Transport, clusters: PixelClusters, allowed: np.nd
         light, scale = chunk.group.draw(chunk.nodes, precise_sample(sampler))
         value, traced = evaluate_pairs(transport, chunk.group, surface, light, scale)
         value = mi.UnpolarizedSpectrum(value) * weight * dr.opaque(mi.Float, chunk.group.sign)
-        add_at(result, dr.select(chunk.written & dr.all(dr.isfinite(value)), value, 0), ray)
+        value = dr.select(chunk.written & dr.all(dr.isfinite(value)), value, 0)
+        add_at(result, value, ray)
+        if layers is not None:
+            layers.add(value, ray, surface.depth + light.depth + 1, light.group)
         dr.eval(result, traced)
         rays += int(dr.count(traced)[0])
     return rays

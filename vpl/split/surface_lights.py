@@ -127,13 +127,13 @@ def _lights_at(scene, emitters: EmitterSampler, hits: LineHits, settings: PathSe
     places, minorant, hit = _places_with_minorants(scene, emitters, hits.ray, settings, derived_seed(seed, 3))
     if places.count == 0:
         return VirtualLights.of("surface", [], [], [])
-    irradiance, length = _irradiance(scene, emitters, places, settings, seed)
-    columns = (places.normal, spectrum_to_rgb(minorant * irradiance), length)
+    irradiance, length, group = _irradiance(scene, emitters, places, settings, seed)
+    columns = (places.normal, spectrum_to_rgb(minorant * irradiance), length, group)
     dr.eval(columns)
     row = download(hit)
-    position, columns = hits.position[row], (download(column) for column in columns)
+    position, *columns, group = hits.position[row], *(download(column) for column in columns)
     lights = VirtualLights.of("surface", position, *columns, facing=download(places.facing))
-    lights.uncertainty = hits.uncertainty[row]
+    lights.uncertainty, lights.group = hits.uncertainty[row], group
     return lights.select((lights.intensity != 0).any(1))
 
 
@@ -161,7 +161,7 @@ def _places_with_minorants(scene, emitters, rays, settings: PathSettings, seed: 
 
 
 def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: int):
-    """Irradiance of each place by a single path: (unpolarized spectrum, edges of the path)."""
+    """Irradiance of each place by a single path: (unpolarized spectrum, edges of the path, group of the emitter)."""
     count = places.count
     cell = emitters.cell(places.position, places.facing) + dr.opaque(mi.UInt32, 0, count)
     sampler = independent_sampler(derived_seed(seed, 0), count)
@@ -172,7 +172,7 @@ def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: i
     dr.eval(cell, ray, density, draw)
     # Many pixels see a light: with few of many emitters, its irradiance would vary visibly
     samples = _EMITTER_SAMPLES if emitters.lights is not None else 1
-    nearest, _ = irradiance_from_emitters(scene, emitters, places, cell, samples, derived_seed(seed, 2))
+    nearest, _, near_group = irradiance_from_emitters(scene, emitters, places, cell, samples, derived_seed(seed, 2))
     # The throughput starts with pi, the weight of a direction, which lets paths go on longer: with 1, lights would cost
     # 7% less and have 12% more variance (kitchen)
     edge = FirstEdge.of(places.position, ray, ones(count) * dr.pi, density, False, State.PAST, cell, 1.0, True)
@@ -184,7 +184,8 @@ def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: i
     is_nearest = draw * (level + more) < level
     one = dr.select(is_nearest, nearest, found.drawn)
     irradiance = dr.select(level + more > 0, one * (level + more) / dr.sum(dr.abs(one)), 0)
-    return irradiance, dr.select(is_nearest, mi.UInt32(1), found.length)
+    group = dr.select(is_nearest, near_group, found.group) + dr.opaque(mi.UInt32, 0, count)
+    return irradiance, dr.select(is_nearest, mi.UInt32(1), found.length), group
 
 
 class KeptLights:

@@ -12,6 +12,7 @@ import numpy as np
 from ..core.arrays import ones
 from ..lights.light_set import LightGroup, LightSet
 from ..lights.perturbed import Perturbed
+from .contributions import Layers
 from .cost_model import CostModel
 from .emitters.base import EmitterSampler
 from .roulette import OutgoingRadiance
@@ -159,7 +160,7 @@ class View:
     ``active``: of the camera, evaluated, the ``samples`` of a pixel side by side; ``width`` of the image in pixels;
     ``seed``; ``importance`` of radiance in each pixel and ``outgoing`` radiance of surfaces: for Russian roulette;
     ``learning_count``: number of camera rays, for the sizes of the pilot and of the emitter sampler's learning;
-    ``model``: constants of the decisions.
+    ``model``: constants of the decisions; ``layers`` of the image.
     """
 
     scene: mi.Scene
@@ -175,6 +176,7 @@ class View:
     outgoing: OutgoingRadiance
     learning_count: int
     model: CostModel
+    layers: Layers
 
     @property
     def count(self) -> int:

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from ...lights.emitter_groups import EmitterGroups
 from ...lights.emitters import read_emitters
 from .base import EmitterSampler, UniformEmitters
 from .learned import LearnedEmitters
@@ -16,25 +17,26 @@ from .tree import TreeEmitters
 _FEWEST_IN_TREE = 64
 
 
-def emitter_sampler(scene, rays: int) -> EmitterSampler:
-    """The sampler that suits a scene, with about ``rays`` rays to learn by.
+def emitter_sampler(scene, rays: int, groups: EmitterGroups | None = None) -> EmitterSampler:
+    """The sampler that suits a scene, with about ``rays`` rays to learn by; ``groups`` of its emitters, or None.
 
     :class:`TreeEmitters` for 64 emitters or more, if arrays can hold every emitter; :class:`UniformEmitters` for a
     single emitter with a position; :class:`LearnedEmitters` otherwise.
     """
     count = len(scene.emitters())
     if count > 1 or scene.environment() is not None:
-        return (_tree(scene, rays) if count >= _FEWEST_IN_TREE else None) or LearnedEmitters(scene)
-    return UniformEmitters(scene)
+        tree = _tree(scene, rays, groups) if count >= _FEWEST_IN_TREE else None
+        return tree or LearnedEmitters(scene, groups)
+    return UniformEmitters(scene, groups)
 
 
-def _tree(scene, rays: int) -> TreeEmitters | None:
+def _tree(scene, rays: int, groups: EmitterGroups | None) -> TreeEmitters | None:
     """The tree over the emitters; None if a tree cannot hold the emitters."""
     try:
-        emitters = read_emitters(scene)
+        emitters = read_emitters(scene, groups.number if groups else None)
     except ValueError:
         # Only Mitsuba can sample a point on one of the emitters
         return None
     if emitters.others or emitters.area.textured or emitters.dropped or not TreeEmitters.located(emitters):
         return None
-    return TreeEmitters(scene, emitters, rays)
+    return TreeEmitters(scene, emitters, rays, groups)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import drjit as dr
@@ -13,6 +13,8 @@ from ...core.arrays import channel_mean, finite_or_zero
 from ...core.loops import recorded_once
 from ...core.sampling import independent_sampler
 from ...direct.emitter_sampling import power_heuristic
+from ...lights.emitter_groups import EmitterGroups
+from ..contributions import Contributions
 from ..emitter_lights import EmitterLights
 
 
@@ -23,7 +25,8 @@ class EmitterSample:
     ``direction``: unit vector; ``weight``: unoccluded radiance over the density; ``density``: 1 / sr, 1 for points and
     directions; ``is_point``: mask of points and directions; ``ray``: shadow ray.  ``nearness``: cosine at the emitter
     over the squared distance, 0 for points, infinite if no virtual light represents the emitter; None if no virtual
-    light represents any emitter.
+    light represents any emitter.  ``group``: of the emitter, see :class:`vpl.lights.emitter_groups.EmitterGroups`, 0
+    without groups.
     """
 
     direction: mi.Vector3f
@@ -31,12 +34,13 @@ class EmitterSample:
     density: mi.Float
     is_point: mi.Bool
     ray: mi.Ray3f
+    group: mi.UInt32
     nearness: mi.Float | None = None
 
     def chosen_with(self, probability: mi.Float) -> EmitterSample:
         """The sample where the emitter was chosen with a probability."""
         weight = finite_or_zero(self.weight / probability)
-        return EmitterSample(self.direction, weight, self.density * probability, self.is_point, self.ray, self.nearness)
+        return replace(self, weight=weight, density=self.density * probability)
 
     def arriving(self, scene, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """The weight where the emitter is visible, 0 elsewhere: traces a shadow ray for nonzero weights."""
@@ -46,21 +50,23 @@ class EmitterSample:
 
 @dataclass
 class MetEmitter:
-    """Emitters hit by rays: ``radiance``; ``density`` of the direction under the sampler, 1 / sr; ``nearness``: see
-    :class:`EmitterSample`."""
+    """Emitters hit by rays: ``radiance``; ``density`` of the direction under the sampler, 1 / sr; ``group``,
+    ``nearness``: see :class:`EmitterSample`."""
 
     radiance: mi.UnpolarizedSpectrum
     density: mi.Float
+    group: mi.UInt32
     nearness: mi.Float | None = None
 
 
 class EmitterSampler(Protocol):
     """Choice of emitters for next-event estimation.
 
-    ``lights``: virtual lights representing the emitters, or None.
+    ``lights``: virtual lights representing the emitters, or None; ``groups`` of the emitters, or None.
     """
 
     lights: EmitterLights | None
+    groups: EmitterGroups | None
 
     def cell(self, position: mi.Point3f, facing: mi.Normal3f) -> mi.UInt32:
         """Number of the spatial cell of each vertex; ``facing``: shading normal on the visible side."""
@@ -88,12 +94,14 @@ class EmitterSampler(Protocol):
 
 
 class UniformEmitters:
-    """Mitsuba's own choice: every emitter with the same probability.  There is nothing to learn."""
+    """Mitsuba's own choice, of at most one emitter.  There is nothing to learn."""
 
     lights = None
 
-    def __init__(self, scene):
-        self._scene = scene
+    def __init__(self, scene, groups: EmitterGroups | None = None):
+        self._scene, self.groups = scene, groups
+        emitters = scene.emitters()
+        self._group = dr.opaque(mi.UInt32, groups.number(emitters[0])) if groups and emitters else mi.UInt32(0)
 
     def cell(self, position, facing):
         """The only cell."""
@@ -104,7 +112,7 @@ class UniformEmitters:
         ds, weight = self._scene.sample_emitter_direction(si, place, False, active)
         far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         ray = dr.select(far, si.spawn_ray(ds.d), si.spawn_ray_to(ds.p))
-        return EmitterSample(ds.d, finite_or_zero(mi.unpolarized_spectrum(weight)), ds.pdf, ds.delta, ray)
+        return EmitterSample(ds.d, finite_or_zero(mi.unpolarized_spectrum(weight)), ds.pdf, ds.delta, ray, self._group)
 
     def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
         """See :meth:`EmitterSampler.met`."""
@@ -113,7 +121,7 @@ class UniformEmitters:
         ds = mi.DirectionSample3f(self._scene, si, origin)
         density = self._scene.pdf_emitter_direction(origin, ds, active & has_density)
         emitted = si.emitter(self._scene, active).eval(si, active)
-        return MetEmitter(finite_or_zero(mi.unpolarized_spectrum(emitted)) & active, density)
+        return MetEmitter(finite_or_zero(mi.unpolarized_spectrum(emitted)) & active, density, self._group)
 
     def learn(self, position, normal, rays: int, seed: int) -> bool:
         """See :meth:`EmitterSampler.learn`."""
@@ -153,19 +161,24 @@ def irradiance_from_emitters(scene, emitters: EmitterSampler, places: Places, ce
     """Irradiance straight from emitters by next-event estimation with ``samples`` samples for each of the ``places``.
 
     Returns, evaluated: the irradiance, an unpolarized spectrum, weighted for multiple importance sampling with
-    cosine-distributed directions; and the mean over channels of the unoccluded irradiance, without the weight.  Virtual
-    lights and learning samplers share this kernel, because compiling it takes a good part of a first render.
+    cosine-distributed directions; the mean over channels of the unoccluded irradiance, without the weight; and the
+    group of the emitter.  With groups, the irradiance has the colour of one sample, because its light belongs to one
+    group.  Virtual lights and learning samplers share this kernel, because compiling it takes a good part of a first
+    render.
     """
     si, sampler, number = places.interaction(), independent_sampler(seed, places.count), mi.UInt32(0)
     wanted = dr.opaque(mi.UInt32, samples)
-    reached, unoccluded = dr.zeros(mi.UnpolarizedSpectrum, places.count), dr.zeros(mi.Float, places.count)
+    found, unoccluded = Contributions.none(places.count), dr.zeros(mi.Float, places.count)
     while dr.hint(number < wanted, exclude=[scene, emitters, si, places, cell, wanted]):
         sample = emitters.sample(si, cell, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
         cosine = dr.maximum(dr.dot(places.facing, sample.direction), 0)
         mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, cosine * dr.inv_pi))
-        reached += dr.select(sample.density > 0, sample.arriving(scene, cosine > 0) * cosine * mis, 0)
+        reached = dr.select(sample.density > 0, sample.arriving(scene, cosine > 0) * cosine * mis, 0)
+        draw = sampler.next_1d() if emitters.groups else mi.Float(0)
+        found.add(reached, mi.UInt32(1), sample.group, draw)
         unoccluded += channel_mean(sample.weight) * cosine
         number += 1
-    reached, unoccluded = reached / mi.Float(wanted), unoccluded / mi.Float(wanted)
-    dr.eval(reached, unoccluded)
-    return reached, unoccluded
+    reached = (found.one if emitters.groups else found.radiance) / mi.Float(wanted)
+    unoccluded /= mi.Float(wanted)
+    dr.eval(reached, unoccluded, found.group)
+    return reached, unoccluded, found.group

@@ -18,6 +18,7 @@ from ...core.arrays import channel_mean, download, finite_or_zero, upload, uploa
 from ...core.registry import RegistryTable
 from ...core.sampling import RowChoice, derived_seed, independent_sampler
 from ...direct.environment_regions import regions_of
+from ...lights.emitter_groups import EmitterGroups
 from ..spatial_cells import SpatialCells
 from .base import EmitterSample, MetEmitter, Places, irradiance_from_emitters
 
@@ -95,7 +96,7 @@ class CellChoice:
         dr.eval(places, source)
         self._learns = dr.opaque(mi.Bool, True)
         try:
-            reached, unoccluded = look(places, source)
+            reached, unoccluded, _ = look(places, source)
         finally:
             self._learns = dr.opaque(mi.Bool, False)
         reached, unoccluded = (
@@ -198,10 +199,10 @@ class LearnedEmitters(CellEmitters):
     # No virtual lights stand for emitters
     lights = None
 
-    def __init__(self, scene):
+    def __init__(self, scene, groups: EmitterGroups | None = None):
         order = _reproducible_order(scene.emitters())
         emitters = [scene.emitters()[number] for number in order]
-        self._scene, self._count = scene, len(emitters)
+        self._scene, self._count, self.groups = scene, len(emitters), groups
         self._emitters = dr.gather(mi.EmitterPtr, scene.emitters_dr(), upload(mi.UInt32, order))
         dr.eval(self._emitters)
         # Emitters with a weight of 0 are never sampled, as in Mitsuba
@@ -214,6 +215,11 @@ class LearnedEmitters(CellEmitters):
             self._regions = regions_of(self._environment, _REGIONS, _COLUMNS)
         registry = download(dr.reinterpret_array(mi.UInt32, self._emitters))
         self._number_of = RegistryTable(registry, np.arange(1, self._count + 1))
+        # A number for each source: the regions belong to the group of the environment
+        self._group = None
+        if groups:
+            of_regions = [groups.number(self._environment)] * self._regions.count if self._regions else []
+            self._group = upload(mi.UInt32, [*map(groups.number, emitters), *of_regions])
         alike = np.zeros(self._count + (self._regions.count if self._regions else 0))
         alike[: self._count] = weight / weight.sum()
         ignored = alike[: self._count] == 0
@@ -246,7 +252,8 @@ class LearnedEmitters(CellEmitters):
                 lambda source, member, place, *drawn: drawn,
             )
             ray = dr.select(of_region, si.spawn_ray(direction), ray)
-        return EmitterSample(direction, weight, density, delta, ray)
+        group = dr.gather(mi.UInt32, self._group, source, active) if self.groups else mi.UInt32(0)
+        return EmitterSample(direction, weight, density, delta, ray, group)
 
     def sample(self, si, cell, chosen, member, place, active) -> EmitterSample:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.sample`."""
@@ -312,7 +319,7 @@ class LearnedEmitters(CellEmitters):
                 lambda origin, cell, direction, density: self._density_met(origin, cell, direction),
                 lambda origin, cell, direction, density: density,
             )
-        return MetEmitter(emitted, density)
+        return MetEmitter(emitted, density, self.groups.met(si) if self.groups else mi.UInt32(0))
 
 
 def _reproducible_order(emitters: list) -> np.ndarray:

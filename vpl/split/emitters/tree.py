@@ -13,6 +13,7 @@ import numpy as np
 
 from ...core.arrays import finite_or_zero, rgb_to_spectrum, upload
 from ...lights.emission import bounding_sphere, solid_angle_radiance
+from ...lights.emitter_groups import EmitterGroups
 from ...lights.emitters import Emitters, registered_shapes
 from ...lights.light_set import largest_below, moments_below
 from ...lights.light_tree import BOX_MAX, BOX_MIN, INTENSITY, build_light_tree
@@ -157,8 +158,9 @@ class TreeEmitters(CellEmitters):
     lights representing the emitters, or None.
     """
 
-    def __init__(self, scene, emitters: Emitters, rays: int):
+    def __init__(self, scene, emitters: Emitters, rays: int, groups: EmitterGroups | None = None):
         self._scene, self._emitters, self._environment = scene, emitters, emitters.environment
+        self.groups = groups
         omni = VirtualLights.concatenate([emitters.points, emitters.spots])
         # A single kernel for both: the cone of a point emitter holds every direction
         omni.kind = "spot"
@@ -179,6 +181,12 @@ class TreeEmitters(CellEmitters):
         self._tree = EmitterTree(position, radius, intensity, clusters)
         self._directional = DeviceLights(emitters.directional) if emitters.directional.count else None
         self._distant = emitters.directional.count + (self._environment is not None)
+        # Of located emitters, by row of the tree, then of distant emitters
+        distant = [
+            emitters.directional.group,
+            [groups.number(self._environment)] if self._environment and groups else [],
+        ]
+        self._group = upload(mi.UInt32, np.concatenate([omni.group, emitters.area.group, *distant])) if groups else None
         self._share = dr.opaque(mi.Float, self._located_share(float(intensity.sum(dtype=np.float64))))
         # The last source is the draw from the root
         usual = np.zeros(self._tree.clusters + self._distant + 1)
@@ -280,7 +288,10 @@ class TreeEmitters(CellEmitters):
             weight = dr.select(here, rgb_to_spectrum(light.intensity), weight)
             density, is_point = dr.select(here, 1, density), is_point | here
         ray = dr.select(far, si.spawn_ray(toward), si.spawn_ray_to(target))
-        return EmitterSample(toward, weight, density, is_point, ray, nearness)
+        group = mi.UInt32(0)
+        if self.groups:
+            group = dr.gather(mi.UInt32, self._group, dr.select(near, row, self._tree.count + index), active)
+        return EmitterSample(toward, weight, density, is_point, ray, group, nearness)
 
     def _nearness(self, row, normal, direction, distance, active):
         """See :class:`vpl.split.emitters.base.EmitterSample`, of area emitters."""
@@ -315,4 +326,5 @@ class TreeEmitters(CellEmitters):
             pdf = finite_or_zero(self._environment.pdf_direction(origin, ds, here))
             probability = self._distant_probability(mi.UInt32(self._distant - 1), cell, here)
             density = dr.select(here, pdf * probability, density)
-        return MetEmitter(emitted_towards(self._emitters, si, active), density, nearness)
+        group = self.groups.met(si) if self.groups else mi.UInt32(0)
+        return MetEmitter(emitted_towards(self._emitters, si, active), density, group, nearness)
