@@ -139,11 +139,9 @@ def parse(arguments):
         if getattr(options, name) and options.output and options.output.suffix == ".png":
             parser.error(f"--{name.replace('_', '-')} needs an .exr file: a PNG file has no layers")
     # The integrator renders these layers, as parameters; the other layers are separate images
-    of_light = ",".join(name for name in options.layers if name in LENGTHS)
+    of_light = ",".join(name for name in options.layers if name in LENGTHS), options.light_groups
+    options.light_layers = {name: text for name, text in zip(("layers", "light_groups"), of_light, strict=True) if text}
     options.layers = tuple(name for name in options.layers if name in FEATURES)
-    options.param += [
-        (name, text) for name, text in (("layers", of_light), ("light_groups", options.light_groups)) if text
-    ]
     if options.output and not options.output.is_dir():
         try:
             check_extension(options.output)
@@ -165,6 +163,11 @@ def parse_scene(options):
     own, name = file.integrator[0], chosen_integrator(options.integrator, file)
     command_line.check_integrator(name)
     parameters = dict(options.param)
+    if options.light_layers and name != DEFAULT:
+        raise UsageError(
+            f"--light-groups and --layers {', '.join(LENGTHS)} need the integrator {DEFAULT}, and this one is {name}"
+        )
+    parameters |= options.light_layers
     if options.denoise and "denoised" not in file.integrator[1]:
         parameters = for_denoising(name, parameters)
     if name != own or options.integrator == name:

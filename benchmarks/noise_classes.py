@@ -17,7 +17,8 @@ import numpy as np
 from benchmarks import scenes
 from benchmarks.rivals import DEPTH, trimmed_variance
 from comparison.rendering import SharedStart
-from vpl.split import contributions, estimator, path_tracer
+from vpl.split import estimator, path_tracer
+from vpl.split.contributions import Contributions
 
 # x1, x2: first and second surface with a BSDF that has a density.  NEE: next-event estimation.  BSDF: an emitter that a
 # BSDF sample meets, straight or by way of mirrors, glass and masks ("via")
@@ -47,7 +48,7 @@ def single_classes():
     """
     chosen = SimpleNamespace(wanted=_ALL, gathers=True, now=None, found=None)
     less_carried, lit, trace = path_tracer._less_carried, path_tracer._lit, estimator.trace_camera_rays
-    add, light = contributions.Contributions.add, estimator.Gatherer.light
+    light = estimator.Gatherer.light
 
     def of_met(path, *others):
         chosen.found = class_of_met(path)
@@ -57,14 +58,15 @@ def single_classes():
         chosen.found = class_of_nee(path)
         return lit(path, *others)
 
-    def add_wanted(self, contribution, *others):
-        wanted = (chosen.now == _ALL) | (chosen.found == chosen.now)
-        add(self, dr.select(wanted, contribution, 0), *others)
+    class Wanted(Contributions):
+        def add(self, contribution, *others):
+            wanted = (chosen.now == _ALL) | (chosen.found == chosen.now)
+            super().add(dr.select(wanted, contribution, 0), *others)
 
-    def trace_image(*arguments, **layers):
+    def trace_image(*arguments, **sums):
         chosen.now = dr.opaque(mi.UInt32, chosen.wanted)
         try:
-            return trace(*arguments, **layers)
+            return trace(*arguments, **sums)
         finally:
             chosen.now = dr.opaque(mi.UInt32, _ALL)
 
@@ -77,7 +79,7 @@ def single_classes():
         for place, name, function in (
             (path_tracer, "_less_carried", of_met),
             (path_tracer, "_lit", of_nee),
-            (contributions.Contributions, "add", add_wanted),
+            (path_tracer, "Contributions", Wanted),
             (estimator, "trace_camera_rays", trace_image),
             (estimator.Gatherer, "light", gathered),
         ):

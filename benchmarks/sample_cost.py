@@ -44,8 +44,8 @@ def counted_edges(edges: list):
     """Within the block, the mean number of edges of the paths of every part of an image is appended to ``edges``."""
     trace = estimator.trace_camera_rays
 
-    def counted(*arguments, **layers):
-        traced = trace(*arguments, **layers)
+    def counted(*arguments, **sums):
+        traced = trace(*arguments, **sums)
         # A path that ends at its first hit has one edge
         edges.append(float(dr.mean(mi.Float(traced.edges))[0]) + 1)
         return traced

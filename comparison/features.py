@@ -31,7 +31,10 @@ def channels_of(names):
     """Return the names of the channels of features, in order. Raises ValueError for a name that is not in `FEATURES`,
     for a repeated name, and for a string in place of a sequence of names."""
     if isinstance(names, str) or not set(names) <= set(FEATURES) or len(set(names)) < len(names):
-        raise ValueError(f"layers must be a list of distinct names out of {', '.join(FEATURES)}, got {names!r}")
+        raise ValueError(
+            f"layers must be a list of distinct names out of {', '.join(FEATURES)}, got {names!r} (layers of light are "
+            "properties of the integrator manylights)"
+        )
     return [f"{name}.{channel}" for name in names for channel in FEATURES[name]]
 
 

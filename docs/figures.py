@@ -1,4 +1,4 @@
-"""Draw the figures of docs/methods.md by the project's own code: light trees, cuts, clusters of points, matrices.
+"""Draw the figures of docs/methods.md and docs/choosing.md by the project's own code: light trees, cuts, matrices, layers.
 
     ./run -- python docs/figures.py [NAME...]
 
@@ -27,6 +27,7 @@ mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
 from benchmarks.matrix_pictures import draw_slice  # noqa: E402
+from benchmarks.noise_classes import single_classes  # noqa: E402
 from benchmarks.scenes import camera_rays  # noqa: E402
 from comparison import images  # noqa: E402
 from vpl.core.arrays import download, upload_vectors  # noqa: E402
@@ -233,10 +234,10 @@ def learned(_view, _pixels):
 def split(view, _pixels):
     """The traced part of `manylights`, the part of its virtual lights, and the sum."""
     plugin = mi.load_dict({"type": "manylights", "max_depth": DEPTH})
-    whole = np.array(mi.render(view.scene, integrator=plugin, spp=256))[..., :3]
-    gather = plugin._gather
-    plugin._gather = lambda *arguments: 0 * gather(*arguments)
-    traced = np.array(mi.render(view.scene, integrator=plugin, spp=256))[..., :3]
+    with single_classes() as chosen:
+        whole = np.array(mi.render(view.scene, integrator=plugin, spp=256))[..., :3]
+        chosen.gathers = False
+        traced = np.array(mi.render(view.scene, integrator=plugin, spp=256))[..., :3]
     figure, axes = panels(["traced", "from virtual lights", "the sum: the image of path"], 1)
     for axis, image in zip(axes, (traced, whole - traced, whole), strict=True):
         axis.imshow(images.tone_map(image, images.automatic_exposure(whole)))
@@ -249,6 +250,19 @@ def matrix(_view, _pixels):
     draw_slice(view.plugin, view.job, 20, FOLDER / "matrix.png", {"scene": "cornell"})
 
 
+def light_groups(_view, _pixels):
+    """The light of the lamps and of the sky, from one render, and a mixture of both."""
+    scene = mi.load_file(str(ROOT / "scenes" / "kitchen_windows.xml"), resx=str(WIDTH), resy="192")
+    groups = "lamps=AreaLight; sky=EnvironmentMapEmitter"
+    plugin = mi.load_dict({"type": "manylights", "max_depth": DEPTH, "light_groups": groups})
+    planes = np.array(mi.render(scene, integrator=plugin, spp=256))
+    whole, lamps, sky = (planes[..., first : first + 3] for first in (0, 3, 6))
+    figure, axes = panels(["image", "lamps", "sky", "lamps, and a twentieth of the sky"], 192 / 256)
+    for axis, image in zip(axes, (whole, lamps, sky, lamps + sky / 20), strict=True):
+        axis.imshow(images.tone_map(image, images.automatic_exposure(image)))
+    save(figure, "light_groups")
+
+
 FIGURES = {
     "light_tree": light_tree,
     "cuts": cuts,
@@ -256,6 +270,7 @@ FIGURES = {
     "bounds": bounds,
     "learned": learned,
     "split": split,
+    "light_groups": light_groups,
     "matrix": matrix,
 }
 

@@ -97,8 +97,13 @@ class DistributedPasses(Passes):
 
     @property
     def waiting_bytes(self):
-        """Memory of passes of three channels that have arrived and are not added yet."""
-        return 12 * self.pixels * len(self._finished)
+        """Memory of passes that have arrived and are not added yet."""
+        return self._pass_bytes * len(self._finished)
+
+    @property
+    def _pass_bytes(self):
+        """Memory of the image of a pass; before the first pass is added, with three channels."""
+        return 4 * self.pixels * (len(self.channels) or 3)
 
     def done(self, index, image, address):
         """Take a finished pass."""
@@ -117,7 +122,7 @@ class DistributedPasses(Passes):
     def _most_ahead(self):
         """Return the maximum number of passes on workers or waiting, which bounds memory."""
         workers = max(1, len(self._pool.workers))
-        return max(TASKS_PER_WORKER * workers, min(8 * workers, WAITING_BYTES // (12 * self.pixels)))
+        return max(TASKS_PER_WORKER * workers, min(8 * workers, WAITING_BYTES // self._pass_bytes))
 
     def _is_too_late(self, queued):
         """Return whether a worker with `queued` tasks would finish another pass after the deadline."""

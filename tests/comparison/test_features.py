@@ -197,8 +197,8 @@ def test_files_have_layers_of_light(tmp_path):
 
 
 def test_only_manylights_has_layers_of_light(tmp_path, capsys):
-    assert command("-o", tmp_path / "a.exr", "--spp", 1, "--layers", "direct") == 1
-    assert 'unreferenced property in integrator plugin of type "path": - string "layers"' in capsys.readouterr().err
+    assert command("-o", tmp_path / "a.exr", "--spp", 1, "--layers", "direct") == 2
+    assert "need the integrator manylights, and this one is path" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("names", ["shape", "albedo,albedo", "", "albedo,"])

@@ -6,15 +6,19 @@ People call them light groups.  Here a *light group* holds virtual lights of one
 
 from __future__ import annotations
 
+import difflib
 from fnmatch import fnmatchcase
 
 import drjit as dr
 import mitsuba as mi
 
 from ..core.registry import RegistryTable
+from .emitters import registered_shapes
 
 # Name of the last group: emitters without another group
 OTHER = "other"
+# Most words in the error message of a pattern
+_MOST_NAMED = 12
 
 
 class EmitterGroups:
@@ -28,16 +32,17 @@ class EmitterGroups:
     def __init__(self, scene, patterns: dict[str, tuple[str, ...]]):
         self.names, self._patterns = (*patterns, OTHER), patterns
         self._require_emitters(scene.emitters())
-        shapes = [shape for shape in scene.shapes() if shape.is_emitter()]
-        index = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
-        self._of_shape = RegistryTable(index, [self.number(shape.emitter()) for shape in shapes])
+        emitting = [(index, shape.emitter()) for index, shape in registered_shapes(scene) if shape.is_emitter()]
+        index, numbers = [index for index, _ in emitting], [self.number(emitter) for _, emitter in emitting]
+        self._of_shape = RegistryTable(index, numbers)
         environment = scene.environment()
         self._of_environment = dr.opaque(mi.UInt32, 0 if environment is None else self.number(environment))
 
     def number(self, emitter) -> int:
         """Number of the group of an emitter."""
+        words = _words(emitter)
         for number, patterns in enumerate(self._patterns.values()):
-            if any(_matches(pattern, emitter) for pattern in patterns):
+            if any(_matches(pattern, word) for pattern in patterns for word in words):
                 return number
         return len(self._patterns)
 
@@ -47,14 +52,12 @@ class EmitterGroups:
 
     def _require_emitters(self, emitters: list) -> None:
         """Raise ValueError for a pattern without an emitter."""
+        words = sorted({word for emitter in emitters for word in _words(emitter)})
         for name, patterns in self._patterns.items():
             for pattern in patterns:
-                if not any(_matches(pattern, emitter) for emitter in emitters):
-                    known = sorted({f'"{word}"' for emitter in emitters for word in _words(emitter)})
-                    raise ValueError(
-                        f'light_groups: no emitter of the group "{name}" is called "{pattern}"; emitters are called '
-                        f"{', '.join(known) or 'nothing: there are none'}"
-                    )
+                if not any(_matches(pattern, word) for word in words):
+                    known = _known(pattern, words)
+                    raise ValueError(f'light_groups: no emitter of group "{name}" is called "{pattern}"; {known}')
 
 
 def _words(emitter) -> list[str]:
@@ -64,5 +67,15 @@ def _words(emitter) -> list[str]:
     return [word for word in words if word]
 
 
-def _matches(pattern: str, emitter) -> bool:
-    return any(fnmatchcase(word, pattern) for word in _words(emitter))
+def _matches(pattern: str, word: str) -> bool:
+    # Brackets are usual in ids, and no wildcards here
+    return fnmatchcase(word, pattern.replace("[", "[[]"))
+
+
+def _known(pattern: str, words: list[str]) -> str:
+    """The words that an error message lists: those near the pattern, or the first."""
+    if not words:
+        return "the scene has no emitters"
+    named = difflib.get_close_matches(pattern, words, _MOST_NAMED) or words[:_MOST_NAMED]
+    more = f" and {len(words) - len(named)} more" if len(words) > len(named) else ""
+    return "emitters are called " + ", ".join(f'"{word}"' for word in named) + more

@@ -274,20 +274,15 @@ def _lights_nothing(emitter) -> bool:
     return emitter.class_name() == "DirectionalArea" or (is_delta and emitter.sampling_weight() == 0)
 
 
-def _in_one_group(emitter) -> int:
-    return 0
-
-
-def read_emitters(scene, group_of: Callable[[mi.Emitter], int] | None = None) -> Emitters:
+def read_emitters(scene, group_of: Callable[[mi.Emitter], int] = lambda _: 0) -> Emitters:
     """Read the emitters of ``scene`` that contribute in Mitsuba's ``path``.
 
-    ``group_of``: number of the group of an emitter; None: every emitter is in group 0.
+    ``group_of``: number of the group of an emitter, by default 0.
 
     Emitters with negative or non-finite values are dropped, counted and logged.  Raises ValueError for environment maps
     with invalid texels and for emitters on shapes that Mitsuba cannot sample.
     """
     points, spots, suns, others = [], [], [], []
-    group_of = group_of or _in_one_group
     environment, dropped = _read_environment(scene)
     area, bad_areas, others_on_shapes = _read_areas(scene, group_of)
     dropped += bad_areas

@@ -50,8 +50,8 @@ class LayerSums:
         size = rays * self._stride * self._channels
         if size > _LARGEST:
             raise ValueError(
-                f"{rays} camera rays with {self._stride} layers need {size} sums, more than {_LARGEST}: render in "
-                "passes of fewer samples"
+                f"{rays} camera rays with {self._stride} layers need {size} sums, more than {_LARGEST}: lower the "
+                "samples of a pass, by samples_per_pass or pass_spp"
             )
         self._sums = dr.zeros(mi.Float, size)
         dr.eval(self._sums)
@@ -64,11 +64,11 @@ class LayerSums:
 
     def add(self, contribution, ray: mi.UInt32, length: mi.UInt32, group: mi.UInt32) -> None:
         """Add the contribution of paths of ``length`` edges from an emitter in ``group`` to the camera rays ``ray``."""
-        first, numbers = 0, []
+        numbers = []
         if self._layers.by_length:
-            numbers, first = [dr.minimum(length, len(LENGTHS)) - 1], len(LENGTHS)
+            numbers.append(dr.minimum(length, len(LENGTHS)) - 1)
         if self._layers.groups:
-            numbers.append(group + first)
+            numbers.append(group + (len(LENGTHS) if self._layers.by_length else 0))
         for number in numbers:
             row = ((self._first + ray) * self._stride + number) * self._channels
             for channel in range(self._channels):
@@ -90,7 +90,7 @@ class Contributions:
 
     ``radiance``: sum; ``drawn``: a contribution, drawn in proportion to absolute value; ``length``: edges of the path
     of ``drawn``; ``group``: of its emitter, see :class:`vpl.lights.emitter_groups.EmitterGroups`; ``level``: sum of
-    absolute values; ``layers``: sums by layer, or None.
+    absolute values; ``sums`` by layer, or None.
     """
 
     radiance: mi.UnpolarizedSpectrum
@@ -98,13 +98,13 @@ class Contributions:
     length: mi.UInt32
     group: mi.UInt32
     level: mi.Float
-    layers: LayerSums | None
+    sums: LayerSums | None
 
     @classmethod
-    def none(cls, count: int, layers: LayerSums | None = None) -> Contributions:
+    def none(cls, count: int, sums: LayerSums | None = None) -> Contributions:
         """No contribution yet."""
         radiance, drawn = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UnpolarizedSpectrum, count)
-        return cls(radiance, drawn, mi.UInt32(0), mi.UInt32(0), mi.Float(0), layers)
+        return cls(radiance, drawn, mi.UInt32(0), mi.UInt32(0), mi.Float(0), sums)
 
     def add(self, contribution, length, group, sample, lane=None) -> None:
         """Add the contribution of paths with ``length`` edges from emitters in ``group``.
@@ -117,8 +117,8 @@ class Contributions:
         self.drawn = dr.select(taken, contribution, self.drawn)
         self.length, self.group = dr.select(taken, length, self.length), dr.select(taken, group, self.group)
         self.level += level
-        if self.layers is not None:
-            self.layers.add(contribution, lane, length, group)
+        if self.sums is not None:
+            self.sums.add(contribution, lane, length, group)
 
     @property
     def one(self) -> mi.UnpolarizedSpectrum:

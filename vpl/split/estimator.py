@@ -247,7 +247,7 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
     settings = view.settings(lights)
     gatherer = Gatherer.of(view, lights, decision) if lights.all else None
     radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
-    layers = view.layers.sums(view.count)
+    sums = view.layers.sums(view.count)
     parts = max(round(view.count / np.clip(view.count / 2, *_WAVEFRONT)), 1)
     most = -(-view.pixels // parts) * view.samples
     statistics: dict[str, int] = {}
@@ -256,13 +256,13 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
             break
         lane = dr.arange(mi.UInt32, min(most, view.count - first)) + dr.opaque(mi.UInt32, first)
         dr.eval(lane)
-        sums = layers.part(first) if layers else None
-        traced, points = _traced_part(view, lane, first, settings, lights, decision.plan, sums, clock)
+        sums_of_part = sums.part(first) if sums else None
+        traced, points = _traced_part(view, lane, first, settings, lights, decision.plan, sums_of_part, clock)
         part, opaque = traced.radiance, traced.valid
         # Frees the memory of unlit gather vertices
         del traced
         if points is not None:
-            light, counts = gatherer.light(points, part, first, sums, clock)
+            light, counts = gatherer.light(points, part, first, sums_of_part, clock)
             part += light
             for name, number in counts.items():
                 statistics[name] = statistics.get(name, 0) + number
@@ -278,17 +278,17 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
         mi.Log(mi.LogLevel.Warn, f"{dropped} sample(s) with values that are not finite were dropped.")
     shown = view.rules.max_depth > 0
     kept = finite & shown
-    found = {name: layers.of(name, kept) for name in view.layers.names}
+    found = {name: sums.of(name, kept) for name in view.layers.names}
     return dr.select(kept, radiance, 0), valid & shown, found, statistics | {"dropped": dropped}
 
 
 def _traced_part(
     view: View, lane: mi.UInt32, first: int, settings: PathSettings, lights: ViewLights, plan: Plan,
-    layers: LayerSums | None, clock: Clock,
+    sums: LayerSums | None, clock: Clock,
 ) -> tuple[Traced, LitVertices | None]:  # fmt: skip
     """(Traced part of the camera rays ``lane``, from the ray ``first`` on; gather vertices that are lit)."""
     clock.begin(Stage.TRACED)
-    traced = trace_camera_rays(view, lane, settings, Stream.IMAGE, first, layers=layers)
+    traced = trace_camera_rays(view, lane, settings, Stream.IMAGE, first, sums=sums)
     if not lights.all:
         return traced, None
     clock.begin(Stage.CLUSTERS)
@@ -320,12 +320,12 @@ class Gatherer:
         return cls(view, decision.plan, transports, decision.expected_light(lights), darkest)
 
     def light(
-        self, points: LitVertices, found, first: int, layers: LayerSums | None, clock: Clock
+        self, points: LitVertices, found, first: int, sums: LayerSums | None, clock: Clock
     ) -> tuple[mi.UnpolarizedSpectrum, dict]:
         """(Light at the ``points``, per camera ray; counters) for a part of the image, from the ray ``first`` on.
 
         The brightness of a pixel is the radiance ``found`` by paths plus the expected light of virtual lights.
-        ``layers``: sums by layer of this part.
+        ``sums`` by layer of this part.
         """
         view, samples, count = self.view, self.view.samples, dr.width(found)
         lit = dr.zeros(mi.UnpolarizedSpectrum, count)
@@ -341,7 +341,7 @@ class Gatherer:
         shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, first)
         for number, transport in enumerate(self.transports):
             stream = derived_seed(seed, 1, number)
-            shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit, layers)
+            shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit, sums)
         clock.stop()
         counts = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}
         return lit, counts | {"later": points.alone}

@@ -128,18 +128,18 @@ class Traced:
 @dr.syntax
 def trace_paths(
     scene, emitters: EmitterSampler, first: FirstEdge, lattice: Lattice, sampler, settings: PathSettings,
-    layers: LayerSums | None = None,
+    sums: LayerSums | None = None,
 ) -> Traced:  # fmt: skip
     """Trace paths to their ends.
 
     ``lattice``: numbers for the choice of emitter, point, lobe and direction at scattering vertices; ``sampler``: the
-    remaining random numbers; ``layers``: sums by layer, for camera rays.
+    remaining random numbers; ``sums`` by layer, for camera rays.
     """
     context, count = mi.BSDFContext(), dr.width(first.throughput)
-    path, found, gathered = Path.of(first), Contributions.none(count, layers), Gathered.none(count)
+    path, found, gathered = Path.of(first), Contributions.none(count, sums), Gathered.none(count)
     lane = dr.arange(mi.UInt32, count)
 
-    while dr.hint(path.active, exclude=[first, lattice, settings, emitters, context]):
+    while dr.hint(path.active, exclude=[first, lattice, settings, emitters, context, lane]):
         # ---------------------- Hit ----------------------
         hit = Hit.of(scene, path, settings)
 
@@ -190,16 +190,16 @@ def trace_paths(
 
 
 def trace_camera_rays(
-    view: View, lane: mi.UInt32, settings: PathSettings, *stream: int, layers: LayerSums | None = None
+    view: View, lane: mi.UInt32, settings: PathSettings, *stream: int, sums: LayerSums | None = None
 ) -> Traced:
-    """Trace the camera rays ``lane`` of a view; ``stream``: of random numbers; ``layers``: sums by layer."""
+    """Trace the camera rays ``lane`` of a view; ``stream``: of random numbers; ``sums`` by layer."""
     seed, ray = derived_seed(view.seed, *stream), view.ray
     part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
     importance = dr.gather(mi.Float, view.importance, lane // dr.opaque(mi.UInt32, view.samples))
     edge = FirstEdge.of_camera(part, importance, dr.gather(mi.Bool, view.active, lane))
     lattice = Lattice.of_lanes(lane, view.samples, derived_seed(seed, 0))
     sampler = independent_sampler(derived_seed(seed, 1), dr.width(lane))
-    return trace_paths(view.scene, view.emitters, edge, lattice, sampler, settings, layers)
+    return trace_paths(view.scene, view.emitters, edge, lattice, sampler, settings, sums)
 
 
 def _less_carried(path: Path, met: MetEmitter, settings: PathSettings):

@@ -126,12 +126,12 @@ class PixelClusters:
 
 def light_clusters(
     transport: Transport, clusters: PixelClusters, allowed: np.ndarray, max_cut: int, seed: int, result,
-    layers: LayerSums | None,
+    sums: LayerSums | None,
 ) -> int:  # fmt: skip
     """Add the light of virtual lights at the clusters to ``result``, per camera ray; returns the number of shadow rays.
 
     ``allowed`` (clusters,): largest bound of a pair, as a contribution to the sum over the samples of the pixel;
-    ``layers``: sums by layer.  A light of a node is drawn in proportion to intensity, so the drawn lights of a group
+    ``sums`` by layer.  A light of a node is drawn in proportion to intensity, so the drawn lights of a group
     have the expectation of the lights of the group.
     """
     with np.errstate(over="ignore"):  # a cluster without weight may have any error
@@ -147,8 +147,8 @@ def light_clusters(
         value = mi.UnpolarizedSpectrum(value) * weight * dr.opaque(mi.Float, chunk.group.sign)
         value = dr.select(chunk.written & dr.all(dr.isfinite(value)), value, 0)
         add_at(result, value, ray)
-        if layers is not None:
-            layers.add(value, ray, surface.depth + light.depth + 1, light.group)
+        if sums is not None:
+            sums.add(value, ray, surface.depth + light.depth + 1, light.group)
         dr.eval(result, traced)
         rays += int(dr.count(traced)[0])
     return rays

@@ -33,7 +33,7 @@ def emitter_sampler(scene, rays: int, groups: EmitterGroups | None = None) -> Em
 def _tree(scene, rays: int, groups: EmitterGroups | None) -> TreeEmitters | None:
     """The tree over the emitters; None if a tree cannot hold the emitters."""
     try:
-        emitters = read_emitters(scene, groups.number if groups else None)
+        emitters = read_emitters(scene, groups.number) if groups else read_emitters(scene)
     except ValueError:
         # Only Mitsuba can sample a point on one of the emitters
         return None
