@@ -1,4 +1,4 @@
-"""Draw the figures of docs/methods.md and docs/choosing.md by the project's own code: light trees, cuts, matrices, layers.
+"""Draw the figures of docs/methods.md and docs/choosing.md by the project's own code: trees, cuts, matrices, layers.
 
     ./run -- python docs/figures.py [NAME...]
 
@@ -251,14 +251,14 @@ def matrix(_view, _pixels):
 
 
 def light_groups(_view, _pixels):
-    """The light of the lamps and of the sky, from one render, and a mixture of both."""
-    scene = mi.load_file(str(ROOT / "scenes" / "kitchen_windows.xml"), resx=str(WIDTH), resy="192")
-    groups = "lamps=AreaLight; sky=EnvironmentMapEmitter"
+    """The light of the lamps, of the sun and of the sky, from one render, and a mixture."""
+    scene = mi.load_file(str(ROOT / "scenes" / "blender_room.xml"))
+    groups = "lamps=AreaLight; sun=DirectionalEmitter; sky=EnvironmentMapEmitter"
     plugin = mi.load_dict({"type": "manylights", "max_depth": DEPTH, "light_groups": groups})
     planes = np.array(mi.render(scene, integrator=plugin, spp=256))
-    whole, lamps, sky = (planes[..., first : first + 3] for first in (0, 3, 6))
-    figure, axes = panels(["image", "lamps", "sky", "lamps, and a twentieth of the sky"], 192 / 256)
-    for axis, image in zip(axes, (whole, lamps, sky, lamps + sky / 20), strict=True):
+    whole, lamps, sun, sky = (planes[..., first : first + 3] for first in (0, 3, 6, 9))
+    figure, axes = panels(["image", "lamps", "sun", "sky", "lamps, and a twentieth of the sky"], 192 / 256)
+    for axis, image in zip(axes, (whole, lamps, sun, sky, lamps + sky / 20), strict=True):
         axis.imshow(images.tone_map(image, images.automatic_exposure(image)))
     save(figure, "light_groups")
 

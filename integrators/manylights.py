@@ -100,9 +100,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
     emitter that its path found, and a light cut draws lights of any group, so a group has more noise than an image of
     its emitters alone.  In scenes of 64 emitters or more, groups change the random numbers of an image.  Layers take
     up to an eighth more time, and a layer takes 12 bytes of memory per sample of a pass, 4 in ``*_mono`` variants;
-    layers by length take the memory of three.  A sensor must give rays the weight 1, as ``perspective`` and
-    ``thinlens`` do; below a wrapper this is not checked.  Denoising leaves layers as they are, and images with layers
-    have no derivatives.
+    layers by length take the memory of three.  The sensor must give rays the weight 1, as ``perspective`` and
+    ``thinlens`` do.  Layers are refused below a wrapper, such as ``aov`` or ``moment``.  Denoising leaves layers as
+    they are, and images with layers have no derivatives.
 
     - Single pixels may be negative while samples are few, because the traced part is a difference.
     - Caustics: the pilot compares relative variances without the largest 0.1% of the errors.  For a glass ball under a
@@ -258,6 +258,11 @@ class ManyLightsIntegrator(GatheringIntegrator):
             return super()._render(scene, chosen, seed, spp, develop, evaluate)
 
     def _sample(self, scene, sampler, ray, active):
+        if self._layer_names and self._sensor is None:
+            raise ValueError(
+                "manylights: layers are not rendered below a wrapper such as aov or moment, which names channels in "
+                "another order (Mitsuba 3.9.1)"
+            )
         clock, shared = Clock(Stage.SCENE), self._shared
         known = shared.start if shared else None
         if shared and known is None and not self._makes_start:

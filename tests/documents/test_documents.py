@@ -80,7 +80,7 @@ def copied(folder):
 
 def test_a_changed_number_of_a_result_file_is_found_and_written(tmp_path):
     root = copied(tmp_path)
-    file = root / "docs" / "results" / "manylights_product.json"
+    file = root / "docs" / "results" / "manylights_timed10.json"
     found = json.loads(file.read_text())
     found["rows"]["hall"]["speedup"] = 0.25
     file.write_text(json.dumps(found))

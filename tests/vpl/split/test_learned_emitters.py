@@ -157,7 +157,7 @@ def test_what_neighbours_have_seen_is_drawn_more_often_than_what_nobody_has():
         """The first source is seen everywhere, the second from one side, the third from nowhere."""
         x, number = download(places.position.x), download(source)
         seen = (number == 0) | ((number == 1) & (x < 0.45))
-        return upload_vectors(mi.Color3f, np.repeat(seen[:, None], 3, 1)), upload(mi.Float, np.ones(len(x)))
+        return upload_vectors(mi.Color3f, np.repeat(seen[:, None], 3, 1)), upload(mi.Float, np.ones(len(x))), None
 
     assert choice.learn(position, np.tile(np.float32([[0, 0, 1]]), (len(position), 1)), 6000, 0, look)
     low, size = np.array(choice._cells.low)[0].item(), np.array(choice._cells.size).item()
