@@ -159,7 +159,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
         Boolean(
             "denoised", False,
             "Whether the image will be denoised. Denoisers keep noise that neighbouring pixels share, so there are "
-            "more virtual lights, up to twice as many, for up to a sixth more variance × time of the raw image.",
+            "more virtual lights, up to twice as many. Denoisers also leave errors at edges, which virtual lights do "
+            "not reduce, so only lights that remove much of the variance are used. The raw image has up to a sixth "
+            "more variance × time where lights are used, and the noise of paths elsewhere.",
         ),
         Boolean(
             "stratified", True,

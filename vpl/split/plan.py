@@ -1,7 +1,8 @@
 """Plan: whether virtual lights pay, the number of lights, and the fineness of the clusters.
 
 An :class:`Option` is a choice of light kinds.  :func:`price` predicts the variance × cost of an option by the cost
-model; :func:`choose` takes the option with the least product, or no lights.
+model; :func:`choose` takes the option with the least product, or no lights.  In images that are denoised, the product
+has a power of the variance: what a denoiser leaves is in part made at edges, which virtual lights do not change.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def choose(evidence: Evidence, options: list[Option]) -> Plan:
     whole = evidence.variance(evidence.radiance)
     product, cost, best = min((_priced(evidence, option) for option in options), key=lambda option: option[0])
     remains = best.variance / max(whole, _TINY)
-    if product > evidence.model.pays_below * whole:
+    if product > _most_to_pay(evidence):
         costs = f"virtual lights would cost {cost - 1:.2g} times as much as the paths"
         return without_lights(f"{costs} and leave {remains:.0%} of the variance")
     return replace(best, reason=f"virtual lights remove {1 - remains:.0%} of the variance")
@@ -117,18 +118,22 @@ def without_lights(reason: str) -> Plan:
 
 
 def price(evidence: Evidence, option: Option) -> float:
-    """Variance × cost with the lights of an option."""
+    """Variance × cost with the lights of an option; a power of the variance in images that are denoised."""
     return _priced(evidence, option)[0]
 
 
 def may_pay(evidence: Evidence, option: Option, others: list[Option]) -> bool:
     """Whether the lights of an option are predicted to pay, and to pay more than every option of ``others``."""
-    least = evidence.model.pays_below * evidence.variance(evidence.radiance)
-    return price(evidence, option) <= min([least, *(price(evidence, other) for other in others)])
+    return price(evidence, option) <= min([_most_to_pay(evidence), *(price(evidence, other) for other in others)])
+
+
+def _most_to_pay(evidence: Evidence) -> float:
+    """Largest price of lights that pay: a multiple of the price of paths alone."""
+    return evidence.model.pays_below * evidence.variance(evidence.radiance) ** evidence.model.denoised_power
 
 
 def _priced(evidence: Evidence, option: Option) -> tuple[float, float, Plan]:
-    """(Variance × cost, cost, best plan) with the lights of an option."""
+    """(:func:`price`, cost, best plan) with the lights of an option."""
     model, paths, samples = evidence.model, evidence.paths, evidence.samples
     rest = option.variance(evidence)
     cuts = model.emitter_cuts * option.emitters + option.surfaces
@@ -142,7 +147,7 @@ def _priced(evidence: Evidence, option: Option) -> tuple[float, float, Plan]:
     # The least of (left + vertex variance / share) × (cost + vertex cost × share)
     share = (model.vertex_variance * cost / (model.vertex_cost * left)) ** 0.5
     vertices = max(round(float(np.clip(share, model.least_vertices, 1)) * samples), 1)
-    return cost * left, cost, Plan(light_paths, option.emitters, error, vertices, left, "")
+    return cost * left**model.denoised_power, cost, Plan(light_paths, option.emitters, error, vertices, left, "")
 
 
 def _cut_rays(rest: float, samples: int, model: CostModel) -> tuple[float, float]:

@@ -8,7 +8,9 @@ import pytest
 from vpl.split.cost_model import CostModel, table
 from vpl.split.plan import Evidence, Option, choose, may_pay, price
 
-MODEL = CostModel()
+DENOISED = CostModel()
+# Lights pay as in raw images, and are as many as in denoised ones
+MODEL = replace(DENOISED, denoised_power=1.0)
 
 
 def balanced(direct, indirect, paths, samples, left=None):
@@ -39,6 +41,18 @@ def test_images_that_are_denoised_have_more_lights():
 
     unlimited = replace(MODEL, most_light_share=1.0, most_light_paths=10**9)
     assert light_paths(unlimited) == pytest.approx(2 * light_paths(unlimited.without_denoiser()), rel=0.05)
+
+
+def test_images_that_are_denoised_need_lights_that_remove_more_variance():
+    rng = np.random.default_rng(0)
+    indirect, direct = rng.exponential(size=(2, 10_000))
+    none = np.zeros(10_000)
+    for share, pays in ((0.0, True), (0.8, False)):
+        traced = share * direct + indirect
+        evidence = Evidence(traced, share * direct + none, np.ones(10_000), 10**8, 64, False, MODEL)
+        option = [Option(True, False, traced, indirect)]
+        assert choose(evidence, option).light_paths > 0
+        assert (choose(replace(evidence, model=DENOISED), option).light_paths > 0) == pays
 
 
 def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
