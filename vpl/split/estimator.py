@@ -138,8 +138,10 @@ def decide(view: View, start: Start) -> Decision:
 
 
 def _evidence(view: View, pilot: Pilot) -> Evidence:
-    emitters, direct = _may_carry_emitters(view), pilot.radiance - pilot.indirect
-    return Evidence(pilot.radiance, direct, pilot.brightness, view.count, view.samples, emitters, view.model)
+    emitters, direct = _may_carry_emitters(view), pilot.radiance - pilot.seen - pilot.indirect
+    return Evidence(
+        pilot.radiance, pilot.seen, direct, pilot.brightness, view.count, view.samples, emitters, view.model
+    )
 
 
 def _may_carry_emitters(view: View) -> bool:
@@ -191,7 +193,8 @@ def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
     if len(onward.path) == 0:
         return view, {}
     outgoing, predicted = OutgoingRadiance.learned(onward.position, onward.normal, onward.sent, model)
-    relative = onward.throughput / error_scale(decision.evidence.brightness, model)[onward.path]
+    of_paths, of_pixels = pilot.unseen
+    relative = onward.throughput / error_scale(of_paths, model)[onward.path]
     whole = decision.evidence.variance(pilot.radiance)
     paths = len(pilot.radiance)
     multiple = best_multiple(relative * predicted, relative * onward.sent, onward.edges, paths, whole, model)
@@ -200,7 +203,7 @@ def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
     if decision.plan.gathers:
         # The less variance remains, the more a contribution matters
         multiple *= (whole / max(decision.plan.variance, 1e-9)) ** 0.5
-    importance = upload(mi.Float, multiple / error_scale(pilot.nearby(pilot.radiance), model))
+    importance = upload(mi.Float, multiple / error_scale(of_pixels, model))
     return replace(view, outgoing=outgoing, importance=importance), {"roulette": f"{multiple:.3g}"}
 
 

@@ -108,14 +108,15 @@ class Traced:
     """Result of :func:`trace_paths`, one record per lane, evaluated.
 
     ``radiance``; ``drawn``: a contribution over its probability, from a path of ``length`` edges to an emitter of
-    ``group``; ``valid``: whether a surface counts in the film's alpha; ``edges`` without the last; ``gathered``: gather
-    vertices.
+    ``group``; ``seen``: emission at the end of the first edge, mean over channels; ``valid``: whether a surface counts
+    in the film's alpha; ``edges`` without the last; ``gathered``: gather vertices.
     """
 
     radiance: mi.UnpolarizedSpectrum
     drawn: mi.UnpolarizedSpectrum
     length: mi.UInt32
     group: mi.UInt32
+    seen: mi.Float
     valid: mi.Bool
     edges: mi.UInt32
     gathered: Gathered
@@ -137,7 +138,7 @@ def trace_paths(
     """
     context, count = mi.BSDFContext(), dr.width(first.throughput)
     path, found, gathered = Path.of(first), Contributions.none(count, sums), Gathered.none(count)
-    lane = dr.arange(mi.UInt32, count)
+    lane, seen = dr.arange(mi.UInt32, count), mi.Float(0)
 
     while dr.hint(path.active, exclude=[first, lattice, settings, emitters, context, lane]):
         # ---------------------- Hit ----------------------
@@ -148,6 +149,7 @@ def trace_paths(
         mis = power_heuristic(path.density, met.density)
         emission = _less_carried(path, met, settings) * met.radiance * mis
         found.add(emission, path.depth + 1, met.group, sampler.next_1d(), lane)
+        seen += dr.select(path.depth == 0, channel_mean(emission), 0)
 
         # ---------------------- Subtraction: w β F1 F2 of x2 ----------------------
         connects = _carry(path, hit, settings, found.radiance, gathered)
@@ -184,7 +186,7 @@ def trace_paths(
             _pass_hidden(path, hit, first)
 
     gathered.finish()
-    traced = Traced(found.radiance, found.one, found.length, found.group, path.valid, path.depth, gathered)
+    traced = Traced(found.radiance, found.one, found.length, found.group, seen, path.valid, path.depth, gathered)
     dr.eval(traced)
     return traced
 

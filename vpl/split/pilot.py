@@ -47,9 +47,9 @@ class Onward:
 class Pilot:
     """Paths in pairs of neighbouring samples, usually of the same pixel.
 
-    ``pixel``, ``radiance`` (n,): of each path; ``indirect`` (n,): part of the radiance through arrivals.  Values may be
-    negative if virtual lights carry a part.  ``vertices``: positions and normals (k, 3) of first and second vertices;
-    ``size``: width of the image and number of pixels.
+    ``pixel``, ``radiance`` (n,): of each path; ``seen`` (n,): emission on the first edge; ``indirect`` (n,): part of
+    the radiance through arrivals.  Values may be negative if virtual lights carry a part.  ``vertices``: positions and
+    normals (k, 3) of first and second vertices; ``size``: width of the image and number of pixels.
     """
 
     arrivals: Arrivals
@@ -57,6 +57,7 @@ class Pilot:
     vertices: tuple[np.ndarray, np.ndarray]
     pixel: np.ndarray
     radiance: np.ndarray
+    seen: np.ndarray
     indirect: np.ndarray
     size: tuple[int, int]
     model: CostModel
@@ -73,12 +74,15 @@ class Pilot:
     @classmethod
     def of(cls, traced: Traced, pixel: np.ndarray, size: tuple[int, int], model: CostModel) -> Pilot:
         """The pilot of traced paths in the pixels ``pixel`` (n,)."""
-        radiance = np.nan_to_num(download(channel_mean(traced.radiance)).astype(np.float64), posinf=0, neginf=0)
+        radiance, seen = (
+            np.nan_to_num(download(x).astype(np.float64), posinf=0, neginf=0)
+            for x in (channel_mean(traced.radiance), traced.seen)
+        )
         edges = download(traced.edges).astype(np.int64)
         arrivals, onward, indirect = _second_vertices(traced.gathered.second, radiance, edges)
         first, facing = _first_vertices(traced.gathered.first)
         vertices = np.concatenate([first, arrivals.position]), np.concatenate([facing, arrivals.normal])
-        return cls(arrivals, onward, vertices, pixel, radiance, indirect, size, model)
+        return cls(arrivals, onward, vertices, pixel, radiance, seen, indirect, size, model)
 
     @property
     def brightness(self) -> np.ndarray:
@@ -88,6 +92,17 @@ class Pilot:
     def nearby(self, values: np.ndarray) -> np.ndarray:
         """Mean of the paths' ``values`` (n,) around each pixel of the image, (pixels,)."""
         return pixel_means(values, self.pixel, *self.size, self._of_others[1])
+
+    @cached_property
+    def unseen(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean radiance without emission on first edges: (around each path, (n,), estimated from the remaining paths;
+        around each pixel, (pixels,)).
+
+        The means reach beyond single pixels: with the emission of a small lamp, pixels beside it would count as bright.
+        """
+        values = self.radiance - self.seen
+        means, priors = means_of_others(values, self.pixel, *self.size, self.model)
+        return means, pixel_means(values, self.pixel, *self.size, priors)
 
     @cached_property
     def _of_others(self) -> tuple[np.ndarray, list[float]]:

@@ -79,11 +79,13 @@ class Option:
 class Evidence:
     """Measurements of a pilot for an image of ``paths`` camera paths, ``samples`` for a pixel.
 
-    ``radiance`` (n,) of the pilot's paths, in pairs; ``direct`` (n,): without the part available to lights on surfaces;
+    ``radiance`` (n,) of the pilot's paths, in pairs; ``seen`` (n,): emission on their first edges; ``direct`` (n,):
+    without ``seen`` and the part available to lights on surfaces;
     ``brightness`` (n,) of the image nearby; ``emitters``: whether lights may represent many emitters.
     """
 
     radiance: np.ndarray
+    seen: np.ndarray
     direct: np.ndarray
     brightness: np.ndarray
     paths: int
@@ -92,11 +94,17 @@ class Evidence:
     model: CostModel
 
     def variance(self, radiance: np.ndarray) -> float:
-        """Relative variance of a path with ``radiance`` (n,), where the samples of a pixel are stratified."""
-        model = self.model
-        retained = max(model.stratified_many if self.emitters else model.stratified, self.samples**-0.5)
+        """Relative variance of a path with ``radiance`` (n,), where the samples of a pixel are stratified.
+
+        Emitters that are seen directly make noise at their edges in the pixel.  Of it, n stratified samples retain the
+        fraction n^-0.5 [Mitchell 1996, "Consequences of stratified sampling in graphics"].
+        """
+        model, edges = self.model, self.samples**-0.5
+        retained = max(model.stratified_many if self.emitters else model.stratified, edges)
         whole = relative_variance(radiance, self.brightness, model)
-        return whole - (1 - retained) * min(relative_variance(self.direct, self.brightness, model), whole)
+        unseen = min(relative_variance(radiance - self.seen, self.brightness, model), whole)
+        direct = min(relative_variance(self.direct, self.brightness, model), unseen)
+        return edges * (whole - unseen) + unseen - (1 - retained) * direct
 
 
 def choose(evidence: Evidence, options: list[Option]) -> Plan:

@@ -11,12 +11,16 @@ from vpl.split.plan import Evidence, Option, choose, may_pay, price
 DENOISED = CostModel()
 # Lights pay as in raw images, and are as many as in denoised ones
 MODEL = replace(DENOISED, denoised_power=1.0)
+# No emitter is seen directly
+UNSEEN = 0.0
 
 
 def balanced(direct, indirect, paths, samples, left=None):
     """The balance of an image of an even brightness; ``left``: of it besides lights on surfaces, if followed."""
     option = Option(True, False, direct + indirect, indirect, left)
-    return choose(Evidence(direct + indirect, direct, np.ones(len(direct)), paths, samples, False, MODEL), [option])
+    return choose(
+        Evidence(direct + indirect, UNSEEN, direct, np.ones(len(direct)), paths, samples, False, MODEL), [option]
+    )
 
 
 def test_lights_pay_where_indirect_light_is_the_noise_and_only_there():
@@ -26,7 +30,7 @@ def test_lights_pay_where_indirect_light_is_the_noise_and_only_there():
     assert balanced(none, indirect, 10**8, 64).light_paths > 0
     assert balanced(none, indirect, 10**4, 64).light_paths == 0
     assert balanced(direct, 1e-3 * indirect, 10**7, 64).light_paths == 0
-    assert choose(Evidence(direct, direct, none + 1, 10**8, 64, False, MODEL), []).light_paths == 0
+    assert choose(Evidence(direct, UNSEEN, direct, none + 1, 10**8, 64, False, MODEL), []).light_paths == 0
 
 
 def test_images_that_are_denoised_have_more_lights():
@@ -36,7 +40,7 @@ def test_images_that_are_denoised_have_more_lights():
 
     def light_paths(model):
         option = Option(True, False, indirect, indirect)
-        evidence = Evidence(indirect, none, np.ones(10_000), 10**7, 1024, False, model)
+        evidence = Evidence(indirect, UNSEEN, none, np.ones(10_000), 10**7, 1024, False, model)
         return choose(evidence, [option]).light_paths
 
     unlimited = replace(MODEL, most_light_share=1.0, most_light_paths=10**9)
@@ -49,10 +53,25 @@ def test_images_that_are_denoised_need_lights_that_remove_more_variance():
     none = np.zeros(10_000)
     for share, pays in ((0.0, True), (1.2, False)):
         traced = share * direct + indirect
-        evidence = Evidence(traced, share * direct + none, np.ones(10_000), 10**8, 64, False, MODEL)
+        evidence = Evidence(traced, UNSEEN, share * direct + none, np.ones(10_000), 10**8, 64, False, MODEL)
         option = [Option(True, False, traced, indirect)]
         assert choose(evidence, option).light_paths > 0
         assert (choose(replace(evidence, model=DENOISED), option).light_paths > 0) == pays
+
+
+def test_edges_of_emitters_in_a_pixel_are_less_noise_the_more_samples_there_are():
+    """Stratified samples resolve the edges, and leave the rest."""
+    rng = np.random.default_rng(0)
+    indirect, seen = rng.exponential(size=10_000), 10.0 * rng.integers(0, 2, 10_000)
+
+    def variance(seen, samples):
+        evidence = Evidence(indirect + seen, seen, 0 * indirect, np.ones(10_000), 10**8, samples, False, MODEL)
+        return evidence.variance(indirect + seen)
+
+    alone = variance(0 * seen, 1)
+    assert variance(0 * seen, 10_000) == pytest.approx(alone)
+    assert variance(seen, 1) > 20 * alone
+    assert variance(seen, 10_000) - alone == pytest.approx((variance(seen, 1) - alone) / 100)
 
 
 def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
@@ -72,7 +91,7 @@ def test_the_more_lights_leave_the_higher_their_price(paths, samples, emitters):
     indirect, direct = rng.exponential(size=(2, 10_000))
     for scale in (1e-3, 1, 1e3):
         traced, small = direct + scale * indirect, 1e-3 * indirect
-        evidence = Evidence(traced, direct, np.ones(10_000), paths, samples, emitters, MODEL)
+        evidence = Evidence(traced, UNSEEN, direct, np.ones(10_000), paths, samples, emitters, MODEL)
         assumed = Option(True, emitters, traced, scale * indirect)
         prices = [price(evidence, replace(assumed, residual=noise * traced)) for noise in (0, 0.1, 0.5, 1, 2, 8, 64)]
         assert prices[0] == price(evidence, assumed)
@@ -83,7 +102,10 @@ def test_the_more_lights_leave_the_higher_their_price(paths, samples, emitters):
 def test_what_is_followed_has_to_promise_more_than_all_that_is_known():
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
-    evidence, none = Evidence(direct + indirect, direct, np.ones(10_000), 10**8, 64, False, MODEL), np.zeros(10_000)
+    evidence, none = (
+        Evidence(direct + indirect, UNSEEN, direct, np.ones(10_000), 10**8, 64, False, MODEL),
+        np.zeros(10_000),
+    )
     good, better = Option(True, False, direct + indirect, indirect), Option(False, True, 0.1 * direct, none)
     useless = replace(good, residual=4 * indirect)
     assert may_pay(evidence, good, []) and may_pay(evidence, better, [good])
