@@ -132,20 +132,6 @@ class ManyLightsIntegrator(GatheringIntegrator):
     """
 
     knobs = (
-        Words(
-            "layers", "",
-            "Parts of the image as additional channels: {allowed}, the light of paths with one, two, and more edges, "
-            "as ``max_depth`` counts them.",
-            words=LENGTHS,
-        ),
-        Groups(
-            "light_groups", "",
-            "Groups of emitters whose light becomes additional channels, such as ``lamps=lamp*,bulb; sky=env``: names "
-            "and patterns. An emitter belongs to the first group of which a pattern is equal to its id, the id of its "
-            "shape, or its class, such as ``SunskyEmitter``; ``*`` and ``?`` stand for any characters. The remaining "
-            f"emitters are the group ``{OTHER}``.",
-            reserved=_RESERVED,
-        ),
         Boolean(
             "virtual_lights", True,
             "Whether virtual lights may carry indirect light and the light of many emitters, where they pay. Otherwise "
@@ -167,6 +153,20 @@ class ManyLightsIntegrator(GatheringIntegrator):
             "stratified", True,
             "Whether the plugin stratifies the samples in a pixel, on the lens and in time if the sensor's sampler is "
             "``independent``, Mitsuba's default. Other samplers, and the sensor ``batch``, keep their samples.",
+        ),
+        Words(
+            "layers", "",
+            "Parts of the image as additional channels: {allowed}, the light of paths with one, two, and more edges, "
+            "as ``max_depth`` counts them.",
+            words=LENGTHS,
+        ),
+        Groups(
+            "light_groups", "",
+            "Groups of emitters whose light becomes additional channels, such as ``lamps=lamp*,bulb; sky=env``: names "
+            "and patterns. An emitter belongs to the first group of which a pattern is equal to its id, the id of its "
+            "shape, or its class, such as ``SunskyEmitter``; ``*`` and ``?`` stand for any characters. The remaining "
+            f"emitters are the group ``{OTHER}``.",
+            reserved=_RESERVED,
         ),
     )  # fmt: skip
 

@@ -101,7 +101,7 @@ class UniformEmitters:
     def __init__(self, scene, groups: EmitterGroups | None = None):
         self._scene, self.groups = scene, groups
         emitters = scene.emitters()
-        self._group = dr.opaque(mi.UInt32, groups.number(emitters[0])) if groups and emitters else mi.UInt32(0)
+        self._group = dr.opaque(mi.UInt32, groups.number(emitters[0]) if groups and emitters else 0)
 
     def cell(self, position, facing):
         """The only cell."""
