@@ -195,7 +195,7 @@ def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
     outgoing, predicted = OutgoingRadiance.learned(onward.position, onward.normal, onward.sent, model)
     of_paths, of_pixels = pilot.unseen
     relative = onward.throughput / error_scale(of_paths, model)[onward.path]
-    whole = decision.evidence.variance(pilot.radiance)
+    whole = decision.evidence.whole
     paths = len(pilot.radiance)
     multiple = best_multiple(relative * predicted, relative * onward.sent, onward.edges, paths, whole, model)
     if not np.isfinite(multiple):

@@ -131,8 +131,8 @@ def light_clusters(
     """Add the light of virtual lights at the clusters to ``result``, per camera ray; returns the number of shadow rays.
 
     ``allowed`` (clusters,): largest bound of a pair, as a contribution to the sum over the samples of the pixel;
-    ``sums`` by layer.  A light of a node is drawn in proportion to intensity, so the drawn lights of a group
-    have the expectation of the lights of the group.
+    ``sums`` by layer.  A light of a node is drawn in proportion to intensity, so the drawn lights of a group have the
+    expectation of the lights of the group.
     """
     with np.errstate(over="ignore"):  # a cluster without weight may have any error
         allowed = allowed / np.maximum(clusters.weight, np.finfo(np.float64).tiny)

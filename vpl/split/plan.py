@@ -8,6 +8,7 @@ has a power of the variance: what a denoiser leaves is in part made at edges, wh
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -80,8 +81,8 @@ class Evidence:
     """Measurements of a pilot for an image of ``paths`` camera paths, ``samples`` for a pixel.
 
     ``radiance`` (n,) of the pilot's paths, in pairs; ``seen`` (n,): emission on their first edges; ``direct`` (n,):
-    without ``seen`` and the part available to lights on surfaces;
-    ``brightness`` (n,) of the image nearby; ``emitters``: whether lights may represent many emitters.
+    without ``seen`` and the part available to lights on surfaces; ``brightness`` (n,) of the image nearby;
+    ``emitters``: whether lights may represent many emitters.
     """
 
     radiance: np.ndarray
@@ -92,6 +93,11 @@ class Evidence:
     samples: int
     emitters: bool
     model: CostModel
+
+    @cached_property
+    def whole(self) -> float:
+        """Relative variance of a path without virtual lights."""
+        return self.variance(self.radiance)
 
     def variance(self, radiance: np.ndarray) -> float:
         """Relative variance of a path with ``radiance`` (n,), where the samples of a pixel are stratified.
@@ -111,9 +117,8 @@ def choose(evidence: Evidence, options: list[Option]) -> Plan:
     """The plan of the option with the least variance × cost; without lights if no option pays."""
     if not options:
         return without_lights("no light comes by way of surfaces that virtual lights could stand for")
-    whole = evidence.variance(evidence.radiance)
     product, cost, best = min((_priced(evidence, option) for option in options), key=lambda option: option[0])
-    remains = best.variance / max(whole, _TINY)
+    remains = best.variance / max(evidence.whole, _TINY)
     if product > _most_to_pay(evidence):
         costs = f"virtual lights would cost {cost - 1:.2g} times as much as the paths"
         return without_lights(f"{costs} and leave {remains:.0%} of the variance")
@@ -137,7 +142,7 @@ def may_pay(evidence: Evidence, option: Option, others: list[Option]) -> bool:
 
 def _most_to_pay(evidence: Evidence) -> float:
     """Largest price of lights that pay: a multiple of the price of paths alone."""
-    return evidence.model.pays_below * evidence.variance(evidence.radiance) ** evidence.model.denoised_power
+    return evidence.model.pays_below * evidence.whole**evidence.model.denoised_power
 
 
 def _priced(evidence: Evidence, option: Option) -> tuple[float, float, Plan]:

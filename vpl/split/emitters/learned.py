@@ -169,13 +169,19 @@ def _share(found: np.ndarray, possible: np.ndarray, axes: tuple) -> np.ndarray:
 
 
 class CellEmitters:
-    """Shared part of the samplers with a :class:`CellChoice`; ``_scene``, ``choice``: set by the subclass."""
+    """Shared part of the samplers with a :class:`CellChoice`; ``_scene``, ``choice``, ``groups``: set by the
+    subclass."""
 
     choice: CellChoice
+    groups: EmitterGroups | None
 
     def cell(self, position, facing):
         """See :meth:`vpl.split.emitters.base.EmitterSampler.cell`."""
         return self.choice.cell(position, facing)
+
+    def _group_met(self, si) -> mi.UInt32:
+        """Group of the emitter at the end of a ray, 0 without groups."""
+        return self.groups.met(si) if self.groups else mi.UInt32(0)
 
     def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> bool:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.learn`."""
@@ -319,7 +325,7 @@ class LearnedEmitters(CellEmitters):
                 lambda origin, cell, direction, density: self._density_met(origin, cell, direction),
                 lambda origin, cell, direction, density: density,
             )
-        return MetEmitter(emitted, density, self.groups.met(si) if self.groups else mi.UInt32(0))
+        return MetEmitter(emitted, density, self._group_met(si))
 
 
 def _reproducible_order(emitters: list) -> np.ndarray:

@@ -326,5 +326,4 @@ class TreeEmitters(CellEmitters):
             pdf = finite_or_zero(self._environment.pdf_direction(origin, ds, here))
             probability = self._distant_probability(mi.UInt32(self._distant - 1), cell, here)
             density = dr.select(here, pdf * probability, density)
-        group = self.groups.met(si) if self.groups else mi.UInt32(0)
-        return MetEmitter(emitted_towards(self._emitters, si, active), density, group, nearness)
+        return MetEmitter(emitted_towards(self._emitters, si, active), density, self._group_met(si), nearness)
