@@ -20,8 +20,8 @@ GROWTH = 1.25  # of the samples between estimates
 class ErrorEstimate:
     """Weighted variance between passes of the mean over colour channels, in double precision.
 
-    With x_k the value of a pixel in pass k of w_k samples per pixel, W = Σ w_k and m = Σ w_k x_k / W, the estimate of
-    the variance of m is Σ w_k² (x_k − m)² / (W² − Σ w_k²). The estimate is unbiased if the variance of x_k is
+    With x_k the value of a pixel in pass k of weight w_k (`Pass.weight`), W = Σ w_k and m = Σ w_k x_k / W, the estimate
+    of the variance of m is Σ w_k² (x_k − m)² / (W² − Σ w_k²). The estimate is unbiased if the variance of x_k is
     proportional to 1 / w_k, and for passes of equal size. It is nearly unbiased if passes of different sizes have equal
     variance, as by virtual lights of each pass. Memory: three images of one channel, and the first pass, which is
     subtracted from all passes against cancellation.
@@ -32,7 +32,7 @@ class ErrorEstimate:
         self._origin, self._sum, self._first_moment, self._second_moment = 0.0, 0.0, 0.0, 0.0
 
     def add(self, image, weight):
-        """Add a pass: colour (height, width, 3) and samples per pixel."""
+        """Add a pass: colour (height, width, 3) and weight."""
         level = np.asarray(image, np.float64).mean(axis=-1)
         if self._count == 0:
             self._origin = level

@@ -1,16 +1,18 @@
-"""Samples per pixel of the next pass of a render: passes take about two seconds, or grow to ten.
+"""Samples per pixel of the next pass of a render: passes take about two seconds, in parts about ten.
 
-Passes in parts grow, as they can be stopped between parts: a pass takes about as long as all passes before it together,
-up to ten seconds, the last pass up to twice that. They are longer than two seconds, too, if starting a pass is slow:
-the start takes a quarter of the pass, up to about ten seconds, or up to twice the time of the start.
+Passes in parts take long, as they can be stopped between parts, and as large ones gain most: virtual lights pay from
+some size on, and samples are stratified within a pass. Such a pass takes about ten seconds, or twice the time of its
+start, and the last pass up to twice that. With a time limit of ten seconds a render has a small pass, one of about half
+of the time, and one that fills the rest.
 
-Sizes are powers of two, from 4 if the number of pixels allows: Mitsuba compiles a single kernel for these sizes, but
-other kernels for sizes between, and, with some film filters, below 4. Starting a pass in parts takes longer than that,
-so its size may be 2, and the last pass has the size that fills the remaining time. The first pass is small, as its cost
-is unknown. Each later pass has the size of the pass before it, or grows by a factor that the measured time allows. The
-first pass with a kernel includes compilation, so its time is an upper bound of the cost: growing by it is safe.
-Shrinking requires a second pass of equal size; so does growth that risks twice the time, for passes that are slow to
-start.
+The first pass is small, as its cost is unknown. Sizes are powers of two, from 4 if the number of pixels allows: Mitsuba
+compiles a single kernel for these sizes, but other kernels for sizes between, and, with some film filters, below 4.
+Each later pass has the size of the pass before it, or grows by a factor that the measured time allows. The first pass
+with a kernel includes compilation, so its time is an upper bound of the cost: growing by it is safe. Shrinking requires
+a second pass of equal size; so does growth that risks twice the time, for passes that are slow to start.
+
+Passes in parts report the time of their start, so that one pass tells the cost of any size, and sizes from the second
+pass on may be any number: `manylights` needs a single further kernel for them.
 """
 
 import math
@@ -18,14 +20,15 @@ import math
 from .rendering import largest_pass
 
 PASS_SECONDS = 2.0
-START_SHARE = 0.25  # maximum fraction of a pass in parts for its start
-MOST_SECONDS, LEAST_REST = 10.0, 1.0  # of a pass in parts; minimum ratio of its rest to its start, which has priority
+PART_SECONDS, LEAST_REST = 10.0, 1.0  # of a pass in parts; minimum ratio of its rest to its start, which has priority
+LEAST_GAIN = 1 / 16  # minimum size of a last pass in parts, as a fraction of the intended size
+LIT = 2.0  # cost of a sample with virtual lights over that without, at most: small passes have no lights
 LONGEST = 2.0  # times the wanted seconds: longer passes shrink
 CHANGED = 1.5  # ratio of the times of two passes of equal size at which earlier times are discarded
 MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of a prediction from one size for another
 USUAL = 4  # samples per pixel; all powers of two from here have the same kernels
 FIRST_SAMPLES = 2**19  # maximum pixel samples of a first pass, unless one per pixel is more
-KERNEL_SECONDS = 0.3  # to compile the kernel of a size that is no power of two
+KERNEL_SECONDS = 0.1  # to compile the kernel of the first size that is no power of two
 LEAST_SHARE = 0.1  # minimum fraction of a pass's time that is assumed proportional to its samples
 PARTS = 8  # with an error limit, a pass has at most this fraction, 1/8, of the samples so far
 
@@ -43,7 +46,8 @@ class PassSizes:
         self._least = USUAL if USUAL * pixels <= FIRST_SAMPLES else 1
         self._current, self._seconds, self._asked = fixed or self._least, {}, None
         self._known = {}  # size -> seconds of the last pass; not of the first pass, which compiles
-        self._spent = 0.0  # seconds of all passes
+        self._starts = {}  # size -> seconds to start the last pass, of passes that report them
+        self._lit = False  # whether a pass had virtual lights
         self._before = None  # number of passes from a checkpoint; None until the first call
 
     def next(self, passes, elapsed):
@@ -53,9 +57,8 @@ class PassSizes:
         if self._before is None:
             self._before = len(passes)
             self._asked = passes[-1].spp if passes else None
-        self._spent = sum(one.seconds for one in passes)
         if passes:
-            self._learn(passes[-1].seconds, done, compiles=len(passes) == self._before + 1)
+            self._learn(passes[-1], done, compiles=len(passes) == self._before + 1)
         size = self._current
         if self._spp is not None:
             if done >= self._spp:
@@ -74,9 +77,12 @@ class PassSizes:
             return left
         return min(size, left if self._fixed or left < USUAL else _power_of_two(left))
 
-    def _learn(self, seconds, done, compiles):
-        """Record the time of the last pass, and choose the size of later passes."""
-        repeated = self._asked in self._seconds
+    def _learn(self, last, done, compiles):
+        """Record the time of the `last` pass, and choose the size of later passes."""
+        repeated, seconds = self._asked in self._seconds, last.seconds
+        if last.start_seconds is not None:
+            self._starts[self._asked] = last.start_seconds
+            self._lit |= last.has_lights
         # The first pass of a size may have compiled kernels
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
         if not compiles:
@@ -99,6 +105,8 @@ class PassSizes:
         """Return the size of a pass of at most `wanted` seconds, from the `seconds` of a pass of the current size."""
         if line:
             start, each = line
+            if self._starts and not self._many:
+                return self._kept(int((wanted - start) / each))
             return min(_power_of_two((wanted - start) / each), MOST_GROWTH * self._current)
         grown = _power_of_two(self._current * wanted / max(seconds, 1e-6))
         if repeated and seconds < wanted:
@@ -108,32 +116,44 @@ class PassSizes:
         return grown
 
     def _in_time(self, size, left):
-        """Return the size, about `size` samples, of a pass within `left` seconds. If there is none, return the least
-        size if `left` is at least half of its time, otherwise 0."""
+        """Return the size, about `size` samples, of a pass within `left` seconds.
+
+        If there is none, return the least size if `left` is at least half of its time, otherwise 0; also 0 if a last
+        pass in parts would be far smaller.
+        """
         least = size if self._fixed else min(size, self._least)
         line = self._line()
         if self._in_parts and not self._many and not self._fixed and line:
             filling = int((left - line[0] - KERNEL_SECONDS) / line[1])
-            while filling > least and not self._accepts(filling):
-                filling -= 1
+            if filling < LEAST_GAIN * size:
+                return 0
+            certain = self._kept(self._certain(filling))
             # A single last pass, instead of several ever smaller ones
-            if least <= filling <= self._largest and filling < (size if self._spp else 2 * size):
-                return filling
+            if least <= certain <= self._largest and filling < (size if self._spp else 2 * size):
+                return certain
         while size > least and self._expected(size) > left:
             size = max(least, _power_of_two(size - 1))
         return size if self._expected(size) <= 2 * left else 0
+
+    def _certain(self, size):
+        """Return the largest size up to `size` that takes no longer than expected if its pass has virtual lights."""
+        known = max(self._known, default=0)
+        return int(size if self._lit or not known else min(size, max(known, size / LIT)))
+
+    def _kept(self, size):
+        """Return the largest size up to `size` that the sampler keeps."""
+        while size > 1 and not self._accepts(size):
+            size -= 1
+        return size
 
     def _wanted(self):
         """Return the intended seconds of a pass."""
         if not self._in_parts:
             return PASS_SECONDS
         line, seconds = self._line(), self._seconds[self._asked]
-        growing = max(min(self._spent, MOST_SECONDS), PASS_SECONDS)
-        if line:
-            return max(min(line[0] / START_SHARE, MOST_SECONDS), (1 + LEAST_REST) * line[0], growing)
-        # The start may take all the time
-        most = MOST_SECONDS if seconds < MOST_SECONDS else (1 + LEAST_REST) * seconds
-        return max(min(seconds / START_SHARE, most), growing)
+        # Without a line, the start may take all the time
+        start = line[0] if line else seconds if seconds > PART_SECONDS else 0.0
+        return max(PART_SECONDS, (1 + LEAST_REST) * start)
 
     def _expected(self, size):
         """Return the expected seconds of a pass: those of an earlier pass of this size, or by `_line`, or, if that is
@@ -148,13 +168,20 @@ class PassSizes:
         return start + each * size
 
     def _line(self):
-        """Return the seconds to start a pass, and the seconds per sample per pixel, from the largest size and the least
-        one within `MOST_GROWTH` of it; None if there is no such pair."""
-        large = max(self._known, default=0)
+        """Return the seconds to start a pass, and the seconds per sample per pixel; None if unknown.
+
+        From the start that the largest pass reports, or else from the largest size and the least one within
+        `MOST_GROWTH` of it.
+        """
+        large = max(self._known or self._starts, default=0)
+        longest = self._known.get(large) or self._seconds.get(large)
+        if large in self._starts:
+            each = max((longest - self._starts[large]) / large, LEAST_SHARE * longest / large)
+            # Larger passes than the first one may have virtual lights
+            return self._starts[large], each if self._known or self._lit else LIT * each
         small = min((size for size in self._known if MOST_GROWTH * size >= large), default=0)
         if small == large:
             return None
-        longest = self._known[large]
         each = (longest - self._known[small]) / (large - small)
         each = min(max(each, LEAST_SHARE * longest / large), longest / large)
         return longest - each * large, each

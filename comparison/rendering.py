@@ -10,12 +10,15 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.garbage import garbage_kept
+from vpl.core.stages import Stage
 
 from .convergence import ErrorEstimate
 from .images import colour
 
 MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the time to the first image
 MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
+# Stages of `manylights` with times about proportional to the samples
+PER_SAMPLE = Stage.LIGHTS, Stage.TREE, Stage.TRACED, Stage.CLUSTERS, Stage.CUTS
 
 
 def pass_seed(seed, index):
@@ -46,6 +49,25 @@ class Pass:
     spp: int
     seconds: float
     statistics: dict = field(default_factory=dict)
+
+    @property
+    def weight(self):
+        """Weight in the average of passes: the precision that the integrator expects of the pass before rendering it,
+        or else the samples per pixel. Passes of `manylights` without virtual lights are noisier than the others."""
+        return self.statistics.get("precision", self.spp)
+
+    @property
+    def has_lights(self):
+        """Whether `manylights` used virtual lights."""
+        return Stage.CUTS in self.statistics.get("seconds", {})
+
+    @property
+    def start_seconds(self):
+        """Seconds that do not grow with the samples; None if the integrator does not report them."""
+        stages = self.statistics.get("seconds", {})
+        if Stage.TRACED not in stages:
+            return None
+        return max(self.seconds - sum(stages.get(stage, 0.0) for stage in PER_SAMPLE), 0.0)
 
 
 @dataclass
@@ -110,7 +132,7 @@ def _sharing(scene, sensor, integrator, this, first, shared):
 
 
 class Passes:
-    """Running average of the passes of a render, weighted by samples per pixel.
+    """Running average of the passes of a render by their weights (`Pass.weight`).
 
     The average depends only on the passes and their order. `channels`: names of the channels ("R", "G", "B", AOVs),
     empty before the first pass; `passes`: a list of `Pass`; `estimate`: the `ErrorEstimate` of the passes.
@@ -129,8 +151,8 @@ class Passes:
         # In double precision, as long sums of single-precision numbers drift
         planes, one = image.planes.astype(np.float64), image.taken
         self.channels = image.channels
-        self.sum = self.sum + one.spp * planes
-        self.estimate.add(_shown(planes, self.channels), one.spp)
+        self.sum = self.sum + one.weight * planes
+        self.estimate.add(_shown(planes, self.channels), one.weight)
         self.passes.append(one)
         return one
 
@@ -147,7 +169,7 @@ class Passes:
     @property
     def image(self):
         """The average, (height, width, channels) float64."""
-        return self.sum / self.spp
+        return self.sum / sum(one.weight for one in self.passes)
 
 
 class Progressive(Passes):

@@ -7,6 +7,7 @@ import pytest
 
 from comparison.pass_sizes import PASS_SECONDS, PassSizes
 from comparison.rendering import MAXIMUM_PASS_SAMPLES, Pass
+from vpl.core.stages import Stage
 
 SQUARE = 256 * 256
 
@@ -24,7 +25,8 @@ def render(pixels, start, each, compilation=3.0, more=None, slow=None, **limits)
         compilation = compilation if more is None else more
         seconds *= 3 if slow is not None and len(passes) >= slow else 1
         kernels.add(kernel)
-        passes.append(Pass(0, spp, seconds))
+        traced = {"seconds": {Stage.TRACED: seconds - start, Stage.CUTS: 0.0}} if limits.get("in_parts") else {}
+        passes.append(Pass(0, spp, seconds, traced))
         elapsed += seconds
     raise AssertionError("endless")
 
@@ -73,15 +75,25 @@ def test_in_parts_at_most_a_quarter_of_a_pass_starts_it(start, each):
 
 @pytest.mark.parametrize("start", [0.0, 0.3])
 @pytest.mark.parametrize("each", [0.02, 0.3])
-def test_in_parts_passes_grow(start, each):
-    """A pass takes at most as long as all passes before it or two seconds; the last one fills the time."""
+def test_in_parts_passes_take_about_ten_seconds_from_the_third_on(start, each):
     passes, _ = render(SQUARE // 16, start, each, time=120, more=0.1, in_parts=True)
-    before = passes[0].seconds
-    for one in passes[1:]:
-        longest = 1.5 * max(min(before, 10), PASS_SECONDS)
-        assert one.seconds < longest * (2 if one is passes[-1] else 1)
-        before += one.seconds
-    assert 5 < max(one.seconds for one in passes) and len(passes) < 30
+    assert all(4 < one.seconds < 1.5 * 10 for one in passes[2:-1])
+    assert len(passes) < 30
+
+
+@pytest.mark.parametrize("lit", [1.0, 1.6])
+@pytest.mark.parametrize("time", [3, 10])
+def test_in_parts_a_short_render_has_one_small_pass_and_few_large_ones(time, lit):
+    """Samples of passes above 20 cost `lit` times those of smaller ones, as with virtual lights."""
+    sizes, passes, elapsed = PassSizes(SQUARE // 2, time=time, in_parts=True), [], 0.0
+    while not isinstance(spp := sizes.next(passes, elapsed), str):
+        traced = 0.05 * spp * (lit if spp > 20 else 1)
+        stages = {Stage.TRACED: traced} | ({Stage.CUTS: 0.0} if lit > 1 and spp > 20 else {})
+        passes.append(Pass(0, spp, 0.3 + traced, {"seconds": stages}))
+        elapsed += 0.3 + traced
+    large = [one for one in passes if one.spp > 8]
+    assert passes[0].spp == 4 and 1 <= len(large) <= 3 and -0.8 < elapsed - time < 0.3
+    assert sum(one.spp for one in large) > 0.8 * sum(one.spp for one in passes)
 
 
 def test_in_parts_large_images_are_not_left_with_one_sample():
@@ -122,10 +134,9 @@ def test_in_parts_an_error_has_more_than_one_pass_however_few_the_samples(spp):
 
 
 @pytest.mark.parametrize("time", [10, 12, 13, 14, 20])
-def test_in_parts_only_a_last_pass_has_an_odd_size(time):
+def test_in_parts_a_limit_of_samples_and_of_time(time):
     passes, ended_by = render(SQUARE, 0.3, 0.1, spp=100, time=time, more=0.1, in_parts=True)
-    odd = [one.spp for one in passes if one.spp & (one.spp - 1)]
-    assert odd in ([], [passes[-1].spp])
+    assert sum(one.spp for one in passes) <= 100 and len(passes) <= 4
     assert 0.8 * time < sum(one.seconds for one in passes) < time + 0.5 or ended_by == "spp"
 
 
@@ -135,11 +146,12 @@ def test_in_parts_the_last_pass_has_a_size_that_the_sampler_keeps():
     )
     odd = [one.spp for one in passes if one.spp & (one.spp - 1)]
     assert ended_by == "time" and odd and all(math.isqrt(spp) ** 2 == spp for spp in odd)
+    assert len(passes) < 8
 
 
 def test_in_parts_ten_seconds_hold_few_passes():
     passes, _ = render(SQUARE // 2, 0.3, 0.06, time=10, more=0.1, compilation=0.7, in_parts=True)
-    assert len(passes) <= 5
+    assert len(passes) <= 4
 
 
 def test_in_parts_an_error_still_has_many_passes():

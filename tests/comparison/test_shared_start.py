@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import manylights
-from comparison.rendering import SharedStart, render_pass
+from comparison.rendering import Passes, SharedStart, render_pass
 from tests.support.rendering import plugin_with_model, render
 from tests.support.scenes import area_light, closed_box
 from tests.support.statistics import assert_same_mean
@@ -32,6 +32,35 @@ def test_a_render_has_a_single_pilot_and_lights_for_each_pass():
     _, took = manylights.render(scene(), plugin(), spp=24, pass_spp=8)
     assert took.passes == 3 and took.statistics["pilots"] == 1
     assert took.statistics["light_paths"] == 3 * 2000
+
+
+def test_passes_are_weighted_by_their_expected_precision():
+    box, shared, images = scene(), SharedStart(), []
+    passes = Passes(0)
+    # Only the larger pass has lights
+    with plugin_with_model(fewest_light_paths=500, fixed_cost=2e3, ray_cost=0.02, pays_below=4.0):
+        integrator = plugin()
+        for spp, seed in (FIRST, (256, 8)):
+            images.append(render_pass(box, 0, integrator, spp, seed, FIRST, shared))
+            passes.add(images[-1])
+    few, many = (image.taken for image in images)
+    assert not few.has_lights and many.has_lights
+    # A sample beside lights has less variance
+    assert many.weight / many.spp > few.weight / few.spp > 0
+    weights = [few.weight, many.weight]
+    expected = np.average([image.planes for image in images], axis=0, weights=weights)
+    np.testing.assert_allclose(passes.image, expected, rtol=1e-6)
+
+
+def test_passes_of_other_integrators_are_weighted_by_their_samples():
+    image = render_pass(scene(), 0, mi.load_dict({"type": "path", "max_depth": 2}), 8, 0)
+    assert image.taken.weight == image.taken.spp == 8 and image.taken.start_seconds is None
+
+
+def test_a_black_image_has_a_weight():
+    dark = mi.load_dict(closed_box({}, 8))
+    image = render_pass(dark, 0, plugin(), 4, 0)
+    assert image.taken.weight == 4 and not image.planes[..., :3].any()
 
 
 def test_a_second_render_has_a_pilot_of_its_own():

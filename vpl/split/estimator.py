@@ -31,7 +31,7 @@ from .line_hits import has_large_curves
 from .path_tracer import Traced, trace_camera_rays
 from .pilot import Pilot, error_scale, relative_variance
 from .pixel_clusters import PixelClusters, light_clusters
-from .plan import Evidence, Option, Plan, choose, may_pay, price, without_lights
+from .plan import Decision, Evidence, Option, Plan, choose, may_pay, price, without_lights
 from .roulette import OutgoingRadiance, best_multiple
 from .surface_lights import KeptLights, surface_lights
 from .view import PathSettings, Stream, View, ViewLights
@@ -65,22 +65,6 @@ class Start:
     refusal: str
 
 
-@dataclass(frozen=True)
-class Decision:
-    """A ``plan`` with the ``evidence`` of the ``pilot`` and the ``options`` that were compared."""
-
-    pilot: Pilot
-    evidence: Evidence
-    plan: Plan
-    options: list[Option]
-
-    def expected_light(self, lights: ViewLights) -> np.ndarray:
-        """Expected radiance of ``lights`` in each pixel of the view, (pixels,)."""
-        kinds = bool(lights.surfaces), bool(lights.emitters)
-        remains = next(x.expected for x in self.options if (x.surfaces, x.emitters) == kinds)
-        return np.maximum(self.pilot.nearby(self.pilot.radiance - remains), 0)
-
-
 def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callable[[], bool], clock: Clock) -> Estimate:
     """Estimate the radiance of a view's camera rays; ``view.emitters`` is the sampler of ``start``.
 
@@ -91,7 +75,8 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
     mi.Log(mi.LogLevel.Info, f"manylights: {decision.plan}")
     lights, of_lights = make_lights(view, decision, kept, clock)
     radiance, valid, layers, of_image = render_image(view, lights, decision, stopped, clock)
-    statistics = {"plan": decision.plan.reason} | roulette | of_lights | of_image
+    precision = {"precision": decision.precision(view.samples)}
+    statistics = {"plan": decision.plan.reason} | precision | roulette | of_lights | of_image
     return Estimate(radiance, valid, layers, statistics | {"seconds": clock.seconds})
 
 
@@ -113,14 +98,14 @@ def learning_pilot(view: View) -> Pilot:
     """Trace the pilot, train the emitter sampler on the pilot, and trace the pilot again if the sampler learned.
 
     The sampler forgets if the second pilot has the greater variance × cost: small shadows and gloss can mislead the
-    sampler.
+    sampler.  Emission that is seen directly does not count: no sampler of emitters changes its variance.
     """
     pilot = Pilot.trace(view, ViewLights())
     rays, seed = learning_rays(view.learning_count), derived_seed(view.seed, Stream.LEARNING)
     if not view.emitters.learn(*pilot.vertices, rays, seed):
         return pilot
     again = Pilot.trace(view, ViewLights())
-    before, after = (relative_variance(x.radiance, pilot.brightness, view.model) for x in (pilot, again))
+    before, after = (relative_variance(x.radiance - x.seen, pilot.brightness, view.model) for x in (pilot, again))
     if view.model.learned_cost * after < before:
         return again
     view.emitters.forget()

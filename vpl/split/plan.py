@@ -13,7 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from .cost_model import CostModel
-from .pilot import relative_variance
+from .pilot import Pilot, relative_variance
+from .view import ViewLights
 
 _TINY = np.finfo(np.float64).tiny
 
@@ -111,6 +112,30 @@ class Evidence:
         unseen = min(relative_variance(radiance - self.seen, self.brightness, model), whole)
         direct = min(relative_variance(self.direct, self.brightness, model), unseen)
         return edges * (whole - unseen) + unseen - (1 - retained) * direct
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A ``plan`` with the ``evidence`` of the ``pilot`` and the ``options`` that were compared."""
+
+    pilot: Pilot
+    evidence: Evidence
+    plan: Plan
+    options: list[Option]
+
+    def expected_light(self, lights: ViewLights) -> np.ndarray:
+        """Expected radiance of ``lights`` in each pixel of the view, (pixels,)."""
+        kinds = bool(lights.surfaces), bool(lights.emitters)
+        remains = next(x.expected for x in self.options if (x.surfaces, x.emitters) == kinds)
+        return np.maximum(self.pilot.nearby(self.pilot.radiance - remains), 0)
+
+    def precision(self, samples: int) -> float:
+        """Expected inverse of the relative variance of a pixel with ``samples``; ``samples`` for a black image.
+
+        Independent of the random numbers of the image, so it may weight the image in a mean over passes.
+        """
+        variance = self.plan.variance if self.plan.gathers else self.evidence.whole
+        return samples / variance if variance > 0 else float(samples)
 
 
 def choose(evidence: Evidence, options: list[Option]) -> Plan:
