@@ -16,9 +16,10 @@ from vpl.lights.perturbed import Perturbed
 from vpl.split.contributions import LENGTHS, Layers
 from vpl.split.cost_model import CostModel
 from vpl.split.emitters import emitter_sampler
-from vpl.split.emitters.learned import learning_rays
-from vpl.split.estimator import Start, estimate, make_start
+from vpl.split.emitters.cell_choice import learning_rays
+from vpl.split.estimator import estimate
 from vpl.split.roulette import OutgoingRadiance
+from vpl.split.start import Start, make_start
 from vpl.split.surface_lights import KeptLights
 from vpl.split.view import PathRules, View
 

@@ -72,16 +72,19 @@ def test_a_second_render_has_a_pilot_of_its_own():
     assert integrator.statistics["pilots"] == 1
 
 
-def test_a_pass_is_the_same_wherever_the_first_pass_was_rendered():
-    """As on a worker that has not rendered the first pass."""
-    box, here, elsewhere = scene(), plugin(), plugin()
+@pytest.mark.parametrize("spp", [16, 128])
+def test_a_pass_is_the_same_wherever_the_first_pass_was_rendered(spp):
+    """As on a worker that has rendered neither the first pass nor others; large passes learn emitters once more."""
+    box, here, elsewhere = scene(48), plugin(), plugin()
     shared = SharedStart()
     first = render_pass(box, 0, here, *FIRST, FIRST, shared)
-    expected = render_pass(box, 0, here, 16, 8, FIRST, shared)
+    render_pass(box, 0, here, 1024, 9, FIRST, shared)
+    expected = render_pass(box, 0, here, spp, 8, FIRST, shared)
+    assert shared.start.learned and sorted(shared.start.later) == ([3] if spp == 16 else [2, 3])
     assert first.taken.statistics["pilots"] == 1 and expected.taken.statistics["pilots"] == 0
-    found = render_pass(box, 0, elsewhere, 16, 8, FIRST)
+    found = render_pass(box, 0, elsewhere, spp, 8, FIRST)
     np.testing.assert_allclose(found.planes, expected.planes, rtol=1e-4, atol=1e-5)
-    alone = render_pass(box, 0, plugin(), 16, 8)
+    alone = render_pass(box, 0, plugin(), spp, 8)
     assert np.abs(alone.planes - expected.planes).max() > 1e-3
 
 

@@ -2,7 +2,7 @@
 
 ::
 
-    pilot -> plan -> lights -> image                                                    (estimator)
+    pilot -> plan -> lights -> image                                             (start, estimator)
 
     image: camera rays -> traced part, gather vertices -> clusters of a pixel -> light cuts -> radiance
 
@@ -11,7 +11,8 @@ The formula, in the order to read in:
 - :mod:`vpl.transport.carried_share`: the share w of virtual lights
 - :mod:`vpl.transport.minorant`: the Lambertian minorant of a BSDF
 - ``path_tracer``: the paths of Mitsuba's ``path``, minus the part carried by virtual lights
-- ``estimator``: the steps from the pilot to the image
+- ``start``: the pilot, learning, and measured kinds of lights: shared by the passes of a render
+- ``estimator``: the steps from the plan to the image
 
 The terms of the estimator:
 

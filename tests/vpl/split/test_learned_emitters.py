@@ -13,7 +13,8 @@ from tests.support.rendering import render, render_with_statistics
 from tests.support.scenes import area_light, closed_box, image, rgb, sensor
 from vpl.core.arrays import download, upload, upload_vectors
 from vpl.lights.light_set import LightSet
-from vpl.split.emitters.learned import CellChoice, LearnedEmitters
+from vpl.split.emitters.cell_choice import CellChoice
+from vpl.split.emitters.learned import LearnedEmitters
 from vpl.split.gather_vertices import LitVertices
 from vpl.split.path_tracer import trace_camera_rays
 from vpl.split.spatial_cells import SpatialCells

@@ -1,6 +1,7 @@
 """Emitter samplers: the choice of an emitter for next-event estimation, and the density.
 
 - ``base``: interface and results of samplers, the uniform sampler, irradiance by a sampler
+- ``cell_choice``: learned probabilities of sources by spatial cell
 - ``learned``: emitters and regions of the environment, chosen by visibility from a pilot's vertices
 - ``tree``: many emitters, chosen through a tree
 """

@@ -92,6 +92,10 @@ class EmitterSampler(Protocol):
         """Return to the probabilities before :meth:`learn`."""
         raise NotImplementedError
 
+    def copy(self) -> EmitterSampler:
+        """A sampler of the same emitters that learns independently."""
+        raise NotImplementedError
+
 
 class UniformEmitters:
     """Mitsuba's own choice, of at most one emitter.  There is nothing to learn."""
@@ -129,6 +133,10 @@ class UniformEmitters:
 
     def forget(self) -> None:
         """See :meth:`EmitterSampler.forget`."""
+
+    def copy(self) -> UniformEmitters:
+        """See :meth:`EmitterSampler.copy`."""
+        return self
 
 
 # ---------------------- Irradiance ----------------------

@@ -21,7 +21,8 @@ from ...lights.virtual_lights import DeviceLights, VirtualLights, spot_falloff
 from ...points.camera_paths import emitted_towards
 from ..emitter_lights import EmitterLights, has_true_normals
 from .base import EmitterSample, MetEmitter
-from .learned import CellChoice, CellEmitters
+from .cell_choice import CellChoice
+from .learned import CellEmitters
 
 # Largest number of clusters; their number grows with the root of the rays to learn by, as does the number of cells
 _MOST_CLUSTERS, _CLUSTERS_BY_RAYS = 256, 0.25

@@ -1,0 +1,189 @@
+"""Probabilities of sources of light by spatial cell, learned from the light of each that a pilot's vertices receive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...core.arrays import channel_mean, download, upload, upload_vectors
+from ...core.sampling import RowChoice, derived_seed, independent_sampler
+from ..spatial_cells import SpatialCells
+from .base import Places
+
+# Rays to learn by, as a fraction of the camera rays: learning may take a few percent of a render
+_LEARNING_SHARE = 0.25
+# The same for later passes of a render, several of which use what was learned
+_LATER_SHARE = 0.5
+# Rays from a cell to each source; largest total number of rays, and number of rays at a time: bounds of memory, some 50
+# bytes a ray in NumPy and 100 bytes on the device
+_RAYS_EACH, _MOST_RAYS, _RAYS_AT_A_TIME = 2, 1 << 21, 1 << 20
+# Weight of the neighbours of a cell and of the prior visibility, as equivalent numbers of rays; the first is a maximum
+_NEIGHBOURS, _PRIOR = 4.0, 1.0
+
+
+def learning_rays(paths: int, is_later: bool = False) -> int:
+    """Number of rays to learn by, for a number of camera rays; ``is_later``: of a later pass of a render."""
+    return int((_LATER_SHARE if is_later else _LEARNING_SHARE) * paths)
+
+
+@dataclass(frozen=True)
+class _VerticesOfCells:
+    """Vertices sorted by cell: ``position``, ``normal``; ``size``, ``first`` (cells,): their number, and the first."""
+
+    position: mi.Point3f
+    normal: mi.Point3f
+    size: mi.UInt32
+    first: mi.UInt32
+
+    @classmethod
+    def of(cls, position: np.ndarray, normal: np.ndarray, cell: np.ndarray) -> _VerticesOfCells:
+        """Vertices (n, 3) in the cells ``cell`` (n,), from 1 on."""
+        order, size = np.argsort(cell, kind="stable"), np.bincount(cell)[1:]
+        position, normal = (upload_vectors(mi.Point3f, x[order]) for x in (position, normal))
+        return cls(position, normal, upload(mi.UInt32, size), upload(mi.UInt32, np.cumsum(size) - size))
+
+    @property
+    def cells(self) -> int:
+        """Number of cells."""
+        return dr.width(self.size)
+
+    def drawn(self, row: mi.UInt32, sampler) -> Places:
+        """A random vertex of each of the cells ``row``, from 0 on."""
+        number = mi.UInt32(sampler.next_1d() * mi.Float(dr.gather(mi.UInt32, self.size, row)))
+        vertex = dr.gather(mi.UInt32, self.first, row) + number
+        facing = mi.Normal3f(dr.gather(mi.Point3f, self.normal, vertex))
+        # Two distinct arrays of normals, as for virtual lights: both use the same kernel
+        return Places(dr.gather(mi.Point3f, self.position, vertex), facing + dr.opaque(mi.Float, 0.0), facing)
+
+
+class CellChoice:
+    """Probabilities of sources by spatial cell; before :meth:`learn`, the same everywhere.
+
+    ``usual`` (n,) float64: probabilities where nothing is known, with sum 1; ``share``: fraction of the samples drawn
+    by ``usual`` in every cell; ``ignored``: indices of sources without learning.
+    """
+
+    def __init__(self, usual: np.ndarray, share: float, ignored: np.ndarray):
+        self.count, self._stride = len(usual), dr.opaque(mi.UInt32, len(usual) + 1)
+        self._usual, self._share, self._ignored = usual, share, ignored
+        # During learning, every source has a cell, and the cell draws only the source
+        self._learns = dr.opaque(mi.Bool, False)
+        self.forget()
+
+    def _use(self, probability: np.ndarray) -> None:
+        """Use probabilities (cells, sources) float64; rows sum to 1."""
+        self._rows = RowChoice(probability.ravel(), np.full(len(probability), self.count))
+
+    @property
+    def pmf(self) -> np.ndarray:
+        """Probabilities (cells + 1, sources) of drawing each source; row 0 where nothing is known."""
+        return self._rows.pmf.reshape(-1, self.count)
+
+    # ---------------------- Learning ----------------------
+
+    def forget(self) -> None:
+        """Return to the usual probabilities everywhere."""
+        self._cells = SpatialCells.none()
+        # Twice, because Dr.Jit compiles different kernels for arrays of a single entry
+        self._use(np.stack([self._usual, self._usual]))
+
+    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int, look: Callable) -> bool:
+        """Learn from vertices (n, 3) with at most about ``rays`` rays; returns whether anything was learned.
+
+        ``look(places, cell)``: :func:`vpl.split.emitters.base.irradiance_from_emitters` with a single sample each.
+        """
+        each = _RAYS_EACH * self.count
+        most = min(rays, _MOST_RAYS) // each
+        if most < 1 or len(position) == 0:
+            return False
+        self._cells, cell = SpatialCells.around(position, normal, most)
+        vertices = _VerticesOfCells.of(position, normal, cell)
+        most = max(_RAYS_AT_A_TIME // each, 1)
+        self._learns = dr.opaque(mi.Bool, True)
+        try:
+            parts = [
+                self._look(vertices, first, min(most, vertices.cells - first), derived_seed(seed, first), look)
+                for first in range(0, vertices.cells, most)
+            ]
+        finally:
+            self._learns = dr.opaque(mi.Bool, False)
+        reached, unoccluded = (np.concatenate(part) for part in zip(*parts, strict=True))
+        self._use(self._shares(unoccluded, reached > 0))
+        return True
+
+    def _look(self, vertices: _VerticesOfCells, first: int, cells: int, seed: int, look: Callable):
+        """(Arriving, unoccluded) irradiance (cells, sources, rays), float64, in ``cells`` cells from ``first`` on."""
+        each = _RAYS_EACH * self.count
+        lane = dr.arange(mi.UInt32, cells * each)
+        row = lane // dr.opaque(mi.UInt32, each) + dr.opaque(mi.UInt32, first)
+        source = lane // _RAYS_EACH % dr.opaque(mi.UInt32, self.count)
+        places = vertices.drawn(row, independent_sampler(seed, len(lane)))
+        dr.eval(places, source)
+        reached, unoccluded, _ = look(places, source)
+        shape = cells, self.count, _RAYS_EACH
+        return [download(x).astype(np.float64).reshape(shape) for x in (channel_mean(reached), unoccluded)]
+
+    def _shares(self, unoccluded: np.ndarray, seen: np.ndarray) -> np.ndarray:
+        """Probabilities (cells + 1, sources) from unoccluded irradiance and visibility (cells, sources, rays).
+
+        Proportional to the root mean square of the arriving light.  Row 0 is for unknown cells.
+        """
+        possible = np.nan_to_num(unoccluded, posinf=0) ** 2
+        possible[:, self._ignored] = 0
+        found = possible * seen
+        # Prior visibility of a source in a cell: how often the cell sees sources, times how often cells see the source
+        of_cell, of_source, of_all = (_share(found, possible, axes) for axes in ((1, 2), (0, 2), (0, 1, 2)))
+        visible = np.minimum(of_cell * of_source / max(float(of_all.squeeze()), 1e-9), 1)[..., 0]
+        found, possible = found.mean(2), possible.mean(2)
+        # The mean of roots, because a neighbour may be next to an emitter that is far from this cell
+        expected, rays = self._of_neighbours(found**0.5, (visible * possible) ** 0.5)
+        rays = np.minimum(rays, _NEIGHBOURS)
+        power = ((_RAYS_EACH * found + rays * expected**2) / (_RAYS_EACH + rays)) ** 0.5
+        total = power.sum(1, keepdims=True)
+        learned = np.where(total > 0, power / np.maximum(total, np.finfo(np.float64).tiny), self._usual)
+        return np.concatenate([self._usual[None], (1 - self._share) * learned + self._share * self._usual])
+
+    def _of_neighbours(self, power: np.ndarray, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean ``power`` (cells, sources) of the neighbours of each cell, and the number of rays (cells, 1) behind it.
+
+        ``guess``: prior mean, with the weight of ``_PRIOR`` rays.
+        """
+        neighbours, total = self._cells.neighbours(), _PRIOR * guess
+        # Row 0 represents missing neighbours
+        padded = np.concatenate([np.zeros((1, self.count)), _RAYS_EACH * power])
+        for neighbour in neighbours.T:
+            total += padded[neighbour]
+        rays = _RAYS_EACH * np.count_nonzero(neighbours, 1)[:, None] + _PRIOR
+        return total / rays, rays
+
+    # ---------------------- Sampling ----------------------
+
+    def cell(self, position, facing):
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.cell`."""
+        return self._cells.at(position, facing)
+
+    def draw(self, cell, number, active):
+        """Draw a source for each cell by a uniform number: (source, its probability, a new uniform number)."""
+        known = active & ~self._learns
+        row = self._rows.draw(cell, number, known)
+        source = dr.select(self._learns, cell, row - self._row(cell))
+        probability = dr.select(self._learns, 1, self._rows.probability(row, known))
+        return source, probability, dr.select(self._learns, number, self._rows.rest(row, number, known))
+
+    def probability(self, cell, source, active):
+        """Probability of a source in each cell."""
+        known = self._rows.probability(self._row(cell) + source, active & ~self._learns)
+        return dr.select(self._learns, dr.select(active & (cell == source), mi.Float(1), 0), known)
+
+    def _row(self, cell):
+        """Start of a cell's row in the table of probabilities."""
+        return cell * self._stride
+
+
+def _share(found: np.ndarray, possible: np.ndarray, axes: tuple) -> np.ndarray:
+    """Fraction of the rays with unoccluded light that found light, over some axes; keeps the axes."""
+    return np.count_nonzero(found, axes, keepdims=True) / np.maximum(np.count_nonzero(possible, axes, keepdims=True), 1)

@@ -1,0 +1,133 @@
+"""Start of a pass: the pilot, the emitter sampler that learned from the pilot, and measured kinds of virtual lights.
+
+The passes of a render may share a start.  Larger passes learn the emitters again, by more rays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from ..core.sampling import derived_seed
+from .emitters.base import EmitterSampler
+from .emitters.cell_choice import learning_rays
+from .pilot import Pilot, relative_variance
+from .plan import Evidence, Option, may_pay, price
+from .view import Stream, View, ViewLights
+
+
+@dataclass(frozen=True)
+class Start:
+    """Knowledge at the beginning of a pass: the ``pilot``; the sampler of ``emitters``, after learning from the pilot
+    if ``learned``; ``options``: kinds of lights to compare, empty if ``refusal`` holds a reason against lights.
+
+    ``paths``: number of camera rays that sized the learning; ``seed``; ``later``: samplers of emitters by the size of
+    passes, see :meth:`emitters_for`.
+    """
+
+    pilot: Pilot
+    emitters: EmitterSampler
+    learned: bool
+    options: list[Option]
+    refusal: str
+    paths: int
+    seed: int
+    later: dict[int, EmitterSampler] = field(default_factory=dict)
+
+    def emitters_for(self, paths: int) -> EmitterSampler:
+        """The sampler for a pass of ``paths`` camera rays: large passes learn again from the same pilot, by more rays.
+
+        Sizes are rounded to powers of four, and each power has a sampler of its own, so that a pass is independent of
+        the other passes.
+        """
+        power = round(np.log2(max(paths / self.paths, 1)) / 2)
+        if power == 0 or not self.learned:
+            return self.emitters
+        if power not in self.later:
+            emitters, rays = self.emitters.copy(), learning_rays(self.paths * 4**power, is_later=True)
+            emitters.learn(*self.pilot.vertices, rays, derived_seed(self.seed, Stream.LEARNING, power))
+            self.later[power] = emitters
+        return self.later[power]
+
+
+def make_start(view: View, virtual_lights: bool, is_shared: bool) -> Start:
+    """Trace the pilot of a view, learn from it, and measure kinds of virtual lights.
+
+    ``virtual_lights``: whether virtual lights are allowed; ``is_shared``: whether passes of different sizes use the
+    start, which requires measuring every kind.
+    """
+    (pilot, learned), refusal = learning_pilot(view), _refusal(view, virtual_lights)
+    options = [] if refusal else _options(view, pilot, evidence_of(view, pilot), is_shared)
+    return Start(pilot, view.emitters, learned, options, refusal, view.learning_count, view.seed)
+
+
+def learning_pilot(view: View) -> tuple[Pilot, bool]:
+    """Trace the pilot, train the emitter sampler on the pilot, and trace the pilot again if the sampler learned:
+    (pilot, whether the sampler keeps what it learned).
+
+    The sampler forgets if the second pilot has the greater variance × cost: small shadows and gloss can mislead the
+    sampler.  Emission that is seen directly does not count: no sampler of emitters changes its variance.
+    """
+    pilot = Pilot.trace(view, ViewLights())
+    rays, seed = learning_rays(view.learning_count), derived_seed(view.seed, Stream.LEARNING)
+    if not view.emitters.learn(*pilot.vertices, rays, seed):
+        return pilot, False
+    again = Pilot.trace(view, ViewLights())
+    before, after = (relative_variance(x.radiance - x.seen, pilot.brightness, view.model) for x in (pilot, again))
+    if view.model.learned_cost * after < before:
+        return again, True
+    view.emitters.forget()
+    return pilot, False
+
+
+def evidence_of(view: View, pilot: Pilot) -> Evidence:
+    """Measurements of a pilot for the size of a view."""
+    emitters, direct = _may_carry_emitters(view), pilot.radiance - pilot.seen - pilot.indirect
+    return Evidence(
+        pilot.radiance, pilot.seen, direct, pilot.brightness, view.count, view.samples, emitters, view.model
+    )
+
+
+def _may_carry_emitters(view: View) -> bool:
+    return view.emitters.lights is not None and view.rules.max_depth > 1
+
+
+def _refusal(view: View, virtual_lights: bool) -> str:
+    """Reason against virtual lights, independent of the pilot; an empty string if lights are possible."""
+    if not virtual_lights:
+        return "virtual_lights is off"
+    if view.perturbed.everywhere:
+        return "bump or normal maps are in shape groups"
+    if view.rules.max_depth <= 2 and not _may_carry_emitters(view):
+        return "no light is indirect at this max_depth"
+    return ""
+
+
+def _options(view: View, pilot: Pilot, evidence: Evidence, measures_all: bool) -> list[Option]:
+    """Kinds of lights that may pay; measures the residual of lights on surfaces if the residual can change the choice,
+    or always."""
+    options, assumed, emitters = [], _with_surfaces(view, pilot, False), None
+    if evidence.emitters:
+        emitters = view.emitter_lights([])
+        traced = Pilot.trace(view, ViewLights(emitters=emitters))
+        options.append(Option(False, True, traced.radiance, traced.indirect))
+        assumed += _with_surfaces(view, traced, True)
+    # A measured residual only raises the price of an option: options are tried in the order of the assumed price, and
+    # an option is measured only if still better than earlier options
+    for option in sorted(assumed, key=partial(price, evidence)):
+        if measures_all or may_pay(evidence, option, options):
+            # The distance between lights is not known yet. With c = 0 lights carry the most
+            surfaces = view.light_set([], 0.0)
+            residual = Pilot.trace(view, ViewLights(surfaces, emitters if option.emitters else None))
+            option = replace(option, residual=residual.radiance)
+        options.append(option)
+    return options
+
+
+def _with_surfaces(view: View, traced: Pilot, emitters: bool) -> list[Option]:
+    """The option of lights on surfaces, if there is indirect light; ``traced``: pilot without lights on surfaces."""
+    if view.rules.max_depth <= 2 or not traced.indirect.any():
+        return []
+    return [Option(True, emitters, traced.radiance, traced.indirect)]
