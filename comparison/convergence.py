@@ -5,15 +5,13 @@ than a pixel correlates neighbours, but not passes). So the variance of a pixel 
 of their average.
 """
 
-from itertools import accumulate
-
 import mitsuba as mi
 import numpy as np
 
 SHARE = 0.95  # fraction of the pixels that must not exceed the error
 DARK = 0.1  # of the mean of the image: lower bound of the scale of relative errors, about as in relMSE
 NEIGHBOURS = 2  # pixels in each direction over which variances are averaged
-LEAST_PASSES = 8  # before the first estimate
+LEAST_PASSES = 8  # effective passes before the first estimate
 GROWTH = 1.25  # of the samples between estimates
 
 
@@ -43,6 +41,11 @@ class ErrorEstimate:
         self._sum = self._sum + weight * level
         self._first_moment = self._first_moment + weight**2 * level
         self._second_moment = self._second_moment + weight**2 * level**2
+
+    @property
+    def effective_passes(self):
+        """Number of passes of equal weight whose average would be as precise: (Σ w_k)² / Σ w_k², 0 without passes."""
+        return self._weight**2 / self._weight_squared if self._count else 0.0
 
     @property
     def state(self):
@@ -97,12 +100,12 @@ class ErrorGoal:
     """The `error` that ends a render, and the schedule of its estimates.
 
     A render that stops at the first estimate below a bound is biased towards low estimates. Therefore the error is
-    estimated rarely: after at least 8 passes, and then after each increase of the samples by a quarter. The number of
-    samples at an estimate depends on the cost of passes, not on their content. In simulations (tests), the reported
-    error is 0 to 20% too high for noise that is independent between pixels, and unbiased for noise common to the whole
-    image. It is 20% too low at worst: if each pass of any size shifts the whole image equally, and about ten passes are
-    enough. (Then brighter images, of lower relative error, also end earlier: the image is too bright by half of its
-    standard error.)
+    estimated rarely: after at least 8 effective passes, and then after each increase of the samples by a quarter. The
+    number of samples at an estimate depends on the cost of passes, not on their content. In simulations (tests), the
+    reported error is 0 to 20% too high for noise that is independent between pixels, and unbiased for noise common to
+    the whole image. It is 20% too low at worst: if each pass of any size shifts the whole image equally, and about ten
+    passes are enough. (Then brighter images, of lower relative error, also end earlier: the image is too bright by half
+    of its standard error.)
     """
 
     def __init__(self, error):
@@ -110,15 +113,17 @@ class ErrorGoal:
 
     def is_due(self, progressive):
         """Return whether an estimate is due for the passes of a `Progressive`."""
-        return self._is_due(len(progressive.passes), progressive.spp)
+        return self._is_due(progressive.estimate.effective_passes, progressive.spp)
 
     def resume(self, passes):
         """Skip the estimates that were made for a list of passes (`Pass`) from a checkpoint."""
-        for count, spp in enumerate(accumulate(one.spp for one in passes), 1):
-            self._is_due(count, spp)
+        spp, weight, squared = 0, 0.0, 0.0
+        for one in passes:
+            spp, weight, squared = spp + one.spp, weight + one.weight, squared + one.weight**2
+            self._is_due(weight**2 / squared, spp)
 
-    def _is_due(self, count, spp):
-        if count < LEAST_PASSES or spp < self._next:
+    def _is_due(self, effective, spp):
+        if round(effective) < LEAST_PASSES or spp < self._next:
             return False
         self._next = GROWTH * spp
         return True

@@ -1,15 +1,16 @@
 """Samples per pixel of the next pass of a render: passes take about two seconds, in parts about ten.
 
-Passes in parts take long, as they can be stopped between parts, and as large ones gain most: virtual lights pay from
-some size on, and samples are stratified within a pass. Such a pass takes about ten seconds, or twice the time of its
-start, and the last pass up to twice that. With a time limit of ten seconds a render has a small pass, one of about half
-of the time, and one that fills the rest.
+Passes in parts take long, as they can be stopped between parts, and large passes are the most efficient: virtual lights
+pay only from a certain size, and samples are stratified within a pass. Such a pass takes about ten seconds, or twice
+the time of its start, and the last pass up to twice that. With a time limit of ten seconds a render has a small pass,
+one of a third to half of the time, and one that fills the rest.
 
-The first pass is small, as its cost is unknown. Sizes are powers of two, from 4 if the number of pixels allows: Mitsuba
-compiles a single kernel for these sizes, but other kernels for sizes between, and, with some film filters, below 4.
-Each later pass has the size of the pass before it, or grows by a factor that the measured time allows. The first pass
-with a kernel includes compilation, so its time is an upper bound of the cost: growing by it is safe. Shrinking requires
-a second pass of equal size; so does growth that risks twice the time, for passes that are slow to start.
+The first pass is small, as its cost is unknown. Sizes of passes that are not in parts, or end by error, are powers of
+two, from 4 if the number of pixels allows: Mitsuba compiles a single kernel for these sizes, but other kernels for
+sizes between, and, with some film filters, below 4. Each later pass has the size of the pass before it, or grows by a
+factor that the measured time allows. The first pass with a kernel includes compilation, so its time is an upper bound
+of the cost: growing by it is safe. Shrinking requires a second pass of equal size; so does growth that risks twice the
+time, for passes that are slow to start.
 
 Passes in parts report the time of their start, so that one pass tells the cost of any size, and sizes from the second
 pass on may be any number: `manylights` needs a single further kernel for them.
@@ -22,7 +23,8 @@ from .rendering import largest_pass
 PASS_SECONDS = 2.0
 PART_SECONDS, LEAST_REST = 10.0, 1.0  # of a pass in parts; minimum ratio of its rest to its start, which has priority
 LEAST_GAIN = 1 / 16  # minimum size of a last pass in parts, as a fraction of the intended size
-LIT = 2.0  # cost of a sample with virtual lights over that without, at most: small passes have no lights
+LIT = 2.0  # usual cost of a sample with virtual lights over that without, at most: small passes have no lights
+DOUBT = 0.5  # fraction of the remaining time for a second pass, which may have lights and cost more than expected
 LONGEST = 2.0  # times the wanted seconds: longer passes shrink
 CHANGED = 1.5  # ratio of the times of two passes of equal size at which earlier times are discarded
 MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of a prediction from one size for another
@@ -123,9 +125,11 @@ class PassSizes:
         """
         least = size if self._fixed else min(size, self._least)
         line = self._line()
+        if self._starts and not self._known and not self._lit:
+            left *= DOUBT
         if self._in_parts and not self._many and not self._fixed and line:
             filling = int((left - line[0] - KERNEL_SECONDS) / line[1])
-            if filling < LEAST_GAIN * size:
+            if self._known and filling < LEAST_GAIN * size:
                 return 0
             certain = self._kept(self._certain(filling))
             # A single last pass, instead of several ever smaller ones

@@ -77,7 +77,8 @@ def render(
     layers: Sequence[str] = (),
 ) -> tuple[mi.TensorXf, Took]:
     """Render a scene in passes; return the image, a `mi.TensorXf` of shape (height, width, channels) as of `mi.render`,
-    and the cost (`Took`). Passes take about two seconds, with `manylights` up to ten.
+    and the cost (`Took`). Passes take about two seconds, with `manylights` about ten, the last one up
+    to twenty.
 
     `scene`: a `mi.Scene`, or the path of a scene file. `integrator`: a `mi.Integrator` or the name of a plugin, by
     default the scene's. `sensor`: an index, or "all" for a list of (image, cost) over all sensors. The first limit that

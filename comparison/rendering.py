@@ -63,7 +63,7 @@ class Pass:
 
     @property
     def start_seconds(self):
-        """Seconds that do not grow with the samples; None if the integrator does not report them."""
+        """Seconds that hardly grow with the samples; None if the integrator does not report them."""
         stages = self.statistics.get("seconds", {})
         if Stage.TRACED not in stages:
             return None
@@ -177,8 +177,13 @@ class Progressive(Passes):
 
     def __init__(self, scene, seed, sensor=0, integrator=None):
         super().__init__(seed)
-        self._scene, self._sensor, self._shared = scene, sensor, SharedStart()
+        self._scene, self._sensor = scene, sensor
         self.integrator = integrator or scene.integrator()
+
+    def restart(self):
+        """Remove all passes and their common start."""
+        super().restart()
+        self._shared = SharedStart()
 
     def render(self, spp, seed=None, accept=lambda: True):
         """Render and add a pass of `spp` samples per pixel; return the `Pass`.
@@ -247,8 +252,8 @@ def total_statistics(passes):
 class TotalStatistics:
     """Sum of the integrators' counters over passes.
 
-    Numbers are summed, also in nested dicts ("seconds"). Descriptions, such as the text "plan" and the dict
-    "lights", come from the pass with the most samples, the last of equal passes.
+    Numbers are summed, also in nested dicts ("seconds"); the sum of "precision" is that of the image. Descriptions,
+    such as the text "plan" and the dict "lights", come from the pass with the most samples, the last of equal passes.
     """
 
     def __init__(self):

@@ -53,7 +53,7 @@ def simulate(noise, error, seed):
         estimate.add(grey(image), spp)
         weights.append(spp)
         total = total + spp * image
-        if goal.is_due(SimpleNamespace(passes=weights, spp=sum(weights))):
+        if goal.is_due(SimpleNamespace(estimate=estimate, spp=sum(weights))):
             found = estimate.relative()
             if goal.is_reached(found):
                 break
@@ -131,10 +131,20 @@ def test_error_is_unknown_of_one_pass_and_zero_of_a_black_image():
     assert estimate.relative() == 0
 
 
+def test_passes_of_little_weight_do_not_count_for_a_look():
+    goal, estimate = ErrorGoal(0.1), ErrorEstimate()
+    for _ in range(8):
+        estimate.add(np.zeros((1, 1, 3)), 1)
+    for passes in range(1, 9):
+        estimate.add(np.zeros((1, 1, 3)), 100)
+        assert goal.is_due(SimpleNamespace(estimate=estimate, spp=12 * passes)) == (passes == 8)
+
+
 def test_looks_are_few():
-    goal, looks = ErrorGoal(0.1), []
+    goal, looks, estimate = ErrorGoal(0.1), [], ErrorEstimate()
     for passes in range(1, 101):
-        if goal.is_due(SimpleNamespace(passes=[4] * passes, spp=4 * passes)):
+        estimate.add(np.zeros((1, 1, 3)), 4)
+        if goal.is_due(SimpleNamespace(estimate=estimate, spp=4 * passes)):
             looks.append(passes)
     assert looks[0] == LEAST_PASSES
     assert all(after >= 1.25 * before for before, after in pairwise(looks))

@@ -64,11 +64,10 @@ def test_large_images_begin_with_one_sample():
 
 @pytest.mark.parametrize("start", [0.7, 1.4, 2.4])
 @pytest.mark.parametrize("each", [0.01, 0.2, 1.0])
-def test_in_parts_at_most_a_quarter_of_a_pass_starts_it(start, each):
+def test_in_parts_the_start_is_less_than_half_of_a_pass(start, each):
     passes, _ = render(SQUARE // 16, start, each, time=200, more=0.1, in_parts=True)
     usual, count = Counter(one.spp for one in passes).most_common(1)[0]
     assert count > 0.5 * len(passes)
-    # Sizes are powers of two
     assert start / (start + each * usual) < 0.4 or usual * SQUARE // 16 == 4 * MAXIMUM_PASS_SAMPLES
     assert max(one.seconds for one in passes[:-1]) < 1.5 * 10
 
@@ -91,9 +90,31 @@ def test_in_parts_a_short_render_has_one_small_pass_and_few_large_ones(time, lit
         stages = {Stage.TRACED: traced} | ({Stage.CUTS: 0.0} if lit > 1 and spp > 20 else {})
         passes.append(Pass(0, spp, 0.3 + traced, {"seconds": stages}))
         elapsed += 0.3 + traced
-    large = [one for one in passes if one.spp > 8]
-    assert passes[0].spp == 4 and 1 <= len(large) <= 3 and -0.8 < elapsed - time < 0.3
-    assert sum(one.spp for one in large) > 0.8 * sum(one.spp for one in passes)
+    assert passes[0].spp == 4 and len(passes) <= 4 and -0.8 < elapsed - time < 0.3
+    assert max(one.spp for one in passes) > 0.4 * sum(one.spp for one in passes)
+
+
+@pytest.mark.parametrize("start, each", [(0.2, 0.3), (0.5, 0.1)])
+def test_in_parts_large_images_use_the_time(start, each):
+    """The first pass has one sample, and compiles for most of its time."""
+    passes, _ = render(4 * SQUARE, start, each, time=10, more=0.1, in_parts=True)
+    assert passes[0].spp == 1 and 8.5 < sum(one.seconds for one in passes) < 10.5 and len(passes) < 8
+
+
+@pytest.mark.parametrize("lit", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("time", [5, 10, 20])
+def test_in_parts_costly_lights_hardly_exceed_the_time(lit, time):
+    """Samples of passes above 8 cost `lit` times those of smaller ones, and kernels of lights compile for half a
+    second."""
+    sizes, passes, elapsed = PassSizes(SQUARE // 2, time=time, in_parts=True), [], 0.0
+    while not isinstance(spp := sizes.next(passes, elapsed), str):
+        has_lights = lit > 1 and spp > 8
+        first = has_lights and not any(one.has_lights for one in passes)
+        traced = 0.05 * spp * (lit if has_lights else 1) + 0.5 * first
+        stages = {Stage.TRACED: traced} | ({Stage.CUTS: 0.0} if has_lights else {})
+        passes.append(Pass(0, spp, 0.3 + traced, {"seconds": stages}))
+        elapsed += 0.3 + traced
+    assert 0.8 * time < elapsed < 1.2 * time
 
 
 def test_in_parts_large_images_are_not_left_with_one_sample():

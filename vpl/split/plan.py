@@ -25,7 +25,8 @@ class Plan:
 
     ``light_paths``: number of lines for drawing virtual lights on surfaces, 0 for none; ``emitters``: whether virtual
     lights represent emitters; ``error``: bound of the cuts, as a fraction of the pixel; ``vertices``: lit vertices per
-    pixel; ``variance``: remaining relative variance of a camera path; ``reason`` in words.
+    pixel; ``variance``: remaining relative variance of a camera path; ``shared``: variance of the lights and of the
+    choice of lit vertices, in the same unit; ``reason`` in words.
     """
 
     light_paths: int
@@ -33,6 +34,7 @@ class Plan:
     error: float
     vertices: int
     variance: float
+    shared: float
     reason: str
 
     @property
@@ -132,9 +134,10 @@ class Decision:
     def precision(self, samples: int) -> float:
         """Expected inverse of the relative variance of a pixel with ``samples``; ``samples`` for a black image.
 
-        Independent of the random numbers of the image, so it may weight the image in a mean over passes.
+        Independent of the random numbers of passes that share the start of an earlier pass, so it may weight them in a
+        mean.  The first pass shares its camera rays with the pilot, and no other random numbers.
         """
-        variance = self.plan.variance if self.plan.gathers else self.evidence.whole
+        variance = self.plan.variance + self.plan.shared if self.plan.gathers else self.evidence.whole
         return samples / variance if variance > 0 else float(samples)
 
 
@@ -152,7 +155,7 @@ def choose(evidence: Evidence, options: list[Option]) -> Plan:
 
 def without_lights(reason: str) -> Plan:
     """The plan of an image without virtual lights."""
-    return Plan(0, False, 0.0, 0, 0.0, reason)
+    return Plan(0, False, 0.0, 0, 0.0, 0.0, reason)
 
 
 def price(evidence: Evidence, option: Option) -> float:
@@ -185,7 +188,11 @@ def _priced(evidence: Evidence, option: Option) -> tuple[float, float, Plan]:
     # The least of (left + vertex variance / share) × (cost + vertex cost × share)
     share = (model.vertex_variance * cost / (model.vertex_cost * left)) ** 0.5
     vertices = max(round(float(np.clip(share, model.least_vertices, 1)) * samples), 1)
-    return cost * left**model.denoised_power, cost, Plan(light_paths, option.emitters, error, vertices, left, "")
+    shared = model.vertex_variance * samples / vertices
+    if light_paths:
+        shared += samples * model.light_variance * _indirect_variance(evidence, option) / light_paths
+    plan = Plan(light_paths, option.emitters, error, vertices, left, shared, "")
+    return cost * left**model.denoised_power, cost, plan
 
 
 def _cut_rays(rest: float, samples: int, model: CostModel) -> tuple[float, float]:
@@ -200,11 +207,15 @@ def _cut_rays(rest: float, samples: int, model: CostModel) -> tuple[float, float
     return model.coarse_rays * error ** (-1 / model.error_slope), error
 
 
+def _indirect_variance(evidence: Evidence, option: Option) -> float:
+    """Relative variance of the indirect light of a camera path."""
+    return relative_variance(option.indirect, evidence.brightness, evidence.model)
+
+
 def _light_paths(evidence: Evidence, option: Option, left: float) -> int:
     """Number of light paths: the least of (left / samples + light variance / light paths) × cost, within limits."""
     model, paths = evidence.model, evidence.paths
-    indirect = relative_variance(option.indirect, evidence.brightness, model)
-    of_lights = model.shared * model.light_variance * indirect
+    of_lights = model.shared * model.light_variance * _indirect_variance(evidence, option)
     balanced = (of_lights * evidence.samples * paths / (model.light_path_cost * left)) ** 0.5
     wanted = max(balanced, option.concentration / model.set_error**2)
     wanted = np.clip(wanted, model.least_light_share * paths, model.most_light_share * paths)

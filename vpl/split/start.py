@@ -23,8 +23,8 @@ class Start:
     """Knowledge at the beginning of a pass: the ``pilot``; the sampler of ``emitters``, after learning from the pilot
     if ``learned``; ``options``: kinds of lights to compare, empty if ``refusal`` holds a reason against lights.
 
-    ``paths``: number of camera rays that sized the learning; ``seed``; ``later``: samplers of emitters by the size of
-    passes, see :meth:`emitters_for`.
+    ``paths``: number of camera rays that sized the learning; ``seed`` of the first pass; ``later``: samplers of
+    emitters by the size of passes, see :meth:`emitters_for`.
     """
 
     pilot: Pilot
@@ -43,10 +43,14 @@ class Start:
         the other passes.
         """
         power = round(np.log2(max(paths / self.paths, 1)) / 2)
-        if power == 0 or not self.learned:
+        rays = learning_rays(self.paths * 4**power, is_later=True)
+        if power == 0 or not self.learned or rays <= learning_rays(self.paths):
             return self.emitters
+        # The smallest power with as many rays, the number of which is limited
+        while learning_rays(self.paths * 4 ** (power - 1), is_later=True) == rays:
+            power -= 1
         if power not in self.later:
-            emitters, rays = self.emitters.copy(), learning_rays(self.paths * 4**power, is_later=True)
+            emitters = self.emitters.copy()
             emitters.learn(*self.pilot.vertices, rays, derived_seed(self.seed, Stream.LEARNING, power))
             self.later[power] = emitters
         return self.later[power]

@@ -13,6 +13,7 @@ from tests.support.rendering import render, render_with_statistics
 from tests.support.scenes import area_light, closed_box, image, rgb, sensor
 from vpl.core.arrays import download, upload, upload_vectors
 from vpl.lights.light_set import LightSet
+from vpl.split.emitters import cell_choice
 from vpl.split.emitters.cell_choice import CellChoice
 from vpl.split.emitters.learned import LearnedEmitters
 from vpl.split.gather_vertices import LitVertices
@@ -154,7 +155,7 @@ def test_what_neighbours_have_seen_is_drawn_more_often_than_what_nobody_has():
     position = rng.random((20_000, 3)).astype(np.float32)
     choice = CellChoice(np.full(3, 1 / 3), 0.2, np.zeros(0, int))
 
-    def look(places, source):
+    def look(places, source, seed):
         """The first source is seen everywhere, the second from one side, the third from nowhere."""
         x, number = download(places.position.x), download(source)
         seen = (number == 0) | ((number == 1) & (x < 0.45))
@@ -169,6 +170,25 @@ def test_what_neighbours_have_seen_is_drawn_more_often_than_what_nobody_has():
     assert (second[sees] > 0.3).all()
     # What somebody sees, though nobody near, is drawn a little more often than what nobody sees
     assert second[neighbour] > 1.5 * second[-1] and second[-1] > third[-1] > 0
+
+
+def test_rays_that_are_traced_a_few_at_a_time_teach_the_same(monkeypatch):
+    rng = np.random.default_rng(2)
+    position, seeds, found = rng.random((20_000, 3)).astype(np.float32), [], []
+
+    def look(places, source, seed):
+        seeds.append(seed)
+        seen = download(source) == 0
+        return upload_vectors(mi.Color3f, np.repeat(seen[:, None], 3, 1)), upload(mi.Float, np.ones(len(seen))), None
+
+    for most in (1 << 20, 100):
+        monkeypatch.setattr(cell_choice, "_RAYS_AT_A_TIME", most)
+        choice = CellChoice(np.full(3, 1 / 3), 0.2, np.zeros(0, int))
+        assert choice.learn(position, np.tile(np.float32([[0, 0, 1]]), (len(position), 1)), 6000, 0, look)
+        found.append(choice.pmf)
+    np.testing.assert_array_equal(*found)
+    # Each part has random numbers of its own
+    assert len(seeds) > 10 and len(set(seeds[1:])) == len(seeds) - 1
 
 
 # ---------------------- Changes between renders ----------------------

@@ -27,7 +27,7 @@ _NEIGHBOURS, _PRIOR = 4.0, 1.0
 
 def learning_rays(paths: int, is_later: bool = False) -> int:
     """Number of rays to learn by, for a number of camera rays; ``is_later``: of a later pass of a render."""
-    return int((_LATER_SHARE if is_later else _LEARNING_SHARE) * paths)
+    return min(int((_LATER_SHARE if is_later else _LEARNING_SHARE) * paths), _MOST_RAYS)
 
 
 @dataclass(frozen=True)
@@ -94,10 +94,11 @@ class CellChoice:
     def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int, look: Callable) -> bool:
         """Learn from vertices (n, 3) with at most about ``rays`` rays; returns whether anything was learned.
 
-        ``look(places, cell)``: :func:`vpl.split.emitters.base.irradiance_from_emitters` with a single sample each.
+        ``look(places, cell, seed)``: :func:`vpl.split.emitters.base.irradiance_from_emitters` with a single sample
+        each.
         """
         each = _RAYS_EACH * self.count
-        most = min(rays, _MOST_RAYS) // each
+        most = rays // each
         if most < 1 or len(position) == 0:
             return False
         self._cells, cell = SpatialCells.around(position, normal, most)
@@ -121,9 +122,9 @@ class CellChoice:
         lane = dr.arange(mi.UInt32, cells * each)
         row = lane // dr.opaque(mi.UInt32, each) + dr.opaque(mi.UInt32, first)
         source = lane // _RAYS_EACH % dr.opaque(mi.UInt32, self.count)
-        places = vertices.drawn(row, independent_sampler(seed, len(lane)))
+        places = vertices.drawn(row, independent_sampler(derived_seed(seed, 0), len(lane)))
         dr.eval(places, source)
-        reached, unoccluded, _ = look(places, source)
+        reached, unoccluded, _ = look(places, source, derived_seed(seed, 1))
         shape = cells, self.count, _RAYS_EACH
         return [download(x).astype(np.float64).reshape(shape) for x in (channel_mean(reached), unoccluded)]
 

@@ -16,7 +16,6 @@ import numpy as np
 
 from ...core.arrays import download, finite_or_zero, upload
 from ...core.registry import RegistryTable
-from ...core.sampling import derived_seed
 from ...direct.environment_regions import regions_of
 from ...lights.emitter_groups import EmitterGroups
 from .base import EmitterSample, MetEmitter, irradiance_from_emitters
@@ -46,10 +45,10 @@ class CellEmitters:
     def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> bool:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.learn`."""
 
-        def look(places, cell):
-            return irradiance_from_emitters(self._scene, self, places, cell, 1, derived_seed(seed, 1))
+        def look(places, cell, seed: int):
+            return irradiance_from_emitters(self._scene, self, places, cell, 1, seed)
 
-        return self.choice.learn(position, normal, rays, derived_seed(seed, 0), look)
+        return self.choice.learn(position, normal, rays, seed, look)
 
     def forget(self) -> None:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.forget`."""
