@@ -3,6 +3,7 @@
 import io
 import sys
 import threading
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -167,7 +168,7 @@ def test_the_error_falls_as_one_over_the_root_of_the_samples():
     ending.look(0.02, 8)
     assert ending.seconds_left(8.0) == pytest.approx(32 - 8)
     # It is not looked at before there are a quarter more samples
-    ending.goal.is_due(type("Passes", (), {"passes": [None] * 8, "spp": 8}))
+    ending.goal.is_due(SimpleNamespace(estimate=SimpleNamespace(effective_passes=8), spp=8))
     ending.look(0.0101, 8)
     assert ending.seconds_left(8.0) == pytest.approx(2)
 
