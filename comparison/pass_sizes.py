@@ -22,7 +22,7 @@ from .rendering import largest_pass
 
 PASS_SECONDS = 2.0
 PART_SECONDS, LEAST_REST = 10.0, 1.0  # of a pass in parts; minimum ratio of its rest to its start, which has priority
-LEAST_GAIN = 1 / 16  # minimum size of a last pass in parts, as a fraction of the intended size
+LEAST_GAIN = 1 / 16  # minimum size of a last pass with virtual lights, as a fraction of the intended size
 LIT = 2.0  # usual cost of a sample with virtual lights over that without, at most: small passes have no lights
 DOUBT = 0.5  # fraction of the remaining time for a second pass, which may have lights and cost more than expected
 LONGEST = 2.0  # times the wanted seconds: longer passes shrink
@@ -121,7 +121,7 @@ class PassSizes:
         """Return the size, about `size` samples, of a pass within `left` seconds.
 
         If there is none, return the least size if `left` is at least half of its time, otherwise 0; also 0 if a last
-        pass in parts would be far smaller.
+        pass in parts would be far smaller than usual.
         """
         least = size if self._fixed else min(size, self._least)
         line = self._line()
@@ -129,7 +129,8 @@ class PassSizes:
             left *= DOUBT
         if self._in_parts and not self._many and not self._fixed and line:
             filling = int((left - line[0] - KERNEL_SECONDS) / line[1])
-            if self._known and filling < LEAST_GAIN * size:
+            # Without virtual lights, small passes are as good as large ones
+            if self._known and filling < (LEAST_GAIN * size if self._lit else least):
                 return 0
             certain = self._kept(self._certain(filling))
             # A single last pass, instead of several ever smaller ones
