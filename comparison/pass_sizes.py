@@ -13,7 +13,8 @@ of the cost: growing by it is safe. Shrinking requires a second pass of equal si
 time, for passes that are slow to start.
 
 Passes in parts report the time of their start, so that one pass tells the cost of any size, and sizes from the second
-pass on may be any number: `manylights` needs a single further kernel for them.
+pass on may be any number: `manylights` needs a single further kernel for them. A second pass may have virtual lights
+where the small first pass has none, and cost more: it is planned for half of the remaining time.
 """
 
 import math
@@ -44,6 +45,7 @@ class PassSizes:
     def __init__(self, pixels, spp=None, time=None, fixed=None, many=False, in_parts=False, accepts=lambda spp: True):
         self._spp, self._time, self._fixed, self._many, self._in_parts = spp, time, fixed, many, in_parts
         self._accepts = accepts
+        self._any_size = in_parts and not many and not fixed  # after the first pass, not only powers of two
         self._largest = _power_of_two(largest_pass(pixels, in_parts))
         self._least = USUAL if USUAL * pixels <= FIRST_SAMPLES else 1
         self._current, self._seconds, self._asked = fixed or self._least, {}, None
@@ -75,7 +77,7 @@ class PassSizes:
 
     def _of_the_rest(self, size, left):
         """Return the size of the next pass, about `size` samples, with `left` samples until the limit."""
-        if self._in_parts and not self._many and not self._fixed and left < 2 * size and left <= self._largest:
+        if self._any_size and left < 2 * size and left <= self._largest:
             return left
         return min(size, left if self._fixed or left < USUAL else _power_of_two(left))
 
@@ -107,7 +109,7 @@ class PassSizes:
         """Return the size of a pass of at most `wanted` seconds, from the `seconds` of a pass of the current size."""
         if line:
             start, each = line
-            if self._starts and not self._many:
+            if self._any_size:
                 return self._kept(int((wanted - start) / each))
             return min(_power_of_two((wanted - start) / each), MOST_GROWTH * self._current)
         grown = _power_of_two(self._current * wanted / max(seconds, 1e-6))
@@ -125,9 +127,9 @@ class PassSizes:
         """
         least = size if self._fixed else min(size, self._least)
         line = self._line()
-        if self._starts and not self._known and not self._lit:
+        if self._any_size and not self._known and not self._lit:
             left *= DOUBT
-        if self._in_parts and not self._many and not self._fixed and line:
+        if self._any_size and line:
             filling = int((left - line[0] - KERNEL_SECONDS) / line[1])
             # Without virtual lights, small passes are as good as large ones
             if self._known and filling < (LEAST_GAIN * size if self._lit else least):

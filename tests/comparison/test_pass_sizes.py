@@ -208,6 +208,15 @@ def test_sizes_that_are_given_stay():
     assert [one.spp for one in passes] == [6, 6, 6, 2]
 
 
+@pytest.mark.parametrize("in_parts", [False, True])
+def test_a_pass_of_a_given_size_begins_if_half_of_it_fits(in_parts):
+    for time, size in ((8, 8), (6, "time")):
+        sizes = PassSizes(SQUARE, time=time, fixed=8, in_parts=in_parts)
+        assert sizes.next([], 0.0) == 8
+        first = Pass(0, 8, 4.5, {"seconds": {Stage.TRACED: 4.0}} if in_parts else {})
+        assert sizes.next([first], 4.5) == size
+
+
 def test_for_an_error_there_are_many_passes_of_similar_sizes():
     passes, done = render(SQUARE // 16, 0.0, 1e-4, time=20, many=True)[0], 0
     for one in passes[:100]:

@@ -199,11 +199,11 @@ def test_a_dim_emitter_next_to_a_bright_one_has_points():
     assert (found < 1e-3 * found.max()).sum() == pytest.approx(500, rel=0.1)
 
 
-@pytest.mark.parametrize("shapes, close", [(panels, 0.95), (balls, 0.9)], ids=["panels", "balls"])
+@pytest.mark.parametrize("shapes, close", [(panels, 0.97), (balls, 0.9)], ids=["panels", "balls"])
 def test_who_samples_an_emitter_and_who_meets_it_agree_on_what_is_carried(shapes, close):
     rng = np.random.default_rng(1)
     scene = mi.load_dict(closed_box(shapes(100, rng) | bulbs(10, rng)))
-    emitters, si = sampler_of(scene, rng, True), interactions(*vertices(rng))
+    emitters, si = sampler_of(scene, rng, True), interactions(*vertices(rng, 40_000))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(1, dr.width(si.p))
     cell = emitters.cell(si.p, si.n)
@@ -212,7 +212,7 @@ def test_who_samples_an_emitter_and_who_meets_it_agree_on_what_is_carried(shapes
     ray = si.spawn_ray(sample.direction)
     met = emitters.met(si.p, cell, ray, scene.ray_intersect(ray), mi.Bool(True), mi.Bool(True))
     lit = np.array((dr.max(sample.arriving(scene, True)) > 0) & ~sample.is_point)
-    assert lit.sum() > 100
+    assert lit.sum() > 1000
     # Directions to the edge of a shape may miss it, or meet a ball elsewhere
     assert np.isclose(np.array(met.nearness), np.array(sample.nearness), rtol=5e-2)[lit].mean() > close
     points = np.array(sample.is_point)
