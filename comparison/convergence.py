@@ -44,8 +44,8 @@ class ErrorEstimate:
 
     @property
     def effective_passes(self):
-        """Number of passes of equal weight whose average would be as precise: (Σ w_k)² / Σ w_k², 0 without passes."""
-        return self._weight**2 / self._weight_squared if self._count else 0.0
+        """Number of passes of equal weight whose average would be as precise."""
+        return effective_number(self._weight, self._weight_squared)
 
     @property
     def state(self):
@@ -96,6 +96,11 @@ def _box_sum(plane):
     return np.maximum(plane, 0)
 
 
+def effective_number(weight, weight_squared):
+    """Return (Σ w_k)² / Σ w_k² for the sum `weight` and the sum of squares `weight_squared`, 0 without passes."""
+    return weight**2 / weight_squared if weight_squared else 0.0
+
+
 class ErrorGoal:
     """The `error` that ends a render, and the schedule of its estimates.
 
@@ -120,7 +125,7 @@ class ErrorGoal:
         spp, weight, squared = 0, 0.0, 0.0
         for one in passes:
             spp, weight, squared = spp + one.spp, weight + one.weight, squared + one.weight**2
-            self._is_due(weight**2 / squared, spp)
+            self._is_due(effective_number(weight, squared), spp)
 
     def _is_due(self, effective, spp):
         if round(effective) < LEAST_PASSES or spp < self._next:

@@ -115,7 +115,7 @@ class PassSizes:
         grown = _power_of_two(self._current * wanted / max(seconds, 1e-6))
         if repeated and seconds < wanted:
             # Without this, a pass with a dominant start would never grow
-            times = MOST_GROWTH if seconds < wanted / 2 and not self._in_parts else 2
+            times = MOST_GROWTH if seconds < wanted / 2 else 2
             grown = max(grown, times * self._current)
         return grown
 
@@ -157,10 +157,8 @@ class PassSizes:
         """Return the intended seconds of a pass."""
         if not self._in_parts:
             return PASS_SECONDS
-        line, seconds = self._line(), self._seconds[self._asked]
-        # Without a line, the start may take all the time
-        start = line[0] if line else seconds if seconds > PART_SECONDS else 0.0
-        return max(PART_SECONDS, (1 + LEAST_REST) * start)
+        line = self._line()
+        return max(PART_SECONDS, (1 + LEAST_REST) * line[0]) if line else PART_SECONDS
 
     def _expected(self, size):
         """Return the expected seconds of a pass: those of an earlier pass of this size, or by `_line`, or, if that is
