@@ -4,7 +4,7 @@ from itertools import count
 
 import numpy as np
 
-from .pass_sizes import FIRST_SAMPLES
+from .pass_sizes import FIRST_SAMPLES, PassSizes
 from .rendering import pass_seed, pass_sizes
 
 LONG_PASS = 60.0  # seconds; with given samples, passes longer than this are warmed up by small passes alone
@@ -24,6 +24,13 @@ def measure(progressive, job):
         _render_cold(progressive, job)
         return progressive.passes[0].seconds
     unused = (pass_seed(job.seed, index) for index in count(UNUSED_PASSES))
+    if progressive.in_parts and not job.spp and not job.pass_spp:
+        # Once to compile the kernels of all sizes
+        _render_in_time(progressive, job.budget, unused)
+        cold = progressive.passes[0].seconds
+        progressive.restart()
+        _render_in_time(progressive, job.budget)
+        return cold
     if job.spp:
         sizes = pass_sizes(job.spp, job.pass_spp or progressive.largest_pass)
         cold = _compile(progressive, sizes, unused)
@@ -43,6 +50,13 @@ def measure(progressive, job):
         progressive.render(following)
         following = _samples_that_fit(progressive, spp, job.budget, start)
     return cold
+
+
+def _render_in_time(progressive, budget, seeds=None):
+    """Render passes in parts within a `budget` in seconds, of the sizes that `render` uses with a limit of time."""
+    sizes = PassSizes(progressive.pixels, time=budget, in_parts=True, accepts=progressive.accepts)
+    while not isinstance(spp := sizes.next(progressive.passes, progressive.seconds), str):
+        progressive.render(spp, next(seeds) if seeds else None)
 
 
 def _render_cold(progressive, job):

@@ -83,7 +83,7 @@ class PassSizes:
 
     def _learn(self, last, done, compiles):
         """Record the time of the `last` pass, and choose the size of later passes."""
-        repeated, seconds = self._asked in self._seconds, last.seconds
+        repeated, seconds = self._asked in self._seconds, last.repeated_seconds
         if last.start_seconds is not None:
             self._starts[self._asked] = last.start_seconds
             self._lit |= last.has_lights

@@ -62,12 +62,18 @@ class Pass:
         return Stage.CUTS in self.statistics.get("seconds", {})
 
     @property
+    def repeated_seconds(self):
+        """Seconds without the pilot, if later passes share it."""
+        made = self.statistics.get("pilots", 0)
+        return self.seconds - (self.statistics["seconds"][Stage.PILOT] if made else 0.0)
+
+    @property
     def start_seconds(self):
-        """Seconds that hardly grow with the samples; None if the integrator does not report them."""
+        """The `repeated_seconds` that hardly grow with the samples; None if the integrator does not report them."""
         stages = self.statistics.get("seconds", {})
         if Stage.TRACED not in stages:
             return None
-        return max(self.seconds - sum(stages.get(stage, 0.0) for stage in PER_SAMPLE), 0.0)
+        return max(self.repeated_seconds - sum(stages.get(stage, 0.0) for stage in PER_SAMPLE), 0.0)
 
 
 @dataclass

@@ -3,6 +3,7 @@
 import pytest
 
 from comparison import measuring, rendering, worker
+from vpl.core.stages import Stage
 
 
 class Recorded(rendering.Progressive):
@@ -27,6 +28,34 @@ def test_kernels_of_every_size_of_pass_are_compiled_before_the_clock_runs():
     assert measuring.measure(progressive, job) == 2.0
     assert progressive.asked == [(5, True), (1, True), (5, True), (9, True), (9, False), (9, False), (1, False)]
     assert sum(one.spp for one in progressive.passes) == 19
+
+
+class InParts(Recorded):
+    """The same in parts, with a pilot of two seconds in the first pass after a restart."""
+
+    in_parts = True
+
+    def accepts(self, spp):
+        return True
+
+    def render(self, spp, seed=None):
+        self.asked.append((spp, seed is not None))
+        pilot = 0.0 if self.passes else 2.0
+        stages = {Stage.PILOT: pilot, Stage.TRACED: 0.01 * spp, Stage.CUTS: 0.0}
+        statistics = {"seconds": stages, "pilots": int(pilot > 0)}
+        self.passes.append(rendering.Pass(seed or 0, spp, pilot + 0.1 + 0.01 * spp, statistics))
+        return self.passes[-1]
+
+
+def test_passes_in_parts_are_those_of_a_render_by_time_and_include_a_pilot():
+    progressive = InParts(10_000)
+    measuring.measure(progressive, worker.Job("p", "manylights", "s.xml", "a.exr", budget=10.0))
+    number = len(progressive.passes)
+    warm, measured = progressive.asked[:-number], progressive.asked[-number:]
+    assert [spp for spp, _ in warm] == [spp for spp, _ in measured] and number <= 4
+    assert all(is_unused for _, is_unused in warm) and not any(is_unused for _, is_unused in measured)
+    assert sum(one.statistics["pilots"] for one in progressive.passes) == 1
+    assert 9 < progressive.seconds < 10.2
 
 
 def test_only_small_passes_compile_where_passes_are_long():

@@ -208,6 +208,16 @@ def test_sizes_that_are_given_stay():
     assert [one.spp for one in passes] == [6, 6, 6, 2]
 
 
+def test_in_parts_the_pilot_of_the_first_pass_is_not_expected_again():
+    found = []
+    for pilot in (0.0, 3.0):
+        sizes = PassSizes(SQUARE // 2, time=10 + pilot, in_parts=True)
+        stages = {Stage.PILOT: pilot, Stage.TRACED: 0.4, Stage.CUTS: 0.0}
+        first = Pass(0, sizes.next([], 0.0), 0.6 + pilot, {"seconds": stages, "pilots": 1})
+        found.append(sizes.next([first], first.seconds))
+    assert found[0] == found[1] > 60
+
+
 @pytest.mark.parametrize("in_parts", [False, True])
 def test_a_pass_of_a_given_size_begins_if_half_of_it_fits(in_parts):
     for time, size in ((8, 8), (6, "time")):
