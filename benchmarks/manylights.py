@@ -12,9 +12,11 @@ in ``product`` also ``manylights``.
   product is proportional to the time for a given error.  Bias: excess of the mean over that of ``path``, with its
   standard error.  Plain: the ratio of the variances of all pixels.  Sets: spread of the mean of the image between
   passes, each of which has its own light set.
-- ``denoised``: error of one pass through Open Image Denoise against the reference, without the noise of the reference,
-  and the time of ``path`` for equal error, with the sampler ``independent`` and with the better sampler.
-  ``manylights`` stratifies its own samples.  The time of the denoiser, with albedo and normal, is the same for all.
+- ``denoised``: error of ``--passes`` denoised images against the reference, without the noise of the reference, and
+  the time of ``path`` for equal error, with the sampler ``independent`` and with the better sampler.
+  ``manylights.render`` ends the images of ``manylights`` after ``--seconds``, with their pilots and first passes; those
+  of ``path`` are single passes, which stratify best, with the same denoiser.  Times include albedo, normal and
+  denoiser.  Kernels are compiled before.
 - ``timed``: variance × time of ``--passes`` images that ``manylights.render`` ends after ``--seconds``, with their
   pilots and first passes.  ``path`` uses its better sampler, ``manylights`` its own stratified samples.  Kernels are
   compiled before.
@@ -171,7 +173,7 @@ def timed(names, width: int, seconds: float, passes: int) -> dict:
 
 def denoised(names, width: int, seconds: float, passes: int) -> dict:
     """Print the denoised error, and the time that ``path`` takes for the denoised error of ``manylights``."""
-    print(f"denoised, {width} wide, passes of {seconds:g} s: error of a pass; time of `path` for equal error over that")
+    print(f"denoised, {width} wide, images of {seconds:g} s: error, samples; time of `path` for equal error over that")
     print("of manylights, with the sampler `independent` and with the better sampler")
     rows = {}
     for name in names:
@@ -189,26 +191,28 @@ def denoised_of(name: str, width: int, seconds: float, passes: int) -> dict:
     from comparison.denoising import Denoiser
 
     scene = load(name, width)
-    rivals = [Rival(name, scene, "path", sampler, width, seconds) for sampler in SAMPLERS]
-    # manylights stratifies the samples of this sampler
-    rivals.append(Rival(name, scene, "manylights", "independent", width, seconds, denoised=True))
-    measure_in_turn(rivals, passes)
-    # The same denoiser for all; the first one compiles
-    denoiser = [Denoiser(scene) for _ in range(2)][-1]
+    # The first denoiser compiles
+    denoiser = [Denoiser(scene, time_limit=seconds) for _ in range(2)][-1]
     fixed = denoiser.seconds + denoiser.filter_seconds
+    rivals = [Rival(name, scene, "path", sampler, width, seconds - fixed) for sampler in SAMPLERS]
+    # manylights stratifies the samples of this sampler
+    rivals.append(Timed(scene, "manylights", "independent", seconds, denoise=True, denoised=True))
+    measure_in_turn(rivals, passes)
     reference = reference_of(name)
-    points = [(denoised_error(rival.images, denoiser, *reference), float(np.median(rival.seconds))) for rival in rivals]
+    clean = [[denoiser.denoise(image, ["R", "G", "B"]) for image in rival.images] for rival in rivals[:-1]]
+    errors = [denoised_error(images, *reference) for images in (*clean, rivals[-1].images)]
+    times = [float(np.median(rival.seconds)) for rival in rivals]
+    points = list(zip(errors, [*(spent + fixed for spent in times[:-1]), times[-1]], strict=True))
     *theirs, (ours, our_time) = points
-    # Denoised errors fall by 1.37 where samples double; the denoiser works once
+    # Denoised errors fall by 1.37 where samples double
     ratios = [
-        (spent * (max(error, 1e-9) / max(ours, 1e-9)) ** (np.log(2) / np.log(1.37)) + fixed) / (our_time + fixed)
-        for error, spent in theirs
+        spent / our_time * (max(error, 1e-9) / max(ours, 1e-9)) ** (np.log(2) / np.log(1.37)) for error, spent in theirs
     ]
     columns = "".join(
-        f"  {rival.kind} ({rival.sampler[:5]}) {error:.5f} ({spent:.2f} s)"
+        f"  {rival.kind} ({rival.sampler[:5]}) {error:.5f} ({rival.spp}, {spent:.2f} s)"
         for rival, (error, spent) in zip(rivals, points, strict=True)
     )
-    print(f"{name:16s}{columns}  denoiser {fixed:.2f} s  {ratios[0]:7.2f} {min(ratios):7.2f}", flush=True)
+    print(f"{name:16s}{columns}  {ratios[0]:7.2f} {min(ratios):7.2f}", flush=True)
     best = theirs[int(np.argmin(ratios))]
     row = {
         kind: {"relmse": error, "seconds": spent}
@@ -217,11 +221,10 @@ def denoised_of(name: str, width: int, seconds: float, passes: int) -> dict:
     return row | {"independent_speedup": float(ratios[0]), "speedup": float(min(ratios))}
 
 
-def denoised_error(images: list, denoiser, truth: np.ndarray, noise: np.ndarray) -> float:
+def denoised_error(images: list, truth: np.ndarray, noise: np.ndarray) -> float:
     """Trimmed relative squared error of denoised images without the noise of the reference."""
     scale = scale_of_truth(truth)
-    clean = [denoiser.denoise(image, ["R", "G", "B"])[..., :3] for image in images]
-    error = np.mean([((image - truth) ** 2 - noise**2) / scale for image in clean], axis=0).mean(-1)
+    error = np.mean([((image - truth) ** 2 - noise**2) / scale for image in images], axis=0).mean(-1)
     return float(np.sort(error.ravel())[int(TRIMMED * error.size) : int((1 - TRIMMED) * error.size)].mean())
 
 

@@ -108,19 +108,28 @@ class Rival:
 
 
 class Timed(Rival):
-    """Images of one integrator with one sampler on one scene that end by time."""
+    """Images of one integrator with one sampler on one scene that end by time.
 
-    def __init__(self, scene, kind: str, sampler: str, seconds: float):
+    ``denoise``: whether the images are denoised, with the time of the denoiser; ``more``: properties of
+    ``manylights``.
+    """
+
+    def __init__(self, scene, kind: str, sampler: str, seconds: float, denoise: bool = False, **more):
         self.kind, self.sampler, self.images, self.seconds, self._wanted = kind, sampler, [], [], seconds
-        self.sensor = SAMPLERS.index(sampler)
-        self._scene, self.integrator = scene, mi.load_dict({"type": kind, "max_depth": DEPTH})
-        # Two passes compile the kernels
+        self.sensor, self._denoise = SAMPLERS.index(sampler), denoise
+        more = more if kind == "manylights" else {}
+        self._scene, self.integrator = scene, mi.load_dict({"type": kind, "max_depth": DEPTH, **more})
+        # Two passes compile the kernels, and a third one those of pixels with different numbers of samples
         render(scene, self.integrator, sensor=self.sensor, spp=8, pass_spp=4)
+        if denoise:
+            render(scene, self.integrator, sensor=self.sensor, spp=24, pass_spp=8, denoise=True)
 
     def render(self, seed: int):
         """Render: (image, float64; seconds)."""
         # A render has a seed for each of its passes
-        image, took = render(self._scene, self.integrator, sensor=self.sensor, time=self._wanted, seed=1000 * seed)
+        image, took = render(
+            self._scene, self.integrator, sensor=self.sensor, time=self._wanted, seed=1000 * seed, denoise=self._denoise
+        )
         self.spp = took.spp
         return np.array(image, np.float64)[..., :3], took.seconds
 

@@ -10,6 +10,8 @@
 `occasional`    files written periodically
 `cluster/`      passes and runs on several processes or machines
 `denoising`     Open Image Denoise with albedo and normal
+`sample_density`
+                more samples where the denoiser leaves noise
 `features`      albedo, normal and depth, for the denoiser and as layers of images
 `images`        EXR files with metadata, tone mapping, false colours
 `metrics`       errors against a reference

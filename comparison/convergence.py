@@ -79,11 +79,31 @@ class ErrorEstimate:
         finite = np.isfinite(mean) & np.isfinite(variance)
         if not finite.any():
             return None
-        scale = np.square(mean) + np.square(DARK * np.abs(mean[finite]).mean())
-        lit = finite & (scale > 0)
-        relative = np.divide(variance, scale, out=np.zeros_like(mean), where=lit)
+        relative = _over_scale(variance, mean, finite)
         shared = _box_sum(relative) / np.maximum(_box_sum(finite.astype(np.float64)), 1)
         return float(np.sqrt(np.percentile(shared[finite], 100 * SHARE)))
+
+
+def relative_squares(first, second):
+    """Return the squared difference of two images (height, width, channels), a mean over channels, relative to the
+    squared scale of relMSE of their mean; 0 where it is not finite. (height, width) float64."""
+    first, second = (np.asarray(image, np.float64) for image in (first, second))
+    squares, mean = np.square(first - second).mean(axis=-1), 0.5 * (first + second).mean(axis=-1)
+    return _over_scale(squares, mean, np.isfinite(squares) & np.isfinite(mean))
+
+
+def box_mean(plane):
+    """Return the mean over the neighbours of each pixel inside the image, (height, width)."""
+    return _box_sum(plane) / _box_sum(np.ones_like(plane))
+
+
+def _over_scale(squares, mean, finite):
+    """Return `squares` over m² + (0.1 a)², for an image m of one channel with the mean a; 0 where not `finite`."""
+    result = np.zeros_like(mean)
+    if not finite.any():
+        return result
+    scale = np.square(mean) + np.square(DARK * np.abs(mean[finite]).mean())
+    return np.divide(squares, scale, out=result, where=finite & (scale > 0))
 
 
 def _box_sum(plane):

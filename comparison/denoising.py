@@ -51,11 +51,14 @@ class Denoiser:
 
     def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=QUALITIES[0]):
         self._oidn, begin = import_oidn(), time.perf_counter()
-        self.quality, self._network = quality, getattr(self._oidn.Quality, quality.capitalize())
+        self.quality = quality
+        self._networks = {name: getattr(self._oidn.Quality, name.capitalize()) for name in QUALITIES}
         self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
         self.features, self.feature_spp = features_of(scene, scene.sensors()[sensor], seed, spp, time_limit)
         filtering = time.perf_counter()
-        self._guides = {name: self._filtered({name: self.features[name]}) for name in ("albedo", "normal")}
+        self._guides = {
+            name: self._filtered({name: self.features[name]}, self._networks[quality]) for name in ("albedo", "normal")
+        }
         end = time.perf_counter()
         self.seconds, self.filter_seconds = end - begin, end - filtering
 
@@ -64,27 +67,28 @@ class Denoiser:
         """Return metadata for denoised images."""
         return {"denoise_quality": self.quality, "denoise_feature_spp": self.feature_spp}
 
-    def denoise(self, image, channels):
+    def denoise(self, image, channels, quality=None):
         """Denoise the colour of an image (height, width, channels). Keeps its other channels, and treats non-finite
-        pixels as black."""
+        pixels as black. `quality`: one of `QUALITIES`, by default that of the denoiser."""
         begin = time.perf_counter()
         names = ("R", "G", "B") if "R" in channels else ("Y",)
         planes = np.array(image, np.float32)
         rgb = np.nan_to_num(colour(planes, channels), nan=0.0, posinf=0.0, neginf=0.0)
-        filtered = self._filtered({"color": rgb, **self._guides}, hdr=True, clean_aux=True)
+        network = self._networks[quality or self.quality]
+        filtered = self._filtered({"color": rgb, **self._guides}, network, hdr=True, clean_aux=True)
         where = [list(channels).index(name) for name in names]
         planes[..., where] = filtered if len(where) == 3 else filtered.mean(axis=-1, keepdims=True)
         self.seconds += time.perf_counter() - begin
         return type(image)(planes) if isinstance(image, mi.TensorXf) else planes
 
-    def _filtered(self, inputs, **settings):
+    def _filtered(self, inputs, quality, **settings):
         """Filter the first image of `inputs` (name -> (height, width, 3) float32), guided by the remaining ones."""
         arrays = {name: np.ascontiguousarray(plane, np.float32) for name, plane in inputs.items()}
         output = np.empty_like(next(iter(arrays.values())))
         network = self._device.new_filter("RT")
         for name, plane in (*arrays.items(), ("output", output)):
             network.set_image(name, plane)
-        for name, value in ({"quality": self._network} | settings).items():
+        for name, value in ({"quality": quality} | settings).items():
             setattr(network, name, value)
         network.execute()
         return output

@@ -54,7 +54,9 @@ def measure(progressive, job):
 
 def _render_in_time(progressive, budget, seeds=None):
     """Render passes in parts within a `budget` in seconds, of the sizes that `render` uses with a limit of time."""
-    sizes = PassSizes(progressive.pixels, time=budget, in_parts=True, accepts=progressive.accepts)
+    sizes = PassSizes(
+        progressive.pixels, time=budget, in_parts=True, accepts=progressive.accepts, probes=progressive.differs
+    )  # fmt: skip
     while not isinstance(spp := sizes.next(progressive.passes, progressive.seconds), str):
         progressive.render(spp, next(seeds) if seeds else None)
 

@@ -5,6 +5,9 @@ pay only from a certain size, and samples are stratified within a pass. Such a p
 the time of its start, and the last pass up to twice that. With a time limit of ten seconds a render has a small pass,
 one of a third to half of the time, and one that fills the rest.
 
+In images that will be denoised, the second pass may determine the samples of the pixels in later passes. It is then
+small, because its own pixels have equal numbers.
+
 The first pass is small, as its cost is unknown. Sizes of passes that are not in parts, or end by error, are powers of
 two, from 4 if the number of pixels allows: Mitsuba compiles a single kernel for these sizes, but other kernels for
 sizes between, and, with some film filters, below 4. Each later pass has the size of the pass before it, or grows by a
@@ -20,12 +23,15 @@ where the small first pass has none, and cost more: it is planned for half of th
 import math
 
 from .rendering import largest_pass
+from .sample_density import LEAST_SAMPLES
 
 PASS_SECONDS = 2.0
 PART_SECONDS, LEAST_REST = 10.0, 1.0  # of a pass in parts; minimum ratio of its rest to its start, which has priority
 LEAST_GAIN = 1 / 16  # minimum size of a last pass with virtual lights, as a fraction of the intended size
 LIT = 2.0  # usual cost of a sample with virtual lights over that without, at most: small passes have no lights
+UNSURE = 1.25  # cost over a predicted cost, at most: predictions are within a fifth in 33 views (decisions.md)
 DOUBT = 0.5  # fraction of the remaining time for a second pass, which may have lights and cost more than expected
+PROBE = 0.25  # fraction of the remaining time, or samples, for a second pass that determines the samples of the pixels
 LONGEST = 2.0  # times the wanted seconds: longer passes shrink
 CHANGED = 1.5  # ratio of the times of two passes of equal size at which earlier times are discarded
 MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of a prediction from one size for another
@@ -40,18 +46,22 @@ class PassSizes:
     """Sizes of the passes of an image of `pixels` pixels, up to `spp` samples per pixel and `time` seconds; both may be
     None. `fixed`: size of all passes except the last, or None. `many`: at least eight passes of similar sizes, for an
     estimate of the error. `in_parts`: whether passes are rendered in parts.
-    `accepts`: whether the sampler keeps a number of samples per pixel."""
+    `accepts`: whether the sampler keeps a number of samples per pixel. `probes`: whether the second pass determines the
+    samples of the pixels in later passes."""
 
-    def __init__(self, pixels, spp=None, time=None, fixed=None, many=False, in_parts=False, accepts=lambda spp: True):
+    def __init__(
+        self, pixels, spp=None, time=None, fixed=None, many=False, in_parts=False, accepts=lambda spp: True,
+        probes=False,
+    ):  # fmt: skip
         self._spp, self._time, self._fixed, self._many, self._in_parts = spp, time, fixed, many, in_parts
-        self._accepts = accepts
+        self._accepts, self._probes = accepts, probes
         self._any_size = in_parts and not many and not fixed  # after the first pass, not only powers of two
         self._largest = _power_of_two(largest_pass(pixels, in_parts))
         self._least = USUAL if USUAL * pixels <= FIRST_SAMPLES else 1
         self._current, self._seconds, self._asked = fixed or self._least, {}, None
         self._known = {}  # size -> seconds of the last pass; not of the first pass, which compiles
         self._starts = {}  # size -> seconds to start the last pass, of passes that report them
-        self._lit = False  # whether a pass had virtual lights
+        self._lit, self._lit_cost = False, LIT  # whether a pass had virtual lights; their cost, at most
         self._before = None  # number of passes from a checkpoint; None until the first call
 
     def next(self, passes, elapsed):
@@ -77,6 +87,8 @@ class PassSizes:
 
     def _of_the_rest(self, size, left):
         """Return the size of the next pass, about `size` samples, with `left` samples until the limit."""
+        if self._probes and self._seconds and not self._known and PROBE * left >= LEAST_SAMPLES:
+            return min(size, self._kept(int(PROBE * left)))
         if self._any_size and left < 2 * size and left <= self._largest:
             return left
         return min(size, left if self._fixed or left < USUAL else _power_of_two(left))
@@ -87,6 +99,8 @@ class PassSizes:
         if last.start_seconds is not None:
             self._starts[self._asked] = last.start_seconds
             self._lit |= last.has_lights
+            if last.growth is not None:
+                self._lit_cost = UNSURE * last.growth if last.growth > 1 else 1.0
         # The first pass of a size may have compiled kernels
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
         if not compiles:
@@ -127,7 +141,9 @@ class PassSizes:
         """
         least = size if self._fixed else min(size, self._least)
         line = self._line()
-        if self._any_size and not self._known and not self._lit:
+        if self._any_size and not self._known and self._probes:
+            left = PROBE * min(left, PART_SECONDS)
+        elif self._any_size and not self._known and not self._lit:
             left *= DOUBT
         if self._any_size and line:
             filling = int((left - line[0] - KERNEL_SECONDS) / line[1])
@@ -145,7 +161,7 @@ class PassSizes:
     def _certain(self, size):
         """Return the largest size up to `size` that takes no longer than expected if its pass has virtual lights."""
         known = max(self._known, default=0)
-        return int(size if self._lit or not known else min(size, max(known, size / LIT)))
+        return int(size if self._lit or not known else min(size, max(known, size / self._lit_cost)))
 
     def _kept(self, size):
         """Return the largest size up to `size` that the sampler keeps."""
@@ -175,15 +191,16 @@ class PassSizes:
     def _line(self):
         """Return the seconds to start a pass, and the seconds per sample per pixel; None if unknown.
 
-        From the start that the largest pass reports, or else from the largest size and the least one within
+        From the shortest start that passes report, or else from the largest size and the least one within
         `MOST_GROWTH` of it.
         """
         large = max(self._known or self._starts, default=0)
         longest = self._known.get(large) or self._seconds.get(large)
         if large in self._starts:
             each = max((longest - self._starts[large]) / large, LEAST_SHARE * longest / large)
-            # Larger passes than the first one may have virtual lights
-            return self._starts[large], each if self._known or self._lit else LIT * each
+            # Some passes learn for all passes of their size. Larger passes than the first one may have virtual lights
+            start = min(self._starts[size] for size in (self._known.keys() & self._starts.keys()) or self._starts)
+            return start, each if self._known or self._lit else LIT * each
         small = min((size for size in self._known if MOST_GROWTH * size >= large), default=0)
         if small == large:
             return None

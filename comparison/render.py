@@ -87,7 +87,8 @@ def render(
     is at least one pass. The log has a warning if `spp` or `time` ends a render above its `error`. `seed`: of the first
     pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py), by
     the network "high" (True), "balanced" or "fast"; an integrator given by name is then created with its property
-    `denoised`, if it has one.
+    `denoised`, if it has one. `manylights` with this property gives more samples to pixels where the denoiser leaves
+    noise (sample_density.py), unless there is an `error`.
     `progress`: called after each pass with the cost and the image so far; integrators of this project also call it at
     the start of each stage of a pass, with None for the image. If it returns False, no other pass begins; an exception
     ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a `checkpoint.Checkpoint` of the
@@ -123,11 +124,12 @@ def render(
     begin = clock.perf_counter()
     denoiser = Denoiser(scene, sensor, seed, spp, time, quality) if denoise else None
     planes = layers_of(layers, scene, sensor, denoiser, seed=seed, spp=spp, time_limit=time)
-    progressive = Progressive(scene, seed, sensor, integrator)
+    # The error is that of the raw image, which equal numbers of samples suit best
+    progressive = Progressive(scene, seed, sensor, integrator, denoiser.denoise if denoiser and not error else None)
     reserved = denoiser.filter_seconds if denoiser else 0.0
     sizes = PassSizes(
         progressive.pixels, spp, time and time - reserved, pass_spp, error is not None, progressive.in_parts,
-        progressive.accepts,
+        progressive.accepts, progressive.differs,
     )  # fmt: skip
     ending = Ending(spp, time and time - reserved, error, reserved)
     if checkpoint:

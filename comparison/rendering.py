@@ -11,12 +11,15 @@ import numpy as np
 
 from vpl.core.garbage import garbage_kept
 from vpl.core.stages import Stage
+from vpl.split.pixel_rays import MULTIPLE
 
 from .convergence import ErrorEstimate
 from .images import colour
+from .sample_density import SampleDensity
 
 MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the time to the first image
 MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
+HALF = "half."  # begins the names of channels with every second sample (integrators/manylights.py)
 # Stages of `manylights` with times about proportional to the samples
 PER_SAMPLE = Stage.LIGHTS, Stage.TREE, Stage.TRACED, Stage.CLUSTERS, Stage.CUTS
 
@@ -62,6 +65,12 @@ class Pass:
         return Stage.CUTS in self.statistics.get("seconds", {})
 
     @property
+    def growth(self):
+        """Cost of a sample in a pass of four times the samples over that in this pass, as `manylights` predicts it;
+        None if the integrator does not predict it."""
+        return self.statistics.get("growth")
+
+    @property
     def repeated_seconds(self):
         """Seconds without the pilot, if later passes share it."""
         made = self.statistics.get("pilots", 0)
@@ -79,21 +88,25 @@ class Pass:
 @dataclass
 class PassImage:
     """Image of a pass. `planes`: average of the samples, (height, width, channels) float32; `channels`: names; `taken`:
-    the `Pass`."""
+    the `Pass`; `half`: colour of every second sample, None if not requested."""
 
     planes: np.ndarray
     channels: list
     taken: Pass
+    half: np.ndarray | None = None
 
 
-def render_pass(scene, sensor, integrator, spp, seed, first=None, shared=None):
+def render_pass(scene, sensor, integrator, spp, seed, first=None, shared=None, density=None, half=False):
     """Render a pass of `spp` samples per pixel, which stratified samplers round up; return a `PassImage`.
 
     `sensor`: an index. `first`: (samples per pixel, seed) of the first pass of the render, by default this pass, on
-    which the start depends that passes of `manylights` share; `shared`: the `SharedStart` of the render.
+    which the start depends that passes of `manylights` share; `shared`: the `SharedStart` of the render. `density`,
+    `half`: samples of each pixel over `spp`, and whether to return an image of every second sample; see
+    `ManyLightsIntegrator.pass_of`.
     """
     sensor, begin = scene.sensors()[sensor], time.perf_counter()
-    with _sharing(scene, sensor, integrator, (spp, seed), first or (spp, seed), shared or SharedStart()):
+    shared = shared or SharedStart()
+    with _sharing(scene, sensor, integrator, (spp, seed), first or (spp, seed), shared, density, half):
         spp = _render(scene, sensor, integrator, spp, seed)
     seconds = time.perf_counter() - begin
     # The film, as the image of `mi.render` lacks names, and channels of nested integrators
@@ -101,7 +114,12 @@ def render_pass(scene, sensor, integrator, spp, seed, first=None, shared=None):
     channels = [entry.name for entry in bitmap.struct_()]
     planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
     statistics = dict(getattr(integrator, "statistics", None) or {})
-    return PassImage(planes, channels, Pass(seed, spp, seconds, statistics))
+    taken = Pass(seed, spp, seconds, statistics)
+    if not half:
+        return PassImage(planes, channels, taken)
+    of_half = [index for index, name in enumerate(channels) if name.startswith(HALF)]
+    rest = [index for index in range(len(channels)) if index not in of_half]
+    return PassImage(planes[..., rest], [channels[index] for index in rest], taken, planes[..., of_half])
 
 
 def _render(scene, sensor, integrator, spp, seed):
@@ -122,7 +140,7 @@ class SharedStart:
 
 
 @contextmanager
-def _sharing(scene, sensor, integrator, this, first, shared):
+def _sharing(scene, sensor, integrator, this, first, shared, density, half):
     """Let the pass `this`, (samples per pixel, seed), use the start of the pass `first`, if the integrator shares it.
 
     Makes the start if the first pass was rendered elsewhere, so that an image is the same on any number of workers.
@@ -130,7 +148,7 @@ def _sharing(scene, sensor, integrator, this, first, shared):
     if not hasattr(integrator, "pass_of"):
         yield
         return
-    with integrator.pass_of(shared, this == first) as is_missing:
+    with integrator.pass_of(shared, this == first, density, half) as is_missing:
         if is_missing:
             with integrator.only_start():
                 _render(scene, sensor, integrator, *first)
@@ -179,17 +197,18 @@ class Passes:
 
 
 class Progressive(Passes):
-    """Running average of passes in this process. `integrator` is by default the scene's."""
+    """Running average of passes in this process. `integrator` is by default the scene's; `denoise`: see
+    `SampleDensity`, for an image that will be denoised."""
 
-    def __init__(self, scene, seed, sensor=0, integrator=None):
-        super().__init__(seed)
-        self._scene, self._sensor = scene, sensor
+    def __init__(self, scene, seed, sensor=0, integrator=None, denoise=None):
+        self._scene, self._sensor, self._denoise = scene, sensor, denoise
         self.integrator = integrator or scene.integrator()
+        super().__init__(seed)
 
     def restart(self):
-        """Remove all passes and their common start."""
+        """Remove all passes and what they share."""
         super().restart()
-        self._shared = SharedStart()
+        self._shared, self.density = SharedStart(), SampleDensity(self._denoise)
 
     def render(self, spp, seed=None, accept=lambda: True):
         """Render and add a pass of `spp` samples per pixel; return the `Pass`.
@@ -199,13 +218,34 @@ class Progressive(Passes):
         """
         seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
         first = (self.passes[0].spp, self.passes[0].seed) if self.passes else None
-        image = render_pass(self._scene, self._sensor, self.integrator, spp, seed, first, self._shared)
-        return self.add(image) if accept() else None
+        sensor = self._scene.sensors()[self._sensor]
+        density, half = self.density.of_pass(self.integrator, sensor, spp, not self.passes)
+        image = render_pass(
+            self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density, half
+        )  # fmt: skip
+        if not accept():
+            return None
+        if density is not None:
+            image.taken.statistics["precision"] *= self.density.gain
+        if half:
+            self.density.learn(image.planes, image.half, image.channels)
+        return self.add(image)
 
     def accepts(self, spp):
-        """Return whether the sampler keeps a number of samples per pixel, which some samplers round up."""
+        """Return whether the sampler keeps a number of samples per pixel, which some samplers round up, and whether
+        pixels may have different numbers of samples if the render uses them."""
         with _sample_count(self._scene.sensors()[self._sensor].sampler(), spp) as rounded:
-            return rounded == spp
+            return rounded == spp and (spp % MULTIPLE == 0 or not self.differs)
+
+    @property
+    def seconds(self):
+        """Sum of the wall-clock seconds of all passes, and of the decision on the samples of pixels."""
+        return super().seconds + self.density.seconds
+
+    @property
+    def differs(self):
+        """Whether pixels may have different numbers of samples after the second pass."""
+        return self.density.suits(self.integrator, self._scene.sensors()[self._sensor])
 
     def should_stop(self):
         """Return whether the integrator's `cancel` was called."""
@@ -259,7 +299,8 @@ class TotalStatistics:
     """Sum of the integrators' counters over passes.
 
     Numbers are summed, also in nested dicts ("seconds"); the sum of "precision" is that of the image. Descriptions,
-    such as the text "plan" and the dict "lights", come from the pass with the most samples, the last of equal passes.
+    such as the text "plan", the dict "lights" and the ratio "growth", come from the pass with the most samples, the
+    last of equal passes.
     """
 
     def __init__(self):
@@ -278,7 +319,7 @@ def _add(total, statistics, describe):
     for key, value in statistics.items():
         if isinstance(value, dict) and key != "lights":
             _add(total.setdefault(key, {}), value, describe)
-        elif isinstance(value, int | float | np.number) and not isinstance(value, bool):
+        elif isinstance(value, int | float | np.number) and not isinstance(value, bool) and key != "growth":
             total[key] = total.get(key, 0) + (value.item() if isinstance(value, np.number) else value)
         elif describe or key not in total:
             total[key] = value

@@ -10,6 +10,7 @@ A sensor that another thread frees meanwhile would end the process, so lent sens
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +18,7 @@ import numpy as np
 
 from vpl.core.sampling import derived_seed
 from vpl.split.lattice import Lattice
+from vpl.split.pixel_rays import MULTIPLE, PixelRays
 
 # Mitsuba's default. A scene that names another sampler keeps it
 _REPLACED = "IndependentSampler"
@@ -28,12 +30,13 @@ class LatticeSampler(mi.Sampler):
     """Camera samples from rank-1 lattices over the samples of a pixel; see :mod:`vpl.split.lattice`.
 
     Each call of ``next_1d`` or ``next_2d`` takes a lattice in an independent random order.  The numbers are for camera
-    rays and not for symbolic loops.  ``pixels``: of the film, borders included.
+    rays and not for symbolic loops.  ``pixels``: of the film, borders included; ``width`` of the film; ``rays``: the
+    :class:`PixelRays` of a render in one pass, None for equal numbers of rays.
     """
 
     def __init__(self):
         super().__init__(mi.Properties("lattice"))
-        self.pixels, self._seed, self._pass = 1, 0, 0
+        self.pixels, self.width, self.rays, self._seed, self._pass = 1, 1, None, 0, 0
 
     @property
     def pass_seed(self) -> int:
@@ -58,15 +61,27 @@ class LatticeSampler(mi.Sampler):
 
     def next_2d(self, active=True):
         """A point of the unit square for each lane."""
-        return self._next()[1]
+        point = self._next()[1]
+        # Mitsuba takes the place in the pixel first, and assumes equal numbers of rays
+        return point + self._offset if self.rays and self._calls == 1 else point
 
     def _begin(self):
         lanes = self.wavefront_size()
-        each = lanes // self.pixels
-        lane, wide = dr.arange(mi.UInt32, lanes), dr.opaque(mi.UInt32, each)
-        # The passes of a render share the lattice of a pixel
-        number = lane % wide + dr.opaque(mi.UInt32, self._pass * each)
-        self._lattice, self._calls = Lattice(lane // wide, number, self.sample_count(), self._seed), 0
+        each, lane, self._calls = lanes // self.pixels, dr.arange(mi.UInt32, lanes), 0
+        if self.rays:
+            places, sizes = self.rays.places(lane), self.rays.sizes
+            here, there = (self._position(pixel) for pixel in (lane // dr.opaque(mi.UInt32, each), places.pixel))
+            self._offset = there - here
+        else:
+            places, sizes = PixelRays.uniform(self.pixels, each).places(lane), (self.sample_count(),)
+            # The passes of a render share the lattice of a pixel
+            places = replace(places, number=places.number + dr.opaque(mi.UInt32, self._pass * each))
+        self._lattice = Lattice(places, sizes, self._seed)
+
+    def _position(self, pixel):
+        """Position of a pixel in the film."""
+        width = dr.opaque(mi.UInt32, self.width)
+        return mi.Point2f(pixel % width, pixel // width)
 
     def _next(self):
         self._calls += 1
@@ -89,8 +104,9 @@ class StratifiedSensor(mi.Sensor):
         properties["shutter_open"], properties["shutter_close"] = 0.0, 1.0
         super().__init__(properties)
 
-    def becomes(self, sensor, spp: int) -> None:
-        """Stand for ``sensor`` with ``spp`` samples of a pixel; None: for no sensor."""
+    def becomes(self, sensor, spp: int, density: np.ndarray | None = None) -> None:
+        """Stand for ``sensor`` with ``spp`` samples of a pixel, which differ in proportion to a ``density`` (height,
+        width) if there is one; None: for no sensor."""
         self._sensor, self.m_film = sensor, sensor.film() if sensor else self._idle
         if sensor is None:
             return
@@ -98,7 +114,9 @@ class StratifiedSensor(mi.Sensor):
         size = np.array(film.crop_size(), np.int64) + (2 * film.rfilter().border_size() if film.sample_border() else 0)
         self.m_needs_sample_3 = sensor.needs_aperture_sample()
         self.sampler().set_sample_count(spp)
-        self.sampler().pixels = int(np.prod(size))
+        sampler = self.sampler()
+        sampler.pixels, sampler.width = int(np.prod(size)), int(size[0])
+        sampler.rays = None if density is None else PixelRays.by_density(density, spp)
 
     def to_string(self):
         """The other sensor."""
@@ -123,24 +141,42 @@ class StratifiedSensor(mi.Sensor):
 _IDLE: list[StratifiedSensor] = []
 
 
+def is_replaced(sensor) -> bool:
+    """Whether :func:`stratified` replaces the samples of a sensor."""
+    is_usual = sensor.sampler().class_name() == _REPLACED and sensor.class_name() != _KEPT
+    # Integrators refuse sensors within a participating medium
+    return is_usual and sensor.get_medium() is None
+
+
+def may_differ(sensor, spp: int) -> bool:
+    """Whether pixels may have different numbers of samples, ``spp`` in the mean.
+
+    Only with a box filter, which has no weights: Mitsuba divides the sum of weighted samples by the sum of weights, so
+    pixels with many samples would count more than their neighbours.
+    """
+    film = sensor.film()
+    return is_replaced(sensor) and film.rfilter().is_box_filter() and not film.sample_border() and spp % MULTIPLE == 0
+
+
 @contextmanager
-def stratified(sensor, spp: int):
+def stratified(sensor, spp: int, density: np.ndarray | None = None):
     """Within the block, a sensor for ``sensor`` with stratified samples if its sampler is ``independent``.
 
-    Yields ``sensor`` itself with another sampler, for a batch of sensors, and within a participating medium, which
-    integrators refuse.  ``spp``: samples of a pixel; 0: as many as the sampler has.
+    Yields ``sensor`` itself with another sampler, for a batch of sensors, and within a participating medium.  ``spp``:
+    samples of a pixel; 0: as many as the sampler has; ``density`` (height, width): the samples of a pixel over their
+    mean, about, where :func:`may_differ`; None: equal numbers.
     """
-    sampler = sensor.sampler()
-    if sampler.class_name() != _REPLACED or sensor.class_name() == _KEPT or sensor.get_medium() is not None:
+    if not is_replaced(sensor):
         yield sensor
         return
+    sampler = sensor.sampler()
     try:
         # A single operation, because threads render at the same time
         lent = _IDLE.pop()
     except IndexError:
         lent = StratifiedSensor()
     try:
-        lent.becomes(sensor, spp or sampler.sample_count())
+        lent.becomes(sensor, spp or sampler.sample_count(), density)
         yield lent
     finally:
         lent.becomes(None, 0)

@@ -18,12 +18,13 @@ from vpl.split.cost_model import CostModel
 from vpl.split.emitters import emitter_sampler
 from vpl.split.emitters.cell_choice import learning_rays
 from vpl.split.estimator import estimate
+from vpl.split.pixel_rays import PixelRays
 from vpl.split.roulette import OutgoingRadiance
 from vpl.split.start import Start, make_start
 from vpl.split.surface_lights import KeptLights
 from vpl.split.view import PathRules, View
 
-from .camera_samples import LatticeSampler, stratified
+from .camera_samples import LatticeSampler, may_differ, stratified
 from .gathering import GatheringIntegrator
 from .knobs import Boolean, Groups, Words
 from .manual import manual_page
@@ -32,8 +33,10 @@ from .manual import manual_page
 _SHARED_SAMPLES = 16
 # Largest depth that prb can count, with 32 bits
 _DEEPEST = 2**32 - 1
+# Name of the channels with the mean of every second sample
+HALF = "half"
 # Names of channels and layers of images, which are no names of groups of emitters
-_RESERVED = (*LENGTHS, OTHER, "albedo", "normal", "depth", *"RGBAXYZ")
+_RESERVED = (*LENGTHS, OTHER, HALF, "albedo", "normal", "depth", *"RGBAXYZ")
 
 
 @manual_page
@@ -111,6 +114,11 @@ class ManyLightsIntegrator(GatheringIntegrator):
     - Samplers: the plugin stratifies the choice of emitters and directions.  In place of ``independent``, Mitsuba's
       default, the plugin also stratifies the samples in a pixel, on the lens and in time.  Other samplers, the sensor
       ``batch`` and wrappers, such as ``aov`` and ``moment``, keep the samples of the sensor's sampler.
+    - Numbers of samples: with ``denoised``, the passes of ``manylights.render`` from the third on give a pixel from a
+      quarter to four times the mean number of samples.  Two halves of the second pass are denoised apart, and show
+      where noise remains.  Passes depend on earlier passes only and have a common weight for all pixels, so the mean of
+      the image is unchanged.  The film needs a box filter, and the sensor the samples of this plugin.  Images that end
+      by ``error``, and images by several workers, have equal numbers.
     - Masks: the image is that of ``prb``.  ``path`` (Mitsuba 3.9.1) shows black for samples whose path ends after it
       passed only masks, so it is too dark where nothing is behind a mask.  With ``hide_emitters``, ``path`` hides an
       environment behind a mask, which ``manylights`` shows.  Alpha is that of ``path``.
@@ -147,8 +155,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
             "denoised", False,
             "Whether the image will be denoised. Denoisers keep noise that neighbouring pixels share, so there are "
             "more virtual lights, up to twice as many. Denoisers also leave errors at edges, which virtual lights do "
-            "not reduce, so only lights that remove much of the variance are used. The raw image has up to a sixth "
-            "more variance × time where lights are used, and the noise of paths elsewhere.",
+            "not reduce, so only lights that remove much of the variance are used. ``manylights.render`` gives more "
+            "samples to pixels where the denoiser leaves noise. The raw image has the same mean, and up to twice the "
+            "variance × time.",
         ),
         Boolean(
             "stratified", True,
@@ -182,30 +191,42 @@ class ManyLightsIntegrator(GatheringIntegrator):
             )
         self.cost_model, self._kept = cost_model or CostModel(), KeptLights()
         self._shared, self._makes_start, self._only_starts = None, False, False
+        self._density, self._has_half = None, False
 
     @contextmanager
-    def pass_of(self, shared, is_first: bool):
+    def pass_of(self, shared, is_first: bool, density=None, half: bool = False):
         """Within the block, a render is a pass of a longer render and uses the start that its passes share.
 
         ``shared``: object with an attribute ``start``, None until the first pass is rendered.  The start depends on the
         first pass alone: where it is missing and this is not the first pass, yields True, and the caller has to render
-        the first pass within :meth:`only_start`.
+        the first pass within :meth:`only_start`.  ``density`` (height, width): samples of each pixel over their mean,
+        about; None for equal numbers.  ``half``: whether the image has the channels :data:`HALF`, the mean of every
+        second sample, with an even number of samples.  Both need :meth:`may_differ`.
         """
         with exclusive(integrator=self):
-            self._shared, self._makes_start = shared, is_first
+            self._shared, self._makes_start, self._density, self._has_half = shared, is_first, density, half
             try:
                 yield shared.start is None and not is_first
             finally:
-                self._shared, self._makes_start = None, False
+                self._shared, self._makes_start, self._density, self._has_half = None, False, None, False
+
+    def may_differ(self, sensor, spp: int) -> bool:
+        """Whether the pixels of a pass of an image for denoising may have different numbers of samples, ``spp`` in the
+        mean."""
+        return self.denoised and self.stratified and may_differ(sensor, spp)
 
     @contextmanager
     def only_start(self):
         """Within the block, a render makes the start of its pass and no image."""
+        of_pass = self._density, self._has_half
         self._makes_start = self._only_starts = True
+        # The start belongs to the first pass, whose pixels have equal numbers of samples
+        self._density, self._has_half = None, False
         try:
             yield
         finally:
             self._makes_start = self._only_starts = False
+            self._density, self._has_half = of_pass
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
         """Derivative of the image, by ``prb``: a tensor of the shape of the image, see :meth:`_adjoint` for errors.
@@ -247,7 +268,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
     def aov_names(self):
         """Names of the channels of layers."""
         channels = "Y" if mi.is_monochromatic else "RGB"
-        return [f"{layer}.{channel}" for layer in self._layer_names for channel in channels]
+        layers = [*self._layer_names, *([HALF] if self._has_half else [])]
+        return [f"{layer}.{channel}" for layer in layers for channel in channels]
 
     @property
     def _layer_names(self) -> list[str]:
@@ -257,7 +279,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
     def _render(self, scene, sensor, seed, spp, develop, evaluate):
         if self._layer_names:
             _require_unit_weight(sensor)
-        with stratified(sensor, spp) if self.stratified else nullcontext(sensor) as chosen:
+        with stratified(sensor, spp, self._density) if self.stratified else nullcontext(sensor) as chosen:
             return super()._render(scene, chosen, seed, spp, develop, evaluate)
 
     def _sample(self, scene, sampler, ray, active):
@@ -282,6 +304,12 @@ class ManyLightsIntegrator(GatheringIntegrator):
         found = estimate(view, start, kept, self.should_stop, clock)
         self.statistics = found.statistics | {"pilots": int(known is None)}
         channels = [channel for name in self._layer_names for channel in found.layers[name]]
+        if view.rays.differ:
+            channels = [view.rays.evenly(channel) for channel in channels]
+            return mi.Spectrum(view.rays.evenly(found.radiance)), view.rays.evenly_masked(found.valid), channels
+        if self._has_half:
+            number = view.rays.places(dr.arange(mi.UInt32, view.count)).number
+            channels += list(dr.select((number & 1) == 1, 2 * found.radiance, 0))
         return mi.Spectrum(found.radiance), found.valid, channels
 
     def _view(self, scene, sampler, ray, active, known: Start | None) -> View:
@@ -292,13 +320,15 @@ class ManyLightsIntegrator(GatheringIntegrator):
         grid, count = self.pixel_grid(scene, sampler), dr.width(ray)
         dr.make_opaque(ray, active)
         pixels = -(-count // grid.samples)
+        own = sampler.rays if isinstance(sampler, LatticeSampler) else None
+        rays = own or PixelRays.uniform(pixels, grid.samples)
         # A shared start serves larger passes, too
         learning = max(count, _SHARED_SAMPLES * pixels) if self._shared else count
         groups = EmitterGroups(scene, self.light_groups) if self.light_groups and not known else None
         emitters = known.emitters if known else emitter_sampler(scene, learning_rays(learning), groups)
         return View(
             scene, emitters, Perturbed(scene), PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray,
-            active, grid.width, grid.samples, seed, dr.opaque(mi.Float, 1.0, pixels), OutgoingRadiance.unknown(),
+            active, grid.width, rays, seed, dr.opaque(mi.Float, 1.0, pixels), OutgoingRadiance.unknown(),
             learning, self.cost_model if self.denoised else self.cost_model.without_denoiser(),
             Layers(bool(self.layers), emitters.groups),
         )  # fmt: skip

@@ -21,6 +21,7 @@ The terms of the estimator:
 - ``contributions``: sums of the contributions of paths, for the image and for its layers
 - ``gather_vertices``: vertices where virtual lights are added, the choice of lit vertices, and both normalisations
 - ``pixel_clusters``: a light cut for the vertices of a pixel with similar normals
+- ``pixel_rays``: numbers of camera rays of pixels, which may differ
 - ``lattice``: stratified random numbers for the samples of a pixel
 - ``emitters``: emitter samplers for next-event estimation
 - ``spatial_cells``: cubes of space by facing, for values learned by place

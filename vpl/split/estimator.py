@@ -27,6 +27,7 @@ from .line_hits import has_large_curves
 from .path_tracer import Traced, trace_camera_rays
 from .pilot import error_scale
 from .pixel_clusters import PixelClusters, light_clusters
+from .pixel_rays import PixelRays
 from .plan import Decision, Plan, choose, without_lights
 from .roulette import OutgoingRadiance, best_multiple
 from .start import Start, evidence_of
@@ -36,6 +37,8 @@ from .view import PathSettings, Stream, View, ViewLights
 # Smallest and largest number of camera rays per part; the target is half of the image. Filling new memory of a process
 # is slow, which matters for small images, and Dr.Jit records the kernels anew for each part
 _WAVEFRONT = 1 << 18, 1 << 20
+# Ratio of the size of a larger pass, of which a pass predicts the cost
+LARGER = 4
 # Every surface blocks the light of virtual lights: light that passes a surface is traced
 _OPAQUE = SceneTraits(False, False, True, False, False, (), (), None)
 
@@ -62,8 +65,8 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
     mi.Log(mi.LogLevel.Info, f"manylights: {decision.plan}")
     lights, of_lights = make_lights(view, decision, kept, clock)
     radiance, valid, layers, of_image = render_image(view, lights, decision, stopped, clock)
-    precision = {"precision": decision.precision(view.samples)}
-    statistics = {"plan": decision.plan.reason} | precision | roulette | of_lights | of_image
+    expected = {"precision": decision.precision(view.samples), "growth": decision.growth(LARGER)}
+    statistics = {"plan": decision.plan.reason} | expected | roulette | of_lights | of_image
     return Estimate(radiance, valid, layers, statistics | {"seconds": clock.seconds})
 
 
@@ -142,20 +145,20 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
     radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
     sums = view.layers.sums(view.count)
     parts = max(round(view.count / np.clip(view.count / 2, *_WAVEFRONT)), 1)
-    most = -(-view.pixels // parts) * view.samples
     statistics: dict[str, int] = {}
-    for first in range(0, view.count, most):
+    for pixels in view.rays.parts(-(-view.pixels // parts) * view.samples):
         if stopped():
             break
-        lane = dr.arange(mi.UInt32, min(most, view.count - first)) + dr.opaque(mi.UInt32, first)
+        rays, first = view.rays.part(*pixels), int(view.rays.first[pixels[0]])
+        lane = dr.arange(mi.UInt32, rays.count) + dr.opaque(mi.UInt32, first)
         dr.eval(lane)
         sums_of_part = sums.part(first) if sums else None
-        traced, points = _traced_part(view, lane, first, settings, lights, decision.plan, sums_of_part, clock)
+        traced, points = _traced_part(view, lane, rays, settings, lights, decision.plan, sums_of_part, clock)
         part, opaque = traced.radiance, traced.valid
         # Frees the memory of unlit gather vertices
         del traced
         if points is not None:
-            light, counts = gatherer.light(points, part, first, sums_of_part, clock)
+            light, counts = gatherer.light(points, part, pixels, sums_of_part, clock)
             part += light
             for name, number in counts.items():
                 statistics[name] = statistics.get(name, 0) + number
@@ -176,18 +179,19 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
 
 
 def _traced_part(
-    view: View, lane: mi.UInt32, first: int, settings: PathSettings, lights: ViewLights, plan: Plan,
+    view: View, lane: mi.UInt32, rays: PixelRays, settings: PathSettings, lights: ViewLights, plan: Plan,
     sums: LayerSums | None, clock: Clock,
 ) -> tuple[Traced, LitVertices | None]:  # fmt: skip
-    """(Traced part of the camera rays ``lane``, from the ray ``first`` on; gather vertices that are lit)."""
+    """(Traced part of the camera rays ``lane``, which are ``rays`` of whole pixels; gather vertices that are lit)."""
     clock.begin(Stage.TRACED)
+    first = int(lane[0])
     traced = trace_camera_rays(view, lane, settings, Stream.IMAGE, first, sums=sums)
     if not lights.all:
         return traced, None
     clock.begin(Stage.CLUSTERS)
     seed = derived_seed(derived_seed(view.seed, Stream.GATHER, first), 0)
     gathered = traced.gathered
-    return traced, LitVertices.of(gathered.first, gathered.later, view.samples, plan.vertices, seed)
+    return traced, LitVertices.of(gathered.first, gathered.later, rays, plan.vertices, seed)
 
 
 @dataclass(frozen=True)
@@ -213,28 +217,37 @@ class Gatherer:
         return cls(view, decision.plan, transports, decision.expected_light(lights), darkest)
 
     def light(
-        self, points: LitVertices, found, first: int, sums: LayerSums | None, clock: Clock
+        self, points: LitVertices, found, pixels: tuple[int, int], sums: LayerSums | None, clock: Clock
     ) -> tuple[mi.UnpolarizedSpectrum, dict]:
-        """(Light at the ``points``, per camera ray; counters) for a part of the image, from the ray ``first`` on.
+        """(Light at the ``points``, per camera ray; counters) for a part of the image: the range ``pixels``.
 
         The brightness of a pixel is the radiance ``found`` by paths plus the expected light of virtual lights.
         ``sums`` by layer of this part.
         """
-        view, samples, count = self.view, self.view.samples, dr.width(found)
-        lit = dr.zeros(mi.UnpolarizedSpectrum, count)
+        view, rays, first = self.view, self.view.rays.part(*pixels), int(self.view.rays.first[pixels[0]])
+        lit = dr.zeros(mi.UnpolarizedSpectrum, rays.count)
         dr.eval(lit)
         if points.count == 0:
             return lit, {}
-        clusters = PixelClusters(points, samples)
+        clusters = PixelClusters(points, rays)
         clock.begin(Stage.CUTS)
-        traced = np.nan_to_num(download(channel_mean(found)), posinf=0, neginf=0).reshape(-1, samples).mean(1)
-        brightness = np.maximum(traced, 0) + self.expected[first // samples :][: len(traced)]
+        radiance = np.nan_to_num(download(channel_mean(found)), posinf=0, neginf=0)
+        traced = np.add.reduceat(radiance, rays.first[:-1]) / rays.numbers
+        brightness = np.maximum(traced, 0) + self.expected[slice(*pixels)]
         # Of the sum over the samples of a pixel
-        allowed = self.plan.error * samples * np.maximum(brightness, self.darkest)[clusters.pixel]
+        allowed = self._errors(rays) * rays.numbers * np.maximum(brightness, self.darkest)
         shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, first)
         for number, transport in enumerate(self.transports):
             stream = derived_seed(seed, 1, number)
-            shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit, sums)
+            shadow_rays += light_clusters(
+                transport, clusters, allowed[clusters.pixel], view.model.largest_cut, stream, lit, sums
+            )
         clock.stop()
         counts = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}
         return lit, counts | {"later": points.alone}
+
+    def _errors(self, rays: PixelRays) -> np.ndarray:
+        """Bound of the cuts as a fraction of the pixel, (pixels,): with as many shadow rays for each camera ray."""
+        model = self.view.model
+        finer = (rays.numbers / rays.mean) ** -model.error_slope
+        return np.clip(self.plan.error * finer, model.finest_error, model.coarsest_error)

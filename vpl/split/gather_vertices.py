@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import channel_mean, download, select_record, upload
+from .pixel_rays import PixelRays
 
 
 @dataclass
@@ -133,18 +134,23 @@ class LitVertices:
     alone: int
 
     @classmethod
-    def of(cls, first: GatherVertices, later: GatherVertices, samples: int, most: int, seed: int) -> LitVertices:
-        """Choose at most ``most`` first vertices of every pixel of ``samples`` rays, and later vertices by weight."""
-        kept, number = min(most, samples), dr.opaque(mi.UInt32, samples)
-        sample = dr.arange(mi.UInt32, dr.width(first.weight)) % number
+    def of(cls, first: GatherVertices, later: GatherVertices, rays: PixelRays, most: int, seed: int) -> LitVertices:
+        """Choose first vertices of every pixel with the camera ``rays``, and later vertices by weight: at most ``most``
+        first vertices of a pixel with the mean number of rays, and as large a fraction of those of the others."""
+        kept = rays.lit(most)
+        places = rays.places(dr.arange(mi.UInt32, dr.width(first.weight)))
+        of_level = (np.array(values) for values in (rays.sizes, kept))
+        number, lighted = (dr.gather(mi.UInt32, upload(mi.UInt32, x), places.level) for x in of_level)
+        # The lanes that fill a packet hold zeros, by which processors do not divide
+        number = dr.maximum(number, 1)
         # Evenly among the samples of a pixel
-        lit = mi.UInt64(sample) * dr.opaque(mi.UInt64, kept) % mi.UInt64(number) >= dr.opaque(mi.UInt64, samples - kept)
-        rays = dr.compress(lit & (dr.max(dr.abs(first.weight)) > 0))
-        later_rays, factor = drawn_later(first, later, samples, kept, seed)
-        # Only kept of samples first vertices are lit, so each represents samples / kept vertices
-        stands_for = dr.opaque(mi.Float, samples / kept)
-        picked = first.select(rays, stands_for).and_then(later.select(later_rays, factor))
-        return cls(picked, joined(rays, later_rays), len(later_rays))
+        lit = mi.UInt64(places.number) * mi.UInt64(lighted) % mi.UInt64(number) >= mi.UInt64(number - lighted)
+        chosen = dr.compress(lit & (dr.max(dr.abs(first.weight)) > 0))
+        later_rays, factor = drawn_later(first, later, rays, most, seed)
+        # A lit vertex represents the first vertices of its pixel
+        stands_for = dr.gather(mi.Float, mi.Float(number) / mi.Float(lighted), chosen)
+        picked = first.select(chosen, stands_for).and_then(later.select(later_rays, factor))
+        return cls(picked, joined(chosen, later_rays), len(later_rays))
 
     @property
     def count(self) -> int:
@@ -152,28 +158,29 @@ class LitVertices:
 
 
 def drawn_later(
-    first: GatherVertices, later: GatherVertices, samples: int, most: int, seed: int
+    first: GatherVertices, later: GatherVertices, rays: PixelRays, most: int, seed: int
 ) -> tuple[mi.UInt32, mi.Float]:
     """Draw later vertices of each pixel in proportion to their weight.
 
-    The expected number is ``most`` times the fraction of later vertices in the total weight of the pixel.  Returns
-    (camera rays, ascending; factors of the weights: the inverse of the expected number of draws of each vertex).
-    Systematic sampling along each pixel of ``samples`` consecutive rays, from a random start.
+    The expected number is the number of lit first vertices, see :class:`LitVertices`, times the fraction of later
+    vertices in the total weight of the pixel.  Returns (camera rays, ascending; factors of the weights: the inverse of
+    the expected number of draws of each vertex).  Systematic sampling along the ``rays`` of each pixel, from a random
+    start.
     """
     levels = [channel_mean(dr.abs(x.weight)) for x in (first, later)]
     dr.eval(levels)
     of_first, of_later = (np.nan_to_num(download(x).astype(np.float64), posinf=0) for x in levels)
-    pixels = np.arange(0, len(of_first), samples)
-    sums = np.add.reduceat(of_later, pixels)
-    step = (sums + np.add.reduceat(of_first, pixels)) / most
-    start = np.random.default_rng(seed).random(len(pixels))
+    begin = rays.first[:-1]
+    sums = np.add.reduceat(of_later, begin)
+    step = (sums + np.add.reduceat(of_first, begin)) / np.array(rays.lit(most))[rays.level]
+    start = np.random.default_rng(seed).random(rays.pixels)
     number = np.floor(sums / np.where(sums > 0, step, 1) + start).astype(np.int64)
-    pixel = np.repeat(np.arange(len(pixels)), number)
+    pixel = np.repeat(np.arange(rays.pixels), number)
     rank = np.arange(len(pixel)) - np.repeat(np.cumsum(number) - number, number)
     cumulative = np.cumsum(of_later)
-    target = (cumulative[pixels] - of_later[pixels])[pixel] + (rank + 1 - start[pixel]) * step[pixel]
+    target = (cumulative[begin] - of_later[begin])[pixel] + (rank + 1 - start[pixel]) * step[pixel]
     ray = np.minimum(np.searchsorted(cumulative, target, side="left"), len(of_later) - 1)
     # Rounding must not lead to a neighbouring pixel or to a vertex without weight
-    kept = (of_later[ray] > 0) & (ray // samples == pixel)
+    kept = (of_later[ray] > 0) & (rays.pixel_of(ray) == pixel)
     ray, factor = ray[kept], step[pixel[kept]] / of_later[ray[kept]]
     return upload(mi.UInt32, ray), upload(mi.Float, factor)

@@ -3,11 +3,12 @@
 Rank-1 lattices with a random shift of the unit square, so every single number is uniform [Cranley and Patterson 1976;
 Sloan and Joe 1994, "Lattice Methods for Multiple Integration"].  Each dimension, vertex and pixel takes the points in
 an independent random order: with a common order, products of two dimensions would have up to twice the variance of
-independent numbers.
+independent numbers.  Pixels may have different numbers of samples, see :mod:`vpl.split.pixel_rays`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import drjit as dr
@@ -16,6 +17,7 @@ import numpy as np
 
 from ..core.arrays import upload
 from ..core.sampling import HASH_ROUNDS, derived_seed
+from .pixel_rays import RayNumbers
 
 # Multipliers of a hash with full avalanche: every bit depends on every input bit [Wellons 2018, "Prospecting for hash
 # functions"]
@@ -56,7 +58,7 @@ def lattice_multiplier(count: int) -> int:
     return int(candidates[nearest][np.argmin(errors)])
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=16)
 def _orders(count: int) -> np.ndarray:
     """Random permutations of ``count`` points, in sequence; fixed, like a hash function."""
     rows = np.tile(np.arange(count, dtype=np.uint32), (max(min(_ORDERS, _ENTRIES // count), 1), 1))
@@ -68,26 +70,32 @@ def _fraction(bits):
 
 
 class Lattice:
-    """Numbers for paths; ``pixel``, ``number`` (UInt32): of each path, with numbers below ``samples``."""
+    """Numbers for paths; ``places`` of the paths in pixels; ``sizes``: different numbers of paths in a pixel."""
 
-    def __init__(self, pixel, number, samples: int, seed: int):
-        self._samples = dr.opaque(mi.UInt32, samples)
-        self._pixel, self._number = pixel, number
+    def __init__(self, places: RayNumbers, sizes: Sequence[int], seed: int):
+        self._pixel, self._number = places.pixel, places.number
         # Derived, because vertex numbers are added to the seed
         self._seed = dr.opaque(mi.UInt32, derived_seed(seed, 0))
-        orders = _orders(samples)
-        self._orders, self._rows = upload(mi.UInt32, orders), dr.opaque(mi.UInt32, len(orders) // samples)
+        tables = [_orders(size) for size in sizes]
+        self._orders = upload(mi.UInt32, np.concatenate(tables))
+        begins = np.cumsum([0, *(len(table) for table in tables[:-1])])
+        rows = [len(table) // size for table, size in zip(tables, sizes, strict=True)]
         # Steps between points of the lattice, in units of 2^-32
-        steps = (round(times * 2**32 / samples) for times in (1, lattice_multiplier(samples)))
-        self._steps = [dr.opaque(mi.UInt32, step % 2**32) for step in steps]
+        steps = [[round(times * 2**32 / size) % 2**32 for size in sizes for times in (1, lattice_multiplier(size))]]
+        steps = np.reshape(steps, (-1, 2)).T
+        self._samples, self._begin, self._rows, *self._steps = (
+            dr.gather(mi.UInt32, upload(mi.UInt32, np.array(values)), places.level)
+            for values in (sizes, begins, rows, *steps)
+        )
 
     @classmethod
     def of_lanes(cls, lane, samples: int, seed: int) -> Lattice:
         """For paths in the lanes ``lane`` (UInt32); ``samples`` consecutive lanes belong to a pixel."""
-        # Evaluated: counted and chosen lanes use the same kernel
-        dr.eval(lane)
         each = dr.opaque(mi.UInt32, samples)
-        return cls(lane // each, lane % each, samples, seed)
+        dr.eval(lane)
+        places = RayNumbers(lane // each, lane % each, lane * dr.opaque(mi.UInt32, 0))
+        dr.eval(places)
+        return cls(places, (samples,), seed)
 
     def at(self, vertex):
         """Numbers of a path at a ``vertex`` (UInt32, counted): (number, pair, number, pair) in [0, 1)."""
@@ -110,4 +118,4 @@ class Lattice:
         order, begin = dr.mul_hi(bits, self._rows), dr.mul_hi(bits * self._rows, self._samples)
         place = begin + self._number
         place = dr.select(place < self._samples, place, place - self._samples)
-        return dr.gather(mi.UInt32, self._orders, order * self._samples + place)
+        return dr.gather(mi.UInt32, self._orders, self._begin + order * self._samples + place)

@@ -197,9 +197,10 @@ def trace_camera_rays(
     """Trace the camera rays ``lane`` of a view; ``stream``: of random numbers; ``sums`` by layer."""
     seed, ray = derived_seed(view.seed, *stream), view.ray
     part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
-    importance = dr.gather(mi.Float, view.importance, lane // dr.opaque(mi.UInt32, view.samples))
+    places = view.rays.places(lane)
+    importance = dr.gather(mi.Float, view.importance, places.pixel)
     edge = FirstEdge.of_camera(part, importance, dr.gather(mi.Bool, view.active, lane))
-    lattice = Lattice.of_lanes(lane, view.samples, derived_seed(seed, 0))
+    lattice = Lattice(places, view.rays.sizes, derived_seed(seed, 0))
     sampler = independent_sampler(derived_seed(seed, 1), dr.width(lane))
     return trace_paths(view.scene, view.emitters, edge, lattice, sampler, settings, sums)
 

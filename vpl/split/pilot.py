@@ -69,7 +69,7 @@ class Pilot:
         lane = view.pairs(min(model.pilot_rays, int(model.pilot_share * view.learning_count)))
         settings = view.settings(lights, Gathering.AT_FIRST)
         traced = trace_camera_rays(view, upload(mi.UInt32, lane), settings, Stream.PILOT)
-        return cls.of(traced, lane // view.samples, (view.width, view.pixels), model)
+        return cls.of(traced, view.rays.pixel_of(lane), (view.width, view.pixels), model)
 
     @classmethod
     def of(cls, traced: Traced, pixel: np.ndarray, size: tuple[int, int], model: CostModel) -> Pilot:

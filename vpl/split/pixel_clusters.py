@@ -22,6 +22,7 @@ from ..points.surfaces import LambertianSurface, Receiver
 from ..transport.evaluation import Transport, evaluate_pairs
 from .contributions import LayerSums
 from .gather_vertices import LitVertices
+from .pixel_rays import PixelRays
 from .spatial_cells import FACINGS, facing
 
 
@@ -63,14 +64,14 @@ class Receivers:
 class PixelClusters:
     """Clusters of lit vertices (at least one) by pixel and facing; each later vertex is a separate cluster.
 
-    ``samples``: camera rays of a pixel, side by side.
+    ``camera_rays`` of the pixels.
     """
 
-    def __init__(self, lit: LitVertices, samples: int):
+    def __init__(self, lit: LitVertices, camera_rays: PixelRays):
         vertices, rays, alone = lit.vertices, lit.rays, lit.alone
         # Shape (3, n): NumPy is several times faster
         position, normal = (np.stack([download(x) for x in vector]) for vector in (vertices.position, vertices.normal))
-        pixel = download(rays).astype(np.int64) // samples
+        pixel = camera_rays.pixel_of(download(rays)).astype(np.int64)
         key = pixel * FACINGS + facing(normal.T)
         key[len(key) - alone :] = (pixel.max() + 1) * FACINGS + np.arange(alone)
         order = np.argsort(key, kind="stable")

@@ -26,7 +26,8 @@ class Plan:
     ``light_paths``: number of lines for drawing virtual lights on surfaces, 0 for none; ``emitters``: whether virtual
     lights represent emitters; ``error``: bound of the cuts, as a fraction of the pixel; ``vertices``: lit vertices per
     pixel; ``variance``: remaining relative variance of a camera path; ``shared``: variance of the lights and of the
-    choice of lit vertices, in the same unit; ``reason`` in words.
+    choice of lit vertices, in the same unit; ``cost`` of a path with its share of lights and cuts, over that of a path
+    alone; ``reason`` in words.
     """
 
     light_paths: int
@@ -35,6 +36,7 @@ class Plan:
     vertices: int
     variance: float
     shared: float
+    cost: float
     reason: str
 
     @property
@@ -131,6 +133,14 @@ class Decision:
         remains = next(x.expected for x in self.options if (x.surfaces, x.emitters) == kinds)
         return np.maximum(self.pilot.nearby(self.pilot.radiance - remains), 0)
 
+    def growth(self, times: int) -> float:
+        """Expected cost of a path of a pass with ``times`` as many samples, over that in this pass: larger passes may
+        have virtual lights where this one has none."""
+        if not self.options:
+            return 1.0
+        larger = replace(self.evidence, paths=times * self.evidence.paths, samples=times * self.evidence.samples)
+        return choose(larger, self.options).cost / self.plan.cost
+
     def precision(self, samples: int) -> float:
         """Expected inverse of the relative variance of a pixel with ``samples``; ``samples`` for a black image.
 
@@ -145,17 +155,17 @@ def choose(evidence: Evidence, options: list[Option]) -> Plan:
     """The plan of the option with the least variance × cost; without lights if no option pays."""
     if not options:
         return without_lights("no light comes by way of surfaces that virtual lights could stand for")
-    product, cost, best = min((_priced(evidence, option) for option in options), key=lambda option: option[0])
+    product, best = min((_priced(evidence, option) for option in options), key=lambda option: option[0])
     remains = best.variance / max(evidence.whole, _TINY)
     if product > _most_to_pay(evidence):
-        costs = f"virtual lights would cost {cost - 1:.2g} times as much as the paths"
+        costs = f"virtual lights would cost {best.cost - 1:.2g} times as much as the paths"
         return without_lights(f"{costs} and leave {remains:.0%} of the variance")
     return replace(best, reason=f"virtual lights remove {1 - remains:.0%} of the variance")
 
 
 def without_lights(reason: str) -> Plan:
     """The plan of an image without virtual lights."""
-    return Plan(0, False, 0.0, 0, 0.0, 0.0, reason)
+    return Plan(0, False, 0.0, 0, 0.0, 0.0, 1.0, reason)
 
 
 def price(evidence: Evidence, option: Option) -> float:
@@ -173,8 +183,8 @@ def _most_to_pay(evidence: Evidence) -> float:
     return evidence.model.pays_below * evidence.whole**evidence.model.denoised_power
 
 
-def _priced(evidence: Evidence, option: Option) -> tuple[float, float, Plan]:
-    """(:func:`price`, cost, best plan) with the lights of an option."""
+def _priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:
+    """(:func:`price`, best plan) with the lights of an option."""
     model, paths, samples = evidence.model, evidence.paths, evidence.samples
     rest = option.variance(evidence)
     cuts = model.emitter_cuts * option.emitters + option.surfaces
@@ -191,8 +201,8 @@ def _priced(evidence: Evidence, option: Option) -> tuple[float, float, Plan]:
     shared = model.vertex_variance * samples / vertices
     if light_paths:
         shared += samples * model.light_variance * _indirect_variance(evidence, option) / light_paths
-    plan = Plan(light_paths, option.emitters, error, vertices, left, shared, "")
-    return cost * left**model.denoised_power, cost, plan
+    plan = Plan(light_paths, option.emitters, error, vertices, left, shared, cost, "")
+    return cost * left**model.denoised_power, plan
 
 
 def _cut_rays(rest: float, samples: int, model: CostModel) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from ..lights.perturbed import Perturbed
 from .contributions import Layers
 from .cost_model import CostModel
 from .emitters.base import EmitterSampler
+from .pixel_rays import PixelRays
 from .roulette import OutgoingRadiance
 
 # c of paths without a carried part, world units: beyond every distance, with a finite square
@@ -157,7 +158,7 @@ class View:
     """Camera rays of one image or pass.
 
     ``scene``; ``emitters``: emitter sampler; ``perturbed``: shapes without a minorant; ``rules`` of the paths; ``ray``,
-    ``active``: of the camera, evaluated, the ``samples`` of a pixel side by side; ``width`` of the image in pixels;
+    ``active``: of the camera, evaluated, by pixel as in ``rays``; ``width`` of the image in pixels;
     ``seed``; ``importance`` of radiance in each pixel and ``outgoing`` radiance of surfaces: for Russian roulette;
     ``learning_count``: number of camera rays, for the sizes of the pilot and of the emitter sampler's learning;
     ``model``: constants of the decisions; ``layers`` of the image.
@@ -170,7 +171,7 @@ class View:
     ray: mi.Ray3f
     active: mi.Bool
     width: int
-    samples: int
+    rays: PixelRays
     seed: int
     importance: mi.Float
     outgoing: OutgoingRadiance
@@ -186,7 +187,12 @@ class View:
     @property
     def pixels(self) -> int:
         """Number of pixels."""
-        return -(-self.count // self.samples)
+        return self.rays.pixels
+
+    @property
+    def samples(self) -> int:
+        """Mean number of camera rays of a pixel."""
+        return self.rays.mean
 
     def pairs(self, most: int) -> np.ndarray:
         """Indices of at most ``most`` rays in pairs of neighbours, evenly over the image; at least one pair."""

@@ -1,0 +1,173 @@
+"""Samples of pixels in images that will be denoised."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import manylights
+from comparison import rendering
+from comparison.pass_sizes import PASS_SECONDS, PROBE, PassSizes
+from comparison.sample_density import LEAST_SAMPLES, SampleDensity
+from tests.comparison.test_pass_sizes import render as made_up_passes
+from tests.support.scenes import area_light, closed_box, cornell
+from tests.support.statistics import assert_same_mean
+
+SIZE = 48
+
+
+def learned(difference, channels=3):
+    """The density learned from two halves of a grey image that differ by `difference`; the denoiser changes nothing."""
+    density = SampleDensity(lambda image, names, quality: image)
+    image = np.ones((SIZE, SIZE, channels), np.float32)
+    half = image + np.float32(difference)[..., None] / 2
+    density.learn(image, half, ["R", "G", "B"] if channels == 3 else ["Y"])
+    return density
+
+
+def corner(level):
+    """Differences of 0.1, and in a quarter of the image of `level`."""
+    difference = np.full((SIZE, SIZE), 0.1)
+    difference[: SIZE // 2, : SIZE // 2] = level
+    return difference
+
+
+def same(first, second):
+    """Whether two densities have about as many samples in the corner: rounding chooses among equal pixels."""
+    corners = [density.relative[: SIZE // 2, : SIZE // 2].mean() for density in (first, second)]
+    return corners[0] == pytest.approx(corners[1], rel=0.05)
+
+
+def test_pixels_where_halves_differ_have_more_samples():
+    density = learned(corner(0.4))
+    assert density.relative.mean() == 1
+    inside, outside = density.relative[4:20, 4:20], density.relative[30:, 30:]
+    # In proportion to the difference, 1 to 4, up to the rounding to powers of two
+    assert inside.min() >= 2 and outside.max() <= 1 and inside.mean() == pytest.approx(4 * outside.mean(), rel=0.45)
+    assert density.gain > 1 and density.seconds > 0
+
+
+def test_equal_differences_give_equal_numbers():
+    density = learned(np.full((SIZE, SIZE), 0.1))
+    assert (density.relative == 1).all() and density.gain == pytest.approx(1)
+
+
+def test_the_sign_of_a_difference_does_not_matter():
+    assert same(learned(corner(0.4)), learned(-corner(0.4)))
+
+
+def test_a_firefly_does_not_take_all_samples():
+    difference = corner(0.1)
+    difference[10, 10] = 1e4
+    assert learned(difference).relative.max() == 1
+
+
+def test_equal_halves_determine_nothing():
+    assert learned(np.zeros((SIZE, SIZE))).relative is None
+
+
+def test_films_of_one_channel_have_the_luminance_of_the_halves():
+    density = SampleDensity(lambda image, names, quality: image)
+    half = np.zeros((SIZE, SIZE, 3), np.float32)
+    half[..., 1] = 1 + corner(0.4) / 2  # green alone
+    density.learn(np.full((SIZE, SIZE, 1), 0.71516, np.float32), half, ["Y"])
+    assert same(density, learned(corner(0.4)))
+
+
+def passes_of(monkeypatch, scene, integrator, **limits):
+    """(Whether a pass had numbers of its own, whether it made halves) of each pass of a render."""
+    seen, before = [], rendering.render_pass
+
+    def spied(*arguments):
+        *_, density, half = arguments
+        seen.append((density is not None, half))
+        return before(*arguments)
+
+    monkeypatch.setattr(rendering, "render_pass", spied)
+    manylights.render(scene, integrator, **limits)
+    return seen
+
+
+EQUAL, HALVES, OWN = (False, False), (False, True), (True, False)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "limits", "expected"),
+    [
+        ("manylights", {"denoise": True}, [EQUAL, HALVES, OWN, OWN]),
+        ("manylights", {}, [EQUAL] * 4),
+        ("path", {"denoise": True}, [EQUAL] * 4),
+        ("manylights", {"denoise": True, "error": 1e-6}, [EQUAL] * 4),
+    ],
+)
+def test_passes_of_images_for_denoising_have_numbers_of_their_own(monkeypatch, integrator, limits, expected):
+    found = passes_of(
+        monkeypatch, cornell().load(), integrator, spp=4 * LEAST_SAMPLES, pass_spp=LEAST_SAMPLES, **limits
+    )
+    assert found == expected
+
+
+def test_small_passes_have_equal_numbers(monkeypatch):
+    assert passes_of(monkeypatch, cornell().load(), "manylights", spp=12, pass_spp=4, denoise=True) == [EQUAL] * 3
+
+
+def test_films_with_another_filter_have_equal_numbers(monkeypatch):
+    scene = closed_box({"lamp": area_light()}, 16)
+    scene["sensor"]["film"]["rfilter"] = {"type": "gaussian"}
+    found = passes_of(monkeypatch, mi.load_dict(scene), "manylights", spp=24, pass_spp=8, denoise=True)
+    assert found == [EQUAL] * 3
+
+
+def test_a_seed_gives_the_same_image():
+    scene = cornell().load()
+    first, second = (
+        manylights.render(scene, "manylights", spp=32, pass_spp=8, seed=5, denoise=True)[1].raw.numpy()
+        for _ in range(2)
+    )
+    np.testing.assert_allclose(first, second, rtol=1e-4, atol=1e-5)
+
+
+def test_the_raw_image_has_the_mean_of_path(variant):
+    scene = closed_box({"lamp": area_light()}, 16)
+    scene, depth = mi.load_dict(scene), {"max_depth": 4}
+    plugin, path = (
+        mi.load_dict({"type": "manylights", "denoised": True, **depth}),
+        mi.load_dict({"type": "path"} | depth),
+    )
+
+    def pair(seed):
+        image = manylights.render(scene, plugin, spp=64, pass_spp=16, seed=1000 * seed, denoise=True)[1].raw
+        return image.numpy(), mi.render(scene, integrator=path, spp=64, seed=seed + 7).numpy()
+
+    assert_same_mean(pair, 12, 0.02)
+
+
+# --- Sizes of passes ---
+
+
+@pytest.mark.parametrize("time", [10.0, 60.0])
+def test_a_pass_that_determines_numbers_is_short(time):
+    passes, _ = made_up_passes(256 * 128, 0.05, 0.04, 0.3, time=time, in_parts=True, probes=True)
+    probe, rest = passes[1], passes[2:]
+    assert probe.seconds <= PROBE * 10 + 0.5 and probe.spp >= LEAST_SAMPLES
+    assert sum(one.spp for one in rest) > 0.6 * sum(one.spp for one in passes)
+    assert sum(one.seconds for one in passes) <= time + PASS_SECONDS / 4
+
+
+@pytest.mark.parametrize("spp", [16, 64, 256])
+def test_a_pass_that_determines_numbers_has_a_quarter_of_the_samples_that_are_left(spp):
+    passes, ended_by = made_up_passes(256 * 128, 0.05, 0.004, 0.3, spp=spp, in_parts=True, probes=True)
+    assert ended_by == "spp" and sum(one.spp for one in passes) == spp
+    expected = int(PROBE * (spp - 4))
+    assert passes[1].spp == (expected if expected >= LEAST_SAMPLES else spp - 4)
+
+
+def test_passes_that_cost_more_than_expected_end_by_the_limit():
+    sizes, passes, elapsed = PassSizes(256 * 128, time=10, in_parts=True, probes=True), [], 0.0
+    while not isinstance(spp := sizes.next(passes, elapsed), str):
+        # Virtual lights from 24 samples on, whose cost is 1.2 times the predicted one
+        seconds = 0.05 + 0.04 * spp * (1.8 if spp >= 24 else 1)
+        stages = {"traced": seconds - 0.05} | ({"cuts": 0.0} if spp >= 24 else {})
+        statistics = {"seconds": stages, "growth": 1.0 if spp >= 24 else 1.5}
+        passes.append(rendering.Pass(0, spp, seconds, statistics))
+        elapsed += seconds
+    assert 9 < elapsed < 10.5
