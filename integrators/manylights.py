@@ -10,6 +10,7 @@ import mitsuba as mi
 from vpl.core.clock import Clock
 from vpl.core.exclusive import exclusive
 from vpl.core.garbage import garbage_kept
+from vpl.core.sampling import derived_seed
 from vpl.core.stages import Stage
 from vpl.lights.emitter_groups import OTHER, EmitterGroups
 from vpl.lights.perturbed import Perturbed
@@ -22,7 +23,7 @@ from vpl.split.pixel_rays import PixelRays
 from vpl.split.roulette import OutgoingRadiance
 from vpl.split.start import Start, make_start
 from vpl.split.surface_lights import KeptLights
-from vpl.split.view import PathRules, View
+from vpl.split.view import PathRules, Stream, View
 
 from .camera_samples import LatticeSampler, may_differ, stratified
 from .gathering import GatheringIntegrator
@@ -213,7 +214,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
     def may_differ(self, sensor, spp: int) -> bool:
         """Whether the pixels of a pass of an image for denoising may have different numbers of samples, ``spp`` in the
         mean."""
-        return self.denoised and self.stratified and may_differ(sensor, spp)
+        in_one = spp <= self.samples_per_pass
+        return self.denoised and self.stratified and in_one and may_differ(sensor, spp)
 
     @contextmanager
     def only_start(self):
@@ -306,7 +308,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
         channels = [channel for name in self._layer_names for channel in found.layers[name]]
         if view.rays.differ:
             channels = [view.rays.evenly(channel) for channel in channels]
-            return mi.Spectrum(view.rays.evenly(found.radiance)), view.rays.evenly_masked(found.valid), channels
+            valid = view.rays.evenly_masked(found.valid, derived_seed(view.seed, Stream.ALPHA))
+            return mi.Spectrum(view.rays.evenly(found.radiance)), valid, channels
         if self._has_half:
             number = view.rays.places(dr.arange(mi.UInt32, view.count)).number
             channels += list(dr.select((number & 1) == 1, 2 * found.radiance, 0))

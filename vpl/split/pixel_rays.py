@@ -139,11 +139,13 @@ class PixelRays:
         """Pixel of each ray if all pixels had the mean number."""
         return dr.arange(mi.UInt32, self.count) // dr.opaque(mi.UInt32, self.mean)
 
-    def evenly_masked(self, mask: mi.Bool) -> mi.Bool:
-        """As :meth:`evenly`, for a ``mask``: the fraction of a pixel is rounded to a multiple of 1 / mean number."""
+    def evenly_masked(self, mask: mi.Bool, seed: int) -> mi.Bool:
+        """As :meth:`evenly`, for a ``mask``: a multiple of 1 / mean number for each pixel, with the mean fraction."""
         fraction = self.evenly(dr.select(mask, mi.Float(1), mi.Float(0)))
-        number = dr.arange(mi.UInt32, self.count) % dr.opaque(mi.UInt32, self.mean)
-        return mi.Float(number) + 0.5 < fraction * self.mean
+        number = mi.Float(dr.arange(mi.UInt32, self.count) % dr.opaque(mi.UInt32, self.mean))
+        # A random number for each pixel, so that rounding has no preference
+        rounding = mi.sample_tea_float32(self._even_pixels, dr.opaque(mi.UInt32, seed))
+        return rounding < fraction * self.mean - number
 
     @cached_property
     def _pixels(self) -> np.ndarray:

@@ -32,6 +32,7 @@ class Stream(IntEnum):
     GATHER = 5
     LEARNING = 6
     EMITTER_LIGHTS = 7
+    ALPHA = 8
 
 
 class State:

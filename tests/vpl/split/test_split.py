@@ -23,6 +23,7 @@ from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
 from vpl.split.lattice import Lattice, lattice_multiplier
 from vpl.split.line_sampling import ArrivalOctree
 from vpl.split.pixel_clusters import PixelClusters, Receivers
+from vpl.split.pixel_rays import PixelRays
 from vpl.split.view import View
 from vpl.transport.bounds import contribution_bound
 from vpl.transport.carried_share import carried_geometry_term, carried_share
@@ -336,7 +337,7 @@ def test_so_many_vertices_of_a_pixel_are_lit_evenly_among_its_samples(samples, m
     place = [dr.zeros(kind, len(weight)) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f)]
     first = GatherVertices(*place, light, dr.full(mi.UInt32, 1, len(weight)))
     later = GatherVertices(*place, dr.zeros(mi.UnpolarizedSpectrum, len(weight)), dr.zeros(mi.UInt32, len(weight)))
-    lit = LitVertices.of(first, later, samples, most, 1)
+    lit = LitVertices.of(first, later, PixelRays.uniform(pixels, samples), most, 1)
     assert lit.alone == 0
     np.testing.assert_allclose(np.abs(np.array(lit.vertices.weight)), samples / kept, rtol=1e-6)
     sample = np.sort(np.array(lit.rays))
@@ -355,7 +356,8 @@ def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
         position, mi.Normal3f(points(normal)), mi.Normal3f(points(normal)), mi.Color3f(points(weight)),
         dr.full(mi.UInt32, 1, count),
     )  # fmt: skip
-    clusters = PixelClusters(LitVertices(vertices, dr.arange(mi.UInt32, count), 0), samples)
+    rays = PixelRays.uniform(count // samples, samples)
+    clusters = PixelClusters(LitVertices(vertices, dr.arange(mi.UInt32, count), 0), rays)
     first, size = np.array(clusters.first), np.array(clusters.size)
     assert size.sum() == count and (clusters.pixel[clusters.cluster] == np.array(clusters.ray) // samples).all()
     draws = 20_000
@@ -378,9 +380,9 @@ def test_later_vertices_are_drawn_by_weight_and_stand_for_all_of_them():
         GatherVertices(None, None, None, mi.Color3f(*(upload(mi.Float, x) for x in weight.T)), None)
         for weight in weights
     )
-    mean, seeds = np.zeros(pixels * samples), 4000
+    rays, mean, seeds = PixelRays.uniform(pixels, samples), np.zeros(pixels * samples), 4000
     for seed in range(seeds):
-        ray, factor = (np.array(x) for x in drawn_later(first, later, samples, most, seed))
+        ray, factor = (np.array(x) for x in drawn_later(first, later, rays, most, seed))
         assert (np.diff(ray.astype(int)) >= 0).all()
         assert np.bincount(ray // samples, minlength=pixels).max() <= most
         np.add.at(mean, ray, factor / seeds)
