@@ -119,10 +119,10 @@ class Timed(Rival):
         self.sensor, self._denoise = SAMPLERS.index(sampler), denoise
         more = more if kind == "manylights" else {}
         self._scene, self.integrator = scene, mi.load_dict({"type": kind, "max_depth": DEPTH, **more})
-        # Two passes compile the kernels, and a third one those of pixels with different numbers of samples
+        # Two passes compile the kernels, and 64 samples those of pixels with different numbers of samples
         render(scene, self.integrator, sensor=self.sensor, spp=8, pass_spp=4)
         if denoise:
-            render(scene, self.integrator, sensor=self.sensor, spp=24, pass_spp=8, denoise=True)
+            render(scene, self.integrator, sensor=self.sensor, spp=64, denoise=True)
 
     def render(self, seed: int):
         """Render: (image, float64; seconds)."""

@@ -19,7 +19,8 @@ from .rendering import Pass
 
 SUFFIX = ".checkpoint.npz"
 CHECKPOINT_SECONDS = 10.0
-_ESTIMATE = "estimate."
+# Prefixes of the names of arrays
+_ESTIMATE, _DECISIONS = "estimate.", "decisions."
 # Exceptions of NumPy, zipfile and zlib for a file that is damaged, or is no archive of arrays
 _UNREADABLE = (
     OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error,
@@ -55,8 +56,7 @@ class Checkpoint:
             raise ValueError(f"'{self.path}' is of a render with another {other[0]}; delete it to begin anew")
         passes.channels, passes.sum = described["channels"], arrays["sum"]
         passes.passes = [Pass(**one) for one in described["passes"]]
-        estimate = (name for name in arrays if name.startswith(_ESTIMATE))
-        passes.estimate.state = {name.removeprefix(_ESTIMATE): arrays[name] for name in estimate}
+        passes.estimate.state, passes.decisions = (_below(prefix, arrays) for prefix in (_ESTIMATE, _DECISIONS))
         return described["seconds"]
 
     def _read(self):
@@ -85,7 +85,8 @@ class Checkpoint:
             "passes": list(passes.passes),
         }
         estimate = {_ESTIMATE + name: value for name, value in passes.estimate.state.items()}
-        self._kept = described, {"sum": passes.sum, **estimate}
+        decisions = {_DECISIONS + name: value for name, value in passes.decisions.items()}
+        self._kept = described, {"sum": passes.sum, **estimate, **decisions}
         self._writer.offer(self.save)
 
     def save(self):
@@ -111,6 +112,11 @@ class Checkpoint:
             self.path.unlink(missing_ok=True)
         except OSError as error:
             mi.Log(mi.LogLevel.Warn, f"The checkpoint could not be removed: {error}")
+
+
+def _below(prefix, arrays):
+    """Return the arrays whose names have a prefix, by the rest of the name."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def _digest(text, arrays):

@@ -58,7 +58,7 @@ def _render_in_time(progressive, budget, seeds=None):
         progressive.pixels, time=budget, in_parts=True, accepts=progressive.accepts, probes=progressive.differs
     )  # fmt: skip
     while not isinstance(spp := sizes.next(progressive.passes, progressive.seconds), str):
-        progressive.render(spp, next(seeds) if seeds else None)
+        progressive.render(spp, next(seeds) if seeds else None, is_probe=sizes.is_probe)
 
 
 def _render_cold(progressive, job):

@@ -17,7 +17,8 @@ time, for passes that are slow to start.
 
 Passes in parts report the time of their start, so that one pass tells the cost of any size, and sizes from the second
 pass on may be any number: `manylights` needs a single further kernel for them. A second pass may have virtual lights
-where the small first pass has none, and cost more: it is planned for half of the remaining time.
+where the small first pass has none, and cost more: it is planned for half of the remaining time, or less if it
+determines samples.
 """
 
 import math
@@ -29,7 +30,9 @@ PASS_SECONDS = 2.0
 PART_SECONDS, LEAST_REST = 10.0, 1.0  # of a pass in parts; minimum ratio of its rest to its start, which has priority
 LEAST_GAIN = 1 / 16  # minimum size of a last pass with virtual lights, as a fraction of the intended size
 LIT = 2.0  # usual cost of a sample with virtual lights over that without, at most: small passes have no lights
-UNSURE = 1.25  # cost over a predicted cost, at most: predictions are within a fifth in 33 views (decisions.md)
+UNSURE = (
+    1.25  # cost over a predicted cost, usually at most: predictions are within a fifth in most scenes (decisions.md)
+)
 DOUBT = 0.5  # fraction of the remaining time for a second pass, which may have lights and cost more than expected
 PROBE = 0.25  # fraction of the remaining time, or samples, for a second pass that determines the samples of the pixels
 LONGEST = 2.0  # times the wanted seconds: longer passes shrink
@@ -54,8 +57,9 @@ class PassSizes:
         probes=False,
     ):  # fmt: skip
         self._spp, self._time, self._fixed, self._many, self._in_parts = spp, time, fixed, many, in_parts
-        self._accepts, self._probes = accepts, probes
         self._any_size = in_parts and not many and not fixed  # after the first pass, not only powers of two
+        self._accepts, self._probes = accepts, probes and self._any_size
+        self.is_probe = False  # whether the last pass that was asked for determines the samples of pixels
         self._largest = _power_of_two(largest_pass(pixels, in_parts))
         self._least = USUAL if USUAL * pixels <= FIRST_SAMPLES else 1
         self._current, self._seconds, self._asked = fixed or self._least, {}, None
@@ -73,7 +77,7 @@ class PassSizes:
             self._asked = passes[-1].spp if passes else None
         if passes:
             self._learn(passes[-1], done, compiles=len(passes) == self._before + 1)
-        size = self._current
+        size, self.is_probe = self._current, self._probes and len(passes) == 1
         if self._spp is not None:
             if done >= self._spp:
                 return "spp"
@@ -83,14 +87,18 @@ class PassSizes:
             if size == 0:
                 return "time"
         self._asked = size
+        # Fewer leave too much noise in the halves of a pass
+        self.is_probe &= size >= LEAST_SAMPLES
         return size
 
     def _of_the_rest(self, size, left):
         """Return the size of the next pass, about `size` samples, with `left` samples until the limit."""
-        if self._probes and self._seconds and not self._known and PROBE * left >= LEAST_SAMPLES:
+        if self.is_probe and PROBE * left >= LEAST_SAMPLES:
             return min(size, self._kept(int(PROBE * left)))
+        # No pass would follow
+        self.is_probe = False
         if self._any_size and left < 2 * size and left <= self._largest:
-            return left
+            return self._kept(left) if self._probes and left > USUAL else left
         return min(size, left if self._fixed or left < USUAL else _power_of_two(left))
 
     def _learn(self, last, done, compiles):
@@ -140,8 +148,8 @@ class PassSizes:
         pass in parts would be far smaller than usual.
         """
         least = size if self._fixed else min(size, self._least)
-        line = self._line()
-        if self._any_size and not self._known and self._probes:
+        line, whole = self._line(), left
+        if self.is_probe:
             left = PROBE * min(left, PART_SECONDS)
         elif self._any_size and not self._known and not self._lit:
             left *= DOUBT
@@ -156,7 +164,7 @@ class PassSizes:
                 return certain
         while size > least and self._expected(size) > left:
             size = max(least, _power_of_two(size - 1))
-        return size if self._expected(size) <= 2 * left else 0
+        return size if self._expected(size) <= max(2 * left, whole) else 0
 
     def _certain(self, size):
         """Return the largest size up to `size` that takes no longer than expected if its pass has virtual lights."""

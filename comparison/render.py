@@ -35,7 +35,8 @@ class Took:
 
     `spp`: samples per pixel; `passes`: number of passes, each with its own seed; `seconds`: wall-clock time of the
     call, including compilation and denoising; `error`: estimated relative standard error that 95% of the pixels do not
-    exceed (see convergence.py), before denoising, None for fewer than two passes; `statistics`: counters of the
+    exceed (see convergence.py), before denoising, None for fewer than two passes and where pixels have different
+    numbers of samples; `statistics`: counters of the
     integrator, summed over passes; `ended_by`: the limit that was reached ("spp", "time" or "error"), "interruption"
     (Ctrl-C, or `cancel` of the integrator) or "progress", None during the render; `channels`: names of the channels;
     `denoise_seconds`: the part of `seconds` for denoising; `denoiser`: metadata, quality of the denoiser and samples of
@@ -250,18 +251,18 @@ class _Render:
             if isinstance(size, str):
                 self._ended_by = size
                 return
-            one = self._pass(size, interrupted)
+            one = self._pass(size, interrupted, {"is_probe": True} if sizes.is_probe else {})
             if one is not None:
                 self._look()
             if one is None or interrupted():
                 self._ended_by = "time" if self.progressive.is_late() else "interruption"
 
-    def _pass(self, size, interrupted):
-        """Render a pass and return it, None after an interruption."""
+    def _pass(self, size, interrupted, settings):
+        """Render a pass with the `settings` of `render`, and return it; None after an interruption."""
         try:
             with listening(self._listener()) if self._progress else nullcontext():
                 # Ctrl-C also stops Mitsuba, so that the pass may be unfinished
-                return self.progressive.render(size, accept=lambda: not interrupted())
+                return self.progressive.render(size, accept=lambda: not interrupted(), **settings)
         except BaseException as error:
             # Mitsuba and Dr.Jit replace exceptions that they pass on
             if self._raised is not None:
@@ -296,7 +297,7 @@ class _Render:
         if self._checkpoint:
             self._checkpoint.keep(self._elapsed())
         if goal and goal.is_due(self.progressive):
-            self._error = self.progressive.estimate.relative()
+            self._error = self.progressive.error()
             self._ending.look(self._error, spp)
             if goal.is_reached(self._error):
                 self._ended_by = "error"
@@ -306,7 +307,7 @@ class _Render:
     def result(self, denoiser):
         """Return the image and the cost; warn if the error was not reached."""
         if self._ended_by != "error":
-            self._error = self.progressive.estimate.relative()
+            self._error = self.progressive.error()
         if self._ended_by in LIMITS and self._ending.goal:
             self._ending.goal.warn_if_missed(self._error, self._ended_by)
         image, took = self._image(), self._took()

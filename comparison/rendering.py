@@ -15,11 +15,11 @@ from vpl.split.pixel_rays import MULTIPLE
 
 from .convergence import ErrorEstimate
 from .images import colour
-from .sample_density import SampleDensity
+from .sample_density import LEAST_SAMPLES, SampleDensity
 
 MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the time to the first image
 MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
-HALF = "half."  # begins the names of channels with every second sample (integrators/manylights.py)
+HALF = "every second."  # begins the names of channels with every second sample (integrators/manylights.py)
 # Stages of `manylights` with times about proportional to the samples
 PER_SAMPLE = Stage.LIGHTS, Stage.TREE, Stage.TRACED, Stage.CLUSTERS, Stage.CUTS
 
@@ -181,6 +181,19 @@ class Passes:
         return one
 
     @property
+    def decisions(self):
+        """Arrays by name that later passes depend on, besides the passes (settable)."""
+        return {}
+
+    @decisions.setter
+    def decisions(self, arrays):
+        """Take nothing: these passes depend on nothing else."""
+
+    def error(self):
+        """Return the relative standard error, as `ErrorEstimate.relative`."""
+        return self.estimate.relative()
+
+    @property
     def spp(self):
         """Samples per pixel of all passes."""
         return sum(one.spp for one in self.passes)
@@ -210,23 +223,22 @@ class Progressive(Passes):
         super().restart()
         self._shared, self.density = SharedStart(), SampleDensity(self._denoise)
 
-    def render(self, spp, seed=None, accept=lambda: True):
+    def render(self, spp, seed=None, accept=lambda: True, is_probe=False):
         """Render and add a pass of `spp` samples per pixel; return the `Pass`.
 
-        The default `seed` is `pass_seed(seed of the render, index of the pass)`. If the pass raises an exception, or
-        `accept` returns False afterwards (the result is then None), the average does not change.
+        The default `seed` is `pass_seed(seed of the render, index of the pass)`. `is_probe`: whether the pass
+        determines the samples of the pixels in later passes. If the pass raises an exception, or `accept` returns False
+        afterwards (the result is then None), the average does not change.
         """
         seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
         first = (self.passes[0].spp, self.passes[0].seed) if self.passes else None
         sensor = self._scene.sensors()[self._sensor]
-        density, half = self.density.of_pass(self.integrator, sensor, spp, not self.passes)
+        density, half = self.density.of_pass(self.integrator, sensor, spp), is_probe and self.differs
         image = render_pass(
             self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density, half
         )  # fmt: skip
         if not accept():
             return None
-        if density is not None:
-            image.taken.statistics["precision"] *= self.density.gain
         if half:
             self.density.learn(image.planes, image.half, image.channels)
         return self.add(image)
@@ -245,7 +257,22 @@ class Progressive(Passes):
     @property
     def differs(self):
         """Whether pixels may have different numbers of samples after the second pass."""
-        return self.density.suits(self.integrator, self._scene.sensors()[self._sensor])
+        suits = self.density.suits(self.integrator, self._scene.sensors()[self._sensor])
+        return suits and self.largest_pass >= LEAST_SAMPLES
+
+    @property
+    def decisions(self):
+        """Samples of pixels over their mean, if they differ."""
+        return {} if self.density.relative is None else {"density": self.density.relative}
+
+    @decisions.setter
+    def decisions(self, arrays):
+        self.density.relative = arrays.get("density")
+
+    def error(self):
+        """Return the relative standard error, as `ErrorEstimate.relative`; None where pixels have different numbers of
+        samples, so that no common weight describes the precision of a pass."""
+        return super().error() if self.density.relative is None else None
 
     def should_stop(self):
         """Return whether the integrator's `cancel` was called."""

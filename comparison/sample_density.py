@@ -3,9 +3,9 @@
 The error of a denoised image is concentrated at edges, textures, lamps and shadows, which neighbours cannot smooth. Two
 halves of the samples of a pass are denoised apart; their squared difference, smoothed, shows where. Later passes have
 numbers of samples in proportion to its root, which would be best for noise that falls by the inverse of the samples.
-Each pass has a common weight for all pixels and depends on earlier passes only, so the mean of the raw image does not
-change. Its variance is larger than with equal numbers, because the raw noise of the remaining pixels does not matter
-to the denoiser.
+A pass has a common weight for all pixels, which does not depend on its noise, and numbers that depend on earlier passes
+only, so the mean of the raw image does not change. Its variance is larger than with equal numbers, because the raw
+noise of the remaining pixels does not matter to the denoiser.
 """
 
 from __future__ import annotations
@@ -29,24 +29,20 @@ class SampleDensity:
     """Samples of the pixels of a render's passes. `denoise`: function from an image (height, width, channels), the
     names of its channels and the quality "fast" to the denoised image; None for equal numbers in all passes.
 
-    `relative` (height, width): samples of a pixel over the mean, None before a pass determined them; `gain`: precision
-    of a pass with these samples over that with equal numbers, in the pixels where the denoiser leaves noise;
-    `seconds` that the decision took.
+    `relative` (height, width): samples of a pixel over the mean, None before a pass determined them; `seconds` that the
+    decision took.
     """
 
     def __init__(self, denoise=None):
-        self._denoise, self.relative, self.gain, self.seconds = denoise, None, 1.0, 0.0
+        self._denoise, self.relative, self.seconds = denoise, None, 0.0
 
     def suits(self, integrator, sensor, spp=MULTIPLE):
         """Return whether the pixels of a pass may have different numbers of samples, `spp` in the mean."""
         return self._denoise is not None and getattr(integrator, "may_differ", lambda *_: False)(sensor, spp)
 
-    def of_pass(self, integrator, sensor, spp, is_first):
-        """Return (samples over their mean for the pixels of the next pass, None for equal numbers; whether the pass
-        needs an image of every second sample)."""
-        if is_first or not self.suits(integrator, sensor, spp):
-            return None, False
-        return self.relative, self.relative is None and spp >= LEAST_SAMPLES
+    def of_pass(self, integrator, sensor, spp):
+        """Return samples over their mean for the pixels of a pass, None for equal numbers."""
+        return self.relative if self.suits(integrator, sensor, spp) else None
 
     def learn(self, image, half, channels):
         """Determine the samples from a pass: its `image` (height, width, channels) and that of every second sample,
@@ -71,4 +67,3 @@ class SampleDensity:
         difference = np.maximum(difference, 1e-6 * difference.max())
         numbers = PixelRays.by_density(np.sqrt(difference), MULTIPLE).numbers.reshape(difference.shape)
         self.relative = numbers / MULTIPLE
-        self.gain = float(np.sum(difference) / np.sum(difference / self.relative))

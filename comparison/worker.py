@@ -135,9 +135,9 @@ def render(job):
     parameters, scene = file.integrator[1], file.load(job.threads)
     load_seconds = time.perf_counter() - begin
 
-    denoiser = _denoiser(scene, job) if job.denoised_output else None
-    cold_denoise = denoiser and denoiser.seconds + denoiser.filter_seconds
-    progressive = Progressive(scene, job.seed, denoise=denoiser and denoiser.denoise)
+    # Pixels may have different numbers of samples, which the denoiser decides, if the render ends by time
+    decides = job.denoised_output and job.budget and hasattr(scene.integrator(), "may_differ")
+    progressive = Progressive(scene, job.seed, denoise=_denoiser(scene, job).denoise if decides else None)
     cold = measure(progressive, job)
     passes, spp, pixels = progressive.passes, progressive.spp, progressive.pixels
     warm = [one.seconds for one in passes[1 if job.cold else 0 :]]
@@ -163,24 +163,27 @@ def render(job):
     described = {key: result[key] for key in ("parameters", "spp", "passes", "seconds")}
     described |= {"integrator": job.integrator, "scene": job.scene, "seed": job.seed, **versions()}
     images.write_exr(job.output, progressive.image, progressive.channels, described | {"run": job.run or ""})
-    result |= {"denoise_seconds": _denoise(job, scene, progressive, described), "cold_denoise_seconds": cold_denoise}
+    result |= _denoise(job, scene, progressive, described)
     return result | {"vpl_output": _render_vpl(job, passes, described) if job.vpl_folder else None}
 
 
-def _denoiser(scene, job):
-    """Return the `Denoiser` for the image of a job."""
-    return Denoiser(scene, seed=job.seed, spp=None if job.budget else job.spp, time_limit=job.budget)
+def _denoiser(scene, job, spp=None):
+    """Return the `Denoiser` for the image of a job with `spp` samples per pixel."""
+    return Denoiser(scene, seed=job.seed, spp=None if job.budget else spp, time_limit=job.budget)
 
 
 def _denoise(job, scene, progressive, described):
-    """Write the denoised image if requested; return the seconds for it, with compiled kernels."""
+    """Write the denoised image if requested; return its times."""
     if not job.denoised_output:
-        return None
-    denoiser = _denoiser(scene, job)
-    image = denoiser.denoise(progressive.image, progressive.channels)
-    described = described | {"run": job.run or "", "denoise_seconds": denoiser.seconds} | denoiser.description
+        return {"denoise_seconds": None, "cold_denoise_seconds": None}
+    seconds = []
+    for _ in range(2):
+        denoiser = _denoiser(scene, job, progressive.spp)
+        image = denoiser.denoise(progressive.image, progressive.channels)
+        seconds.append(denoiser.seconds)
+    described = described | {"run": job.run or "", "denoise_seconds": seconds[1]} | denoiser.description
     images.write_exr(job.denoised_output, image, progressive.channels, described)
-    return denoiser.seconds
+    return {"denoise_seconds": seconds[1], "cold_denoise_seconds": seconds[0]}
 
 
 def _parse(job):

@@ -37,6 +37,7 @@ class LatticeSampler(mi.Sampler):
     def __init__(self):
         super().__init__(mi.Properties("lattice"))
         self.pixels, self.width, self.rays, self._seed, self._pass = 1, 1, None, 0, 0
+        self._lattice = self._offset = None
 
     @property
     def pass_seed(self) -> int:
@@ -54,6 +55,10 @@ class LatticeSampler(mi.Sampler):
         # Without Mitsuba's method: called from Python, it would call this method a second time
         self._pass += 1
         self._begin()
+
+    def end(self):
+        """Free the memory of a pass."""
+        self._lattice = self._offset = None
 
     def next_1d(self, active=True):
         """A uniform number for each lane."""
@@ -108,7 +113,9 @@ class StratifiedSensor(mi.Sensor):
         """Stand for ``sensor`` with ``spp`` samples of a pixel, which differ in proportion to a ``density`` (height,
         width) if there is one; None: for no sensor."""
         self._sensor, self.m_film = sensor, sensor.film() if sensor else self._idle
+        self.sampler().rays = None
         if sensor is None:
+            self.sampler().end()
             return
         film = sensor.film()
         size = np.array(film.crop_size(), np.int64) + (2 * film.rfilter().border_size() if film.sample_border() else 0)
@@ -116,7 +123,8 @@ class StratifiedSensor(mi.Sensor):
         self.sampler().set_sample_count(spp)
         sampler = self.sampler()
         sampler.pixels, sampler.width = int(np.prod(size)), int(size[0])
-        sampler.rays = None if density is None else PixelRays.by_density(density, spp)
+        if density is not None:
+            sampler.rays = PixelRays.by_density(density, spp)
 
     def to_string(self):
         """The other sensor."""

@@ -35,9 +35,9 @@ _SHARED_SAMPLES = 16
 # Largest depth that prb can count, with 32 bits
 _DEEPEST = 2**32 - 1
 # Name of the channels with the mean of every second sample
-HALF = "half"
+HALF = "every second"
 # Names of channels and layers of images, which are no names of groups of emitters
-_RESERVED = (*LENGTHS, OTHER, HALF, "albedo", "normal", "depth", *"RGBAXYZ")
+_RESERVED = (*LENGTHS, OTHER, "albedo", "normal", "depth", *"RGBAXYZ")
 
 
 @manual_page
@@ -119,7 +119,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
       quarter to four times the mean number of samples.  Two halves of the second pass are denoised apart, and show
       where noise remains.  Passes depend on earlier passes only and have a common weight for all pixels, so the mean of
       the image is unchanged.  The film needs a box filter, and the sensor the samples of this plugin.  Images that end
-      by ``error``, and images by several workers, have equal numbers.
+      by ``error``, passes of a given size, images by several workers and images above a million pixels have equal
+      numbers.
     - Masks: the image is that of ``prb``.  ``path`` (Mitsuba 3.9.1) shows black for samples whose path ends after it
       passed only masks, so it is too dark where nothing is behind a mask.  With ``hide_emitters``, ``path`` hides an
       environment behind a mask, which ``manylights`` shows.  Alpha is that of ``path``.
@@ -157,8 +158,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
             "Whether the image will be denoised. Denoisers keep noise that neighbouring pixels share, so there are "
             "more virtual lights, up to twice as many. Denoisers also leave errors at edges, which virtual lights do "
             "not reduce, so only lights that remove much of the variance are used. ``manylights.render`` gives more "
-            "samples to pixels where the denoiser leaves noise. The raw image has the same mean, and up to twice the "
-            "variance × time.",
+            "samples to pixels where the denoiser leaves noise. The raw image has the same mean, and "
+            "1.3 to 2 times the variance × time in four rooms.",
         ),
         Boolean(
             "stratified", True,
@@ -202,8 +203,10 @@ class ManyLightsIntegrator(GatheringIntegrator):
         first pass alone: where it is missing and this is not the first pass, yields True, and the caller has to render
         the first pass within :meth:`only_start`.  ``density`` (height, width): samples of each pixel over their mean,
         about; None for equal numbers.  ``half``: whether the image has the channels :data:`HALF`, the mean of every
-        second sample, with an even number of samples.  Both need :meth:`may_differ`.
+        second sample, with an even number of samples.  Both need :meth:`may_differ`, and exclude each other.
         """
+        if half and density is not None:
+            raise ValueError("half must be False where pixels have different numbers of samples, by a density")
         with exclusive(integrator=self):
             self._shared, self._makes_start, self._density, self._has_half = shared, is_first, density, half
             try:

@@ -143,7 +143,7 @@ def test_a_monochrome_image_has_the_mean_of_equal_numbers(restore_variant):
     mi.set_variant("llvm_ad_mono")
     scene, integrator = room(), plugin(lights=False)
     assert_same_mean_of_pixels(lambda seed: tuple(render(scene, integrator, x, seed) for x in (DENSITY, None)))
-    assert {"half.Y"} == {name for name in halves(scene, integrator) if name.startswith("half")}
+    assert {"every second.Y"} == {name for name in halves(scene, integrator) if name.startswith("every second")}
 
 
 # ---------------------- Variance ----------------------
@@ -213,11 +213,11 @@ def test_halves_are_additional_channels(rgba, lights):
     expected = render(scene, integrator, None, 2)
     found = halves(scene, integrator, 2)
     layers = [f"direct.{channel}" for channel in "RGB"]
-    assert list(found) == [*("RGBA" if rgba else "RGB"), *layers, "half.R", "half.G", "half.B"]
+    assert list(found) == [*("RGBA" if rgba else "RGB"), *layers, "every second.R", "every second.G", "every second.B"]
     # The others are those of a render without halves
     for name, plane in zip(list(found)[:-3], np.moveaxis(expected, 2, 0), strict=True):
         np.testing.assert_allclose(found[name], plane, rtol=1e-4, atol=1e-5)
-    assert "half.R" not in integrator.aov_names()
+    assert "every second.R" not in integrator.aov_names()
 
 
 @with_and_without_lights
@@ -226,7 +226,7 @@ def test_halves_have_the_mean_of_the_image(lights):
 
     def pair(seed):
         found = halves(scene, integrator, seed)
-        return colour(found, "half."), colour(found)
+        return colour(found, "every second."), colour(found)
 
     assert_same_mean_of_pixels(pair)
 
@@ -235,7 +235,7 @@ def test_halves_are_of_every_second_sample():
     """What they leave of the image is the mean of as many other samples."""
     scene, integrator = pictures(), plugin(max_depth=1)
     found = [halves(scene, integrator, seed) for seed in range(64)]
-    half, whole = (np.array([colour(x, prefix) for x in found]) for prefix in ("half.", ""))
+    half, whole = (np.array([colour(x, prefix) for x in found]) for prefix in ("every second.", ""))
     rest = 2 * whole - half
     # The radiance of a lamp is positive
     assert half.min() >= 0 and rest.min() >= -1e-6

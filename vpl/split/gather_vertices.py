@@ -138,7 +138,7 @@ class LitVertices:
         """Choose first vertices of every pixel with the camera ``rays``, and later vertices by weight: at most ``most``
         first vertices of a pixel with the mean number of rays, and as large a fraction of those of the others."""
         kept = rays.lit(most)
-        places = rays.places(dr.arange(mi.UInt32, dr.width(first.weight)))
+        places = rays.places(dr.arange(mi.UInt32, rays.count))
         of_level = (np.array(values) for values in (rays.sizes, kept))
         number, lighted = (dr.gather(mi.UInt32, upload(mi.UInt32, x), places.level) for x in of_level)
         # The lanes that fill a packet hold zeros, by which processors do not divide

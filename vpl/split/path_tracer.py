@@ -198,6 +198,8 @@ def trace_camera_rays(
     seed, ray = derived_seed(view.seed, *stream), view.ray
     part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
     places = view.rays.places(lane)
+    # All numbers of rays, and counted and chosen lanes, use the same kernel
+    dr.eval(lane, places)
     importance = dr.gather(mi.Float, view.importance, places.pixel)
     edge = FirstEdge.of_camera(part, importance, dr.gather(mi.Bool, view.active, lane))
     lattice = Lattice(places, view.rays.sizes, derived_seed(seed, 0))

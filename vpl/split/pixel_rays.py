@@ -24,7 +24,7 @@ MULTIPLE = 4
 
 @dataclass(frozen=True)
 class RayNumbers:
-    """Places of camera rays in pixels, UInt32, evaluated.
+    """Places of camera rays in pixels, UInt32.
 
     ``pixel``; ``number`` in the pixel; ``level``: index of the pixel's number of rays in :attr:`PixelRays.sizes`.
     """
@@ -60,7 +60,9 @@ class PixelRays:
         if samples < MULTIPLE or samples % MULTIPLE:
             raise ValueError(f"samples must be a positive multiple of {MULTIPLE}, got {samples}")
         level = _levels(np.log2(np.asarray(density, np.float64).reshape(-1) / np.mean(density)))
-        sizes = tuple(int(size) for size in _LEVELS * samples)
+        # Without the levels that no pixel has: large numbers take long to tabulate
+        used, level = np.unique(level, return_inverse=True)
+        sizes = tuple(int(size) for size in _LEVELS[used] * samples)
         return cls(samples, sizes, level.astype(np.uint32))
 
     @property
@@ -110,15 +112,12 @@ class PixelRays:
 
     def places(self, lane: mi.UInt32) -> RayNumbers:
         """Places of the rays ``lane`` (UInt32)."""
-        # Evaluated: all layouts, and counted and chosen lanes, use the same kernels
-        dr.eval(lane)
         if self.differ:
             pixel = dr.gather(mi.UInt32, self._device_pixels, lane)
         else:
             pixel = lane // dr.opaque(mi.UInt32, self.mean)
         first, level = self._device_rows
         number, level = lane - dr.gather(mi.UInt32, first, pixel), dr.gather(mi.UInt32, level, pixel)
-        dr.eval(pixel, number, level)
         return RayNumbers(pixel, number, level)
 
     def evenly(self, values):
@@ -173,7 +172,8 @@ def _levels(wanted: np.ndarray) -> np.ndarray:
     whole = len(wanted) * MULTIPLE
     reach = float(np.ptp(wanted)) + top
     low, high = -reach, reach
-    for _ in range(50):
+    # The remainder makes up for the rest
+    for _ in range(30):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if np.sum(1 << rounded(middle)) > whole else (middle, high)
     level = rounded(low)

@@ -286,14 +286,16 @@ def test_lit_vertices_stand_for_all_vertices(most):
     pixel = places_one_by_one(rays)[:, 0]
     weights = [random_weights(rng, rays.count, share) for share in (0.6, 0.4)]
     expected = np.array([np.bincount(pixel, (weights[0] + weights[1])[:, k]) for k in range(3)])
-    found = np.zeros((seeds, *expected.shape))
+    found, levels = np.zeros((seeds, *expected.shape)), np.abs(weights).mean(2)
     for seed in range(seeds):
         order = np.lexsort([rng.random(rays.count), pixel])
         lit = LitVertices.of(*(vertices(x[order]) for x in weights), rays, most, seed)
         of_pixel, weight = pixel[np.array(lit.rays)], np.array(lit.vertices.weight)
         found[seed] = [np.bincount(of_pixel, x, rays.pixels) for x in weight]
-    error = np.sqrt(found.var(0, ddof=1) / seeds)
-    assert (np.abs(found.mean(0) - expected) <= 5 * error + 1e-4).all()
+    # Rare draws may not have happened: the variance of as many draws as expected, at least
+    of_draw = np.bincount(pixel, levels.sum(0)) / np.array(rays.lit(most))[rays.level]
+    variance = np.maximum(found.var(0, ddof=1), of_draw * np.bincount(pixel, levels[1]))
+    assert (np.abs(found.mean(0) - expected) <= 5 * np.sqrt(variance / seeds) + 1e-4).all()
     # Of the whole image, and of the pixels of each number
     for size in (None, *rays.sizes):
         own = (rays.numbers == size) if size else slice(None)
