@@ -123,6 +123,10 @@ class StratifiedSensor(mi.Sensor):
         self.sampler().set_sample_count(spp)
         sampler = self.sampler()
         sampler.pixels, sampler.width = int(np.prod(size)), int(size[0])
+        if density is not None and density.shape != tuple(size[::-1]):
+            raise ValueError(
+                f"density must have the shape of the film, {tuple(size[::-1].tolist())}, got {density.shape}"
+            )
         if density is not None:
             sampler.rays = PixelRays.by_density(density, spp)
 

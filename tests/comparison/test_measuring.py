@@ -14,8 +14,9 @@ class Recorded(rendering.Progressive):
         self.restart()
 
     pixels, integrator = property(lambda self: self._pixels), None
+    _denoise, differs = None, False
 
-    def render(self, spp, seed=None):
+    def render(self, spp, seed=None, is_probe=False):
         self.asked.append((spp, seed is not None))
         seconds = self._seconds.pop(0) if self._seconds else self._start + spp
         self.passes.append(rendering.Pass(seed or 0, spp, seconds))
@@ -38,7 +39,7 @@ class InParts(Recorded):
     def accepts(self, spp):
         return True
 
-    def render(self, spp, seed=None):
+    def render(self, spp, seed=None, is_probe=False):
         self.asked.append((spp, seed is not None))
         pilot = 0.0 if self.passes else 2.0
         stages = {Stage.PILOT: pilot, Stage.TRACED: 0.01 * spp, Stage.CUTS: 0.0}

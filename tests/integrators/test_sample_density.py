@@ -289,3 +289,15 @@ def test_numbers_may_not_differ_between_the_sensors_of_a_batch():
     camera = closed_box({}, 8)["sensor"]
     batch = {"type": "batch", "film": camera["film"], "sampler": camera["sampler"], "one": camera}
     assert not plugin().may_differ(mi.load_dict(batch), 16)
+
+
+@pytest.mark.parametrize("density", [DENSITY[:2], DENSITY.T])
+def test_a_density_of_another_shape_is_refused(density):
+    with pytest.raises(RuntimeError) as raised:
+        render(room(), plugin(), density)
+    assert "density must have the shape of the film" in str(raised.value.__cause__ or raised.value)
+
+
+def test_a_density_with_halves_is_refused():
+    with pytest.raises(ValueError, match="half must be False"):
+        render(room(), plugin(), DENSITY, half=True)

@@ -59,7 +59,7 @@ class PixelRays:
         """
         if samples < MULTIPLE or samples % MULTIPLE:
             raise ValueError(f"samples must be a positive multiple of {MULTIPLE}, got {samples}")
-        level = _levels(np.log2(np.asarray(density, np.float64).reshape(-1) / np.mean(density)))
+        level = _levels(np.log2(np.asarray(density, np.float64).reshape(-1)))
         # Without the levels that no pixel has: large numbers take long to tabulate
         used, level = np.unique(level, return_inverse=True)
         sizes = tuple(int(size) for size in _LEVELS[used] * samples)
@@ -164,6 +164,7 @@ def _levels(wanted: np.ndarray) -> np.ndarray:
     """Index in ``_LEVELS`` of each pixel, for ``wanted`` (n,), the logarithm to base 2 of the number of rays up to a
     common constant.  The mean of the numbers is 1 exactly."""
     lowest, top = int(np.log2(_LEVELS[0])), len(_LEVELS) - 1
+    wanted = wanted - np.mean(wanted)
 
     def rounded(constant):
         return np.clip(np.round(wanted + constant) - lowest, 0, top).astype(np.int64)
