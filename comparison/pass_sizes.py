@@ -23,6 +23,8 @@ determines samples.
 
 import math
 
+from vpl.split.pixel_rays import MULTIPLE
+
 from .rendering import largest_pass
 from .sample_density import LEAST_SAMPLES
 
@@ -77,18 +79,24 @@ class PassSizes:
             self._asked = passes[-1].spp if passes else None
         if passes:
             self._learn(passes[-1], done, compiles=len(passes) == self._before + 1)
-        size, self.is_probe = self._current, self._probes and len(passes) == 1
+        if self._spp is not None and done >= self._spp:
+            return "spp"
+        self.is_probe = self._probes and len(passes) == 1
+        size = self._size(passes, done, elapsed)
+        if self.is_probe and size < LEAST_SAMPLES:
+            # Too few for the halves of a pass: a pass of the usual size
+            self.is_probe = False
+            size = self._size(passes, done, elapsed)
+        self._asked = size - size % MULTIPLE if self.is_probe else size
+        return self._asked or "time"
+
+    def _size(self, passes, done, elapsed):
+        """Return the size of the next pass, 0 if the time ends the render."""
+        size = self._current
         if self._spp is not None:
-            if done >= self._spp:
-                return "spp"
             size = self._of_the_rest(size, self._spp - done)
         if self._time is not None and passes:
             size = self._in_time(size, self._time - elapsed)
-            if size == 0:
-                return "time"
-        self._asked = size
-        # Fewer leave too much noise in the halves of a pass
-        self.is_probe &= size >= LEAST_SAMPLES
         return size
 
     def _of_the_rest(self, size, left):
@@ -98,7 +106,7 @@ class PassSizes:
         # No pass would follow
         self.is_probe = False
         if self._any_size and left < 2 * size and left <= self._largest:
-            return self._kept(left) if self._probes and left > USUAL else left
+            return self._kept(left) if self._probes else left
         return min(size, left if self._fixed or left < USUAL else _power_of_two(left))
 
     def _learn(self, last, done, compiles):

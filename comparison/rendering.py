@@ -233,7 +233,8 @@ class Progressive(Passes):
         seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
         first = (self.passes[0].spp, self.passes[0].seed) if self.passes else None
         sensor = self._scene.sensors()[self._sensor]
-        density, half = self.density.of_pass(self.integrator, sensor, spp), is_probe and self.differs
+        density = self.density.of_pass(self.integrator, sensor, spp)
+        half = is_probe and self.density.suits(self.integrator, sensor, spp)
         image = render_pass(
             self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density, half
         )  # fmt: skip
@@ -245,9 +246,10 @@ class Progressive(Passes):
 
     def accepts(self, spp):
         """Return whether the sampler keeps a number of samples per pixel, which some samplers round up, and whether
-        pixels may have different numbers of samples if the render uses them."""
+        pixels may have the different numbers of samples that the render has determined."""
         with _sample_count(self._scene.sensors()[self._sensor].sampler(), spp) as rounded:
-            return rounded == spp and (spp % MULTIPLE == 0 or not self.differs)
+            is_multiple = spp % MULTIPLE == 0 or spp < MULTIPLE or self.density.relative is None
+            return rounded == spp and is_multiple
 
     @property
     def seconds(self):

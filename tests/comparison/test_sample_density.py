@@ -131,6 +131,14 @@ def test_images_with_few_samples_in_a_pass_have_equal_numbers(monkeypatch):
     assert not progressive.differs
 
 
+def test_any_size_is_accepted_before_numbers_are_determined():
+    plugin = mi.load_dict({"type": "manylights", "denoised": True})
+    progressive = rendering.Progressive(cornell().load(), 0, integrator=plugin, denoise=print)
+    assert all(progressive.accepts(spp) for spp in range(1, 20))
+    progressive.density.relative = np.ones((16, 16))
+    assert [spp for spp in range(1, 20) if progressive.accepts(spp)] == [1, 2, 3, 4, 8, 12, 16]
+
+
 def test_the_error_of_different_numbers_is_unknown():
     scene = cornell().load()
     assert manylights.render(scene, "manylights", spp=64, denoise=True)[1].error is None
@@ -198,7 +206,7 @@ def test_a_pass_that_determines_numbers_is_short(time):
 def test_a_pass_that_determines_numbers_has_a_quarter_of_the_samples_that_are_left(spp):
     passes, ended_by = made_up_passes(256 * 128, 0.05, 0.004, 0.3, spp=spp, in_parts=True, probes=True)
     assert ended_by == "spp" and sum(one.spp for one in passes) == spp
-    expected = int(PROBE * (spp - 4))
+    expected = int(PROBE * (spp - 4)) // 4 * 4
     assert passes[1].spp == (expected if expected >= LEAST_SAMPLES else spp - 4)
 
 
@@ -206,6 +214,16 @@ def test_a_slow_first_pass_does_not_end_a_render():
     passes, ended_by = made_up_passes(256 * 128, 0.05, 0.04, 6.0, 0.3, time=60.0, in_parts=True, probes=True)
     assert ended_by == "time" and passes[0].seconds > 6
     assert sum(one.seconds for one in passes) > 55
+
+
+def test_large_images_in_short_renders_have_passes_as_without_a_probe():
+    """Where a probe would have too few samples, in an image of a third of a million pixels."""
+    found = [
+        made_up_passes(768 * 432, 0.05, 0.3, 1.0, 0.3, time=6.0, in_parts=True, probes=probes)[0]
+        for probes in (True, False)
+    ]
+    sizes, expected = ([one.spp for one in passes] for passes in found)
+    assert sizes == expected and max(sizes) > 4
 
 
 def test_given_sizes_of_passes_are_kept():
