@@ -32,9 +32,7 @@ PASS_SECONDS = 2.0
 PART_SECONDS, LEAST_REST = 10.0, 1.0  # of a pass in parts; minimum ratio of its rest to its start, which has priority
 LEAST_GAIN = 1 / 16  # minimum size of a last pass with virtual lights, as a fraction of the intended size
 LIT = 2.0  # usual cost of a sample with virtual lights over that without, at most: small passes have no lights
-UNSURE = (
-    1.25  # cost over a predicted cost, usually at most: predictions are within a fifth in most scenes (decisions.md)
-)
+UNSURE = 1.25  # cost over a predicted one, at most in most scenes: predictions are within a fifth (decisions.md)
 DOUBT = 0.5  # fraction of the remaining time for a second pass, which may have lights and cost more than expected
 PROBE = 0.25  # fraction of the remaining time, or samples, for a second pass that determines the samples of the pixels
 LONGEST = 2.0  # times the wanted seconds: longer passes shrink

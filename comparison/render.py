@@ -18,12 +18,13 @@ from vpl.core.stages import listening
 
 from .batch import ALL
 from .checkpoint import Checkpoint
+from .counters import TotalStatistics
 from .denoising import Denoiser, for_denoising, quality_of
 from .ending import Ending
 from .features import Layers, channels_of, features_of
 from .interruption import Interruption
 from .pass_sizes import PassSizes
-from .rendering import Progressive, TotalStatistics
+from .rendering import Progressive
 from .scene_files import SceneFile
 
 LIMITS = ("spp", "time")  # end a render regardless of its error
@@ -36,9 +37,9 @@ class Took:
     `spp`: samples per pixel; `passes`: number of passes, each with its own seed; `seconds`: wall-clock time of the
     call, including compilation and denoising; `error`: estimated relative standard error that 95% of the pixels do not
     exceed (see convergence.py), before denoising, None for fewer than two passes and where pixels have different
-    numbers of samples; `statistics`: counters of the
-    integrator, summed over passes; `ended_by`: the limit that was reached ("spp", "time" or "error"), "interruption"
-    (Ctrl-C, or `cancel` of the integrator) or "progress", None during the render; `channels`: names of the channels;
+    numbers of samples; `statistics`: counters of the integrator, summed over passes; `ended_by`: the limit that was
+    reached ("spp", "time" or "error"), "interruption" (Ctrl-C, or `cancel` of the integrator) or "progress", None
+    during the render; `channels`: names of the channels;
     `denoise_seconds`: the part of `seconds` for denoising; `denoiser`: metadata, quality of the denoiser and samples of
     albedo and normal; `raw`: the image before denoising (`mi.TensorXf`), None without denoising; `layer_spp`: samples
     per pixel of the requested layers, None without.
@@ -251,18 +252,18 @@ class _Render:
             if isinstance(size, str):
                 self._ended_by = size
                 return
-            one = self._pass(size, interrupted, {"is_probe": True} if sizes.is_probe else {})
+            one = self._pass(size, interrupted, sizes.is_probe)
             if one is not None:
                 self._look()
             if one is None or interrupted():
                 self._ended_by = "time" if self.progressive.is_late() else "interruption"
 
-    def _pass(self, size, interrupted, settings):
-        """Render a pass with the `settings` of `render`, and return it; None after an interruption."""
+    def _pass(self, size, interrupted, is_probe):
+        """Render a pass and return it, None after an interruption."""
         try:
             with listening(self._listener()) if self._progress else nullcontext():
                 # Ctrl-C also stops Mitsuba, so that the pass may be unfinished
-                return self.progressive.render(size, accept=lambda: not interrupted(), **settings)
+                return self.progressive.render(size, accept=lambda: not interrupted(), is_probe=is_probe)
         except BaseException as error:
             # Mitsuba and Dr.Jit replace exceptions that they pass on
             if self._raised is not None:

@@ -2,7 +2,6 @@
 
 import time
 from contextlib import contextmanager
-from copy import deepcopy
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -11,7 +10,7 @@ import numpy as np
 
 from vpl.core.garbage import garbage_kept
 from vpl.core.stages import Stage
-from vpl.split.pixel_rays import MULTIPLE
+from vpl.split.pixel_rays import HALF, MULTIPLE
 
 from .convergence import ErrorEstimate
 from .images import colour
@@ -19,7 +18,6 @@ from .sample_density import LEAST_SAMPLES, SampleDensity
 
 MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the time to the first image
 MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
-HALF = "every second."  # begins the names of channels with every second sample (integrators/manylights.py)
 # Stages of `manylights` with times about proportional to the samples
 PER_SAMPLE = Stage.LIGHTS, Stage.TREE, Stage.TRACED, Stage.CLUSTERS, Stage.CUTS
 
@@ -117,9 +115,9 @@ def render_pass(scene, sensor, integrator, spp, seed, first=None, shared=None, d
     taken = Pass(seed, spp, seconds, statistics)
     if not half:
         return PassImage(planes, channels, taken)
-    of_half = [index for index, name in enumerate(channels) if name.startswith(HALF)]
-    rest = [index for index in range(len(channels)) if index not in of_half]
-    return PassImage(planes[..., rest], [channels[index] for index in rest], taken, planes[..., of_half])
+    rest = [index for index, name in enumerate(channels) if not name.startswith(HALF)]
+    of_half = colour(planes, channels, f"{HALF}.")
+    return PassImage(planes[..., rest], [channels[index] for index in rest], taken, of_half)
 
 
 def _render(scene, sensor, integrator, spp, seed):
@@ -317,38 +315,3 @@ def _shown(planes, channels):
         return colour(planes, channels)
     except ValueError:
         return planes
-
-
-def total_statistics(passes):
-    """Return the sum of the integrators' counters over passes (see `TotalStatistics`)."""
-    return TotalStatistics().of(passes)
-
-
-class TotalStatistics:
-    """Sum of the integrators' counters over passes.
-
-    Numbers are summed, also in nested dicts ("seconds"); the sum of "precision" is that of the image. Descriptions,
-    such as the text "plan", the dict "lights" and the ratio "growth", come from the pass with the most samples, the
-    last of equal passes.
-    """
-
-    def __init__(self):
-        self._total, self._count, self._most = {}, 0, 0
-
-    def of(self, passes):
-        """Return the total of a list of passes that begins with the list of the last call; {} without counters."""
-        for one in passes[self._count :]:
-            _add(self._total, one.statistics, describe=one.spp >= self._most)
-            self._most = max(self._most, one.spp)
-        self._count = len(passes)
-        return deepcopy(self._total)
-
-
-def _add(total, statistics, describe):
-    for key, value in statistics.items():
-        if isinstance(value, dict) and key != "lights":
-            _add(total.setdefault(key, {}), value, describe)
-        elif isinstance(value, int | float | np.number) and not isinstance(value, bool) and key != "growth":
-            total[key] = total.get(key, 0) + (value.item() if isinstance(value, np.number) else value)
-        elif describe or key not in total:
-            total[key] = value

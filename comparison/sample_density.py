@@ -17,6 +17,7 @@ import numpy as np
 from vpl.split.pixel_rays import MULTIPLE, PixelRays
 
 from .convergence import box_mean, relative_squares
+from .images import colour
 
 QUALITY = "fast"  # of the denoiser: a quarter of the time of "high", and the same error in three scenes
 LEAST_SAMPLES = 8  # of a pass that determines the density: fewer leave too much noise in its halves
@@ -45,18 +46,18 @@ class SampleDensity:
         return self.relative if self.suits(integrator, sensor, spp) else None
 
     def learn(self, image, half, channels):
-        """Determine the samples from a pass: its `image` (height, width, channels) and that of every second sample,
-        `half` (height, width, 3 or 1)."""
+        """Determine the samples from a pass: its `image` (height, width, channels), and the colour of every second
+        sample, `half` (height, width, 3)."""
         begin = time.perf_counter()
         self._learn(image, half, channels)
         self.seconds += time.perf_counter() - begin
 
     def _learn(self, image, half, channels):
-        colours = [channels.index(name) for name in ("R", "G", "B") if name in channels] or [channels.index("Y")]
-        names = [channels[index] for index in colours]
-        if half.shape[-1] > len(names):
+        whole = colour(image, channels)
+        if "R" not in channels:
             half = half @ np.float32(LUMINANCE)[:, None]
-        halves = [self._denoise(one, names, QUALITY) for one in (half, 2 * image[..., colours] - half)]
+        half = np.broadcast_to(half, whole.shape)
+        halves = [self._denoise(one, ["R", "G", "B"], QUALITY) for one in (half, 2 * whole - half)]
         difference = relative_squares(*halves)
         difference = np.minimum(difference, np.quantile(difference, OUTLIERS))
         for _ in range(SMOOTHED):

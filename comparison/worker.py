@@ -22,9 +22,10 @@ from pathlib import Path
 
 from . import images, machine
 from .command_line import failure, set_variant, versions
+from .counters import total_statistics
 from .denoising import Denoiser
 from .measuring import measure
-from .rendering import Progressive, total_statistics
+from .rendering import Progressive
 from .scene_files import SceneFile
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -18,7 +18,7 @@ import numpy as np
 
 from vpl.core.sampling import derived_seed
 from vpl.split.lattice import Lattice
-from vpl.split.pixel_rays import MULTIPLE, PixelRays
+from vpl.split.pixel_rays import MULTIPLE, PixelRays, RayNumbers
 
 # Mitsuba's default. A scene that names another sampler keeps it
 _REPLACED = "IndependentSampler"
@@ -36,8 +36,8 @@ class LatticeSampler(mi.Sampler):
 
     def __init__(self):
         super().__init__(mi.Properties("lattice"))
-        self.pixels, self.width, self.rays, self._seed, self._pass = 1, 1, None, 0, 0
-        self._lattice = self._offset = None
+        self.pixels, self.width, self._seed, self._pass = 1, 1, 0, 0
+        self.end()
 
     @property
     def pass_seed(self) -> int:
@@ -57,8 +57,8 @@ class LatticeSampler(mi.Sampler):
         self._begin()
 
     def end(self):
-        """Free the memory of a pass."""
-        self._lattice = self._offset = None
+        """Forget the last render, and free its memory."""
+        self.rays = self._lattice = self._offset = None
 
     def next_1d(self, active=True):
         """A uniform number for each lane."""
@@ -78,7 +78,7 @@ class LatticeSampler(mi.Sampler):
             here, there = (self._position(pixel) for pixel in (lane // dr.opaque(mi.UInt32, each), places.pixel))
             self._offset = there - here
         else:
-            places, sizes = PixelRays.uniform(self.pixels, each).places(lane), (self.sample_count(),)
+            places, sizes = RayNumbers.of_lanes(lane, each), (self.sample_count(),)
             # The passes of a render share the lattice of a pixel
             places = replace(places, number=places.number + dr.opaque(mi.UInt32, self._pass * each))
         self._lattice = Lattice(places, sizes, self._seed)
@@ -112,23 +112,21 @@ class StratifiedSensor(mi.Sensor):
     def becomes(self, sensor, spp: int, density: np.ndarray | None = None) -> None:
         """Stand for ``sensor`` with ``spp`` samples of a pixel, which differ in proportion to a ``density`` (height,
         width) if there is one; None: for no sensor."""
-        self._sensor, self.m_film = sensor, sensor.film() if sensor else self._idle
-        self.sampler().rays = None
+        self._sensor, self.m_film, sampler = sensor, sensor.film() if sensor else self._idle, self.sampler()
+        sampler.end()
         if sensor is None:
-            self.sampler().end()
             return
         film = sensor.film()
         size = np.array(film.crop_size(), np.int64) + (2 * film.rfilter().border_size() if film.sample_border() else 0)
         self.m_needs_sample_3 = sensor.needs_aperture_sample()
-        self.sampler().set_sample_count(spp)
-        sampler = self.sampler()
+        sampler.set_sample_count(spp)
         sampler.pixels, sampler.width = int(np.prod(size)), int(size[0])
-        if density is not None and density.shape != tuple(size[::-1]):
-            raise ValueError(
-                f"density must have the shape of the film, {tuple(size[::-1].tolist())}, got {density.shape}"
-            )
-        if density is not None:
-            sampler.rays = PixelRays.by_density(density, spp)
+        if density is None:
+            return
+        shape = tuple(size[::-1].tolist())
+        if density.shape != shape:
+            raise ValueError(f"density must have the shape of the film, {shape}, got {density.shape}")
+        sampler.rays = PixelRays.by_density(density, spp)
 
     def to_string(self):
         """The other sensor."""

@@ -19,7 +19,7 @@ from vpl.split.cost_model import CostModel
 from vpl.split.emitters import emitter_sampler
 from vpl.split.emitters.cell_choice import learning_rays
 from vpl.split.estimator import estimate
-from vpl.split.pixel_rays import PixelRays
+from vpl.split.pixel_rays import HALF, PixelRays
 from vpl.split.roulette import OutgoingRadiance
 from vpl.split.start import Start, make_start
 from vpl.split.surface_lights import KeptLights
@@ -34,8 +34,8 @@ from .manual import manual_page
 _SHARED_SAMPLES = 16
 # Largest depth that prb can count, with 32 bits
 _DEEPEST = 2**32 - 1
-# Name of the channels with the mean of every second sample
-HALF = "every second"
+# Ratio of the size of a later pass of a render, of which a pass predicts the cost
+_LARGER = 4
 # Names of channels and layers of images, which are no names of groups of emitters
 _RESERVED = (*LENGTHS, OTHER, "albedo", "normal", "depth", *"RGBAXYZ")
 
@@ -159,7 +159,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
             "more virtual lights, up to twice as many. Denoisers also leave errors at edges, which virtual lights do "
             "not reduce, so only lights that remove much of the variance are used. ``manylights.render`` gives more "
             "samples to pixels where the denoiser leaves noise. The raw image has the same mean, and "
-            "1.3 to 2 times the variance × time in four rooms.",
+            "1.2 to 1.6 times the variance × time in four rooms.",
         ),
         Boolean(
             "stratified", True,
@@ -202,8 +202,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
         ``shared``: object with an attribute ``start``, None until the first pass is rendered.  The start depends on the
         first pass alone: where it is missing and this is not the first pass, yields True, and the caller has to render
         the first pass within :meth:`only_start`.  ``density`` (height, width): samples of each pixel over their mean,
-        about; None for equal numbers.  ``half``: whether the image has the channels :data:`HALF`, the mean of every
-        second sample, with an even number of samples.  Both need :meth:`may_differ`, and exclude each other.
+        about; None for equal numbers.  ``half``: whether the image has the mean of every second sample as channels of
+        the layer :data:`vpl.split.pixel_rays.HALF`, with an even number of samples.  Both need :meth:`may_differ`, and
+        exclude each other.
         """
         if half and density is not None:
             raise ValueError("half must be False where pixels have different numbers of samples, by a density")
@@ -308,6 +309,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
         kept = self._kept if self.keep_lights else None
         found = estimate(view, start, kept, self.should_stop, clock)
         self.statistics = found.statistics | {"pilots": int(known is None)}
+        if shared:
+            self.statistics["growth"] = found.decision.growth(_LARGER)
         channels = [channel for name in self._layer_names for channel in found.layers[name]]
         if view.rays.differ:
             channels = [view.rays.evenly(channel) for channel in channels]

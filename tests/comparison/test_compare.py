@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import compare
-from comparison import images, rendering, worker
+from comparison import counters, images, rendering, worker
 from comparison.scene_files import SceneFile
 from tests.support.paths import CORNELL, ROOT
 from tests.support.scenes import cornell
@@ -149,7 +149,7 @@ def test_statistics_add_up():
         {"shadow_rays": 3, "seconds": {"trace": 1.0}, "lights": {"omni": 7}},
         {"shadow_rays": 4, "seconds": {"trace": 0.5, "cut": 1.0}, "lights": {"omni": 8}},
     ]
-    total = rendering.total_statistics([rendering.Pass(0, 1, 1.0, one) for one in statistics])
+    total = counters.total_statistics([rendering.Pass(0, 1, 1.0, one) for one in statistics])
     assert total == {"shadow_rays": 7, "seconds": {"trace": 1.5, "cut": 1.0}, "lights": {"omni": 8}}
     assert statistics[0]["seconds"] == {"trace": 1.0}
 
@@ -161,7 +161,7 @@ def test_what_describes_a_pass_is_that_of_the_largest():
         {"plan": "too few samples"},
     ]
     passes = [rendering.Pass(0, spp, 1.0, one) for spp, one in zip((1, 8, 2), statistics, strict=True)]
-    assert rendering.total_statistics(passes) == {"plan": "glossy", "share": 0.75, "lights": {"surface": 7}}
+    assert counters.total_statistics(passes) == {"plan": "glossy", "share": 0.75, "lights": {"surface": 7}}
 
 
 def test_statistics_are_read_once_as_passes_come():
@@ -172,11 +172,11 @@ def test_statistics_are_read_once_as_passes_come():
             read.append(1)
             return super().items()
 
-    totals, passes, found = rendering.TotalStatistics(), [], []
+    totals, passes, found = counters.TotalStatistics(), [], []
     for spp in (4, 8, 2, 8):
         passes.append(rendering.Pass(0, spp, 1.0, Read(rays=spp, plan=f"{spp}, {len(passes)}")))
         found.append(totals.of(passes))
-    assert len(read) == 4 and found[-1] == rendering.total_statistics(passes) == {"rays": 22, "plan": "8, 3"}
+    assert len(read) == 4 and found[-1] == counters.total_statistics(passes) == {"rays": 22, "plan": "8, 3"}
     assert found[0] == {"rays": 4, "plan": "4, 0"}
 
 

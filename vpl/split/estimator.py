@@ -37,20 +37,28 @@ from .view import PathSettings, Stream, View, ViewLights
 # Smallest and largest number of camera rays per part; the target is half of the image. Filling new memory of a process
 # is slow, which matters for small images, and Dr.Jit records the kernels anew for each part
 _WAVEFRONT = 1 << 18, 1 << 20
-# Ratio of the size of a larger pass, of which a pass predicts the cost
-LARGER = 4
 # Every surface blocks the light of virtual lights: light that passes a surface is traced
 _OPAQUE = SceneTraits(False, False, True, False, False, (), (), None)
 
 
 @dataclass(frozen=True)
+class Part:
+    """Pixels that are traced at once: a range ``pixels`` (first, last + 1), their ``first`` ray and ``rays``."""
+
+    pixels: tuple[int, int]
+    first: int
+    rays: PixelRays
+
+
+@dataclass(frozen=True)
 class Estimate:
     """``radiance`` of each camera ray; ``valid``: whether the ray is opaque in the film's alpha; ``layers``: radiance
-    by name of the layer; ``statistics``."""
+    by name of the layer; ``decision``; ``statistics``."""
 
     radiance: mi.UnpolarizedSpectrum
     valid: mi.Bool
     layers: dict[str, mi.UnpolarizedSpectrum]
+    decision: Decision
     statistics: dict
 
 
@@ -65,9 +73,9 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
     mi.Log(mi.LogLevel.Info, f"manylights: {decision.plan}")
     lights, of_lights = make_lights(view, decision, kept, clock)
     radiance, valid, layers, of_image = render_image(view, lights, decision, stopped, clock)
-    expected = {"precision": decision.precision(view.samples), "growth": decision.growth(LARGER)}
-    statistics = {"plan": decision.plan.reason} | expected | roulette | of_lights | of_image
-    return Estimate(radiance, valid, layers, statistics | {"seconds": clock.seconds})
+    precision = {"precision": decision.precision(view.samples)}
+    statistics = {"plan": decision.plan.reason} | precision | roulette | of_lights | of_image
+    return Estimate(radiance, valid, layers, decision, statistics | {"seconds": clock.seconds})
 
 
 # ---------------------- Plan ----------------------
@@ -149,20 +157,20 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
     for pixels in view.rays.parts(-(-view.pixels // parts) * view.samples):
         if stopped():
             break
-        rays, first = view.rays.part(*pixels), int(view.rays.first[pixels[0]])
-        lane = dr.arange(mi.UInt32, rays.count) + dr.opaque(mi.UInt32, first)
+        part = Part(pixels, int(view.rays.first[pixels[0]]), view.rays.part(*pixels))
+        lane = dr.arange(mi.UInt32, part.rays.count) + dr.opaque(mi.UInt32, part.first)
         dr.eval(lane)
-        sums_of_part = sums.part(first) if sums else None
-        traced, points = _traced_part(view, lane, rays, settings, lights, decision.plan, sums_of_part, clock)
-        part, opaque = traced.radiance, traced.valid
+        sums_of_part = sums.part(part.first) if sums else None
+        traced, points = _traced_part(view, lane, part, settings, lights, decision.plan, sums_of_part, clock)
+        found, opaque = traced.radiance, traced.valid
         # Frees the memory of unlit gather vertices
         del traced
         if points is not None:
-            light, counts = gatherer.light(points, part, pixels, sums_of_part, clock)
-            part += light
+            light, counts = gatherer.light(points, found, part, sums_of_part, clock)
+            found += light
             for name, number in counts.items():
                 statistics[name] = statistics.get(name, 0) + number
-        dr.scatter(radiance, part, lane)
+        dr.scatter(radiance, found, lane)
         dr.scatter(valid, opaque, lane)
         dr.eval(radiance, valid)
     clock.stop()
@@ -174,24 +182,23 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
         mi.Log(mi.LogLevel.Warn, f"{dropped} sample(s) with values that are not finite were dropped.")
     shown = view.rules.max_depth > 0
     kept = finite & shown
-    found = {name: sums.of(name, kept) for name in view.layers.names}
-    return dr.select(kept, radiance, 0), valid & shown, found, statistics | {"dropped": dropped}
+    layers = {name: sums.of(name, kept) for name in view.layers.names}
+    return dr.select(kept, radiance, 0), valid & shown, layers, statistics | {"dropped": dropped}
 
 
 def _traced_part(
-    view: View, lane: mi.UInt32, rays: PixelRays, settings: PathSettings, lights: ViewLights, plan: Plan,
+    view: View, lane: mi.UInt32, part: Part, settings: PathSettings, lights: ViewLights, plan: Plan,
     sums: LayerSums | None, clock: Clock,
 ) -> tuple[Traced, LitVertices | None]:  # fmt: skip
-    """(Traced part of the camera rays ``lane``, which are ``rays`` of whole pixels; gather vertices that are lit)."""
+    """(Traced part of the camera rays ``lane`` of a part of the image; gather vertices that are lit)."""
     clock.begin(Stage.TRACED)
-    first = int(lane[0])
-    traced = trace_camera_rays(view, lane, settings, Stream.IMAGE, first, sums=sums)
+    traced = trace_camera_rays(view, lane, settings, Stream.IMAGE, part.first, sums=sums)
     if not lights.all:
         return traced, None
     clock.begin(Stage.CLUSTERS)
-    seed = derived_seed(derived_seed(view.seed, Stream.GATHER, first), 0)
+    seed = derived_seed(derived_seed(view.seed, Stream.GATHER, part.first), 0)
     gathered = traced.gathered
-    return traced, LitVertices.of(gathered.first, gathered.later, rays, plan.vertices, seed)
+    return traced, LitVertices.of(gathered.first, gathered.later, part.rays, plan.vertices, seed)
 
 
 @dataclass(frozen=True)
@@ -217,14 +224,14 @@ class Gatherer:
         return cls(view, decision.plan, transports, decision.expected_light(lights), darkest)
 
     def light(
-        self, points: LitVertices, found, pixels: tuple[int, int], sums: LayerSums | None, clock: Clock
+        self, points: LitVertices, found, part: Part, sums: LayerSums | None, clock: Clock
     ) -> tuple[mi.UnpolarizedSpectrum, dict]:
-        """(Light at the ``points``, per camera ray; counters) for a part of the image: the range ``pixels``.
+        """(Light at the ``points``, per camera ray; counters) for a part of the image.
 
         The brightness of a pixel is the radiance ``found`` by paths plus the expected light of virtual lights.
         ``sums`` by layer of this part.
         """
-        view, rays, first = self.view, self.view.rays.part(*pixels), int(self.view.rays.first[pixels[0]])
+        view, rays = self.view, part.rays
         lit = dr.zeros(mi.UnpolarizedSpectrum, rays.count)
         dr.eval(lit)
         if points.count == 0:
@@ -233,10 +240,10 @@ class Gatherer:
         clock.begin(Stage.CUTS)
         radiance = np.nan_to_num(download(channel_mean(found)), posinf=0, neginf=0)
         traced = np.add.reduceat(radiance, rays.first[:-1]) / rays.numbers
-        brightness = np.maximum(traced, 0) + self.expected[slice(*pixels)]
+        brightness = np.maximum(traced, 0) + self.expected[slice(*part.pixels)]
         # Of the sum over the samples of a pixel
         allowed = self._errors(rays) * rays.numbers * np.maximum(brightness, self.darkest)
-        shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, first)
+        shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, part.first)
         for number, transport in enumerate(self.transports):
             stream = derived_seed(seed, 1, number)
             shadow_rays += light_clusters(

@@ -81,8 +81,8 @@ class Lattice:
         begins = np.cumsum([0, *(len(table) for table in tables[:-1])])
         rows = [len(table) // size for table, size in zip(tables, sizes, strict=True)]
         # Steps between points of the lattice, in units of 2^-32
-        steps = [[round(times * 2**32 / size) % 2**32 for size in sizes for times in (1, lattice_multiplier(size))]]
-        steps = np.reshape(steps, (-1, 2)).T
+        multipliers = [1] * len(sizes), [lattice_multiplier(size) for size in sizes]
+        steps = ([round(g * 2**32 / size) % 2**32 for g, size in zip(row, sizes, strict=True)] for row in multipliers)
         self._samples, self._begin, self._rows, *self._steps = (
             dr.gather(mi.UInt32, upload(mi.UInt32, np.array(values)), places.level)
             for values in (sizes, begins, rows, *steps)
@@ -91,9 +91,9 @@ class Lattice:
     @classmethod
     def of_lanes(cls, lane, samples: int, seed: int) -> Lattice:
         """For paths in the lanes ``lane`` (UInt32); ``samples`` consecutive lanes belong to a pixel."""
-        each = dr.opaque(mi.UInt32, samples)
         dr.eval(lane)
-        places = RayNumbers(lane // each, lane % each, lane * dr.opaque(mi.UInt32, 0))
+        places = RayNumbers.of_lanes(lane, samples)
+        # All numbers of rays, and counted and chosen lanes, use the same kernel
         dr.eval(places)
         return cls(places, (samples,), seed)
 

@@ -18,6 +18,8 @@ from ..core.arrays import add_at, upload
 # Numbers of rays over the mean number: from a quarter to four times. With more levels up and down the denoised error is
 # the same within 1% (kitchen, staircase2)
 _LEVELS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
+# Name of the channels of an image with the mean of every second ray
+HALF = "every second"
 # Of the mean number: the least number of rays is an integer
 MULTIPLE = 4
 
@@ -32,6 +34,12 @@ class RayNumbers:
     pixel: mi.UInt32
     number: mi.UInt32
     level: mi.UInt32
+
+    @classmethod
+    def of_lanes(cls, lane: mi.UInt32, samples: int) -> RayNumbers:
+        """Of the rays ``lane``, of which ``samples`` consecutive ones belong to a pixel."""
+        each = dr.opaque(mi.UInt32, samples)
+        return cls(lane // each, lane % each, lane * dr.opaque(mi.UInt32, 0))
 
 
 @dataclass(frozen=True)
@@ -112,39 +120,36 @@ class PixelRays:
 
     def places(self, lane: mi.UInt32) -> RayNumbers:
         """Places of the rays ``lane`` (UInt32)."""
-        if self.differ:
-            pixel = dr.gather(mi.UInt32, self._device_pixels, lane)
-        else:
-            pixel = lane // dr.opaque(mi.UInt32, self.mean)
-        first, level = self._device_rows
-        number, level = lane - dr.gather(mi.UInt32, first, pixel), dr.gather(mi.UInt32, level, pixel)
-        return RayNumbers(pixel, number, level)
+        if not self.differ:
+            return RayNumbers.of_lanes(lane, self.mean)
+        pixel = dr.gather(mi.UInt32, self._device_pixels, lane)
+        first, level = (dr.gather(mi.UInt32, row, pixel) for row in self._device_rows)
+        return RayNumbers(pixel, lane - first, level)
 
     def evenly(self, values):
         """Mean of the ``values`` of each pixel's rays, for as many rays as if all pixels had the mean number.
 
         Mitsuba adds up samples with a box filter as if pixels had equal numbers of rays.
         """
-        channels = []
+        channels, even = [], self._even_places.pixel
         for channel in values if dr.depth_v(values) > 1 else [values]:
             total = dr.zeros(mi.Float, self.pixels)
             add_at(total, channel, self._device_pixels)
-            total /= upload(mi.Float, self.numbers)
-            channels.append(dr.gather(mi.Float, total, self._even_pixels))
+            channels.append(dr.gather(mi.Float, total / self._device_numbers, even))
         return type(values)(*channels)
 
     @property
-    def _even_pixels(self) -> mi.UInt32:
-        """Pixel of each ray if all pixels had the mean number."""
-        return dr.arange(mi.UInt32, self.count) // dr.opaque(mi.UInt32, self.mean)
+    def _even_places(self) -> RayNumbers:
+        """Places of the rays if all pixels had the mean number."""
+        return RayNumbers.of_lanes(dr.arange(mi.UInt32, self.count), self.mean)
 
     def evenly_masked(self, mask: mi.Bool, seed: int) -> mi.Bool:
         """As :meth:`evenly`, for a ``mask``: a multiple of 1 / mean number for each pixel, with the mean fraction."""
         fraction = self.evenly(dr.select(mask, mi.Float(1), mi.Float(0)))
-        number = mi.Float(dr.arange(mi.UInt32, self.count) % dr.opaque(mi.UInt32, self.mean))
+        places = self._even_places
         # A random number for each pixel, so that rounding has no preference
-        rounding = mi.sample_tea_float32(self._even_pixels, dr.opaque(mi.UInt32, seed))
-        return rounding < fraction * self.mean - number
+        rounding = mi.sample_tea_float32(places.pixel, dr.opaque(mi.UInt32, seed))
+        return rounding < fraction * self.mean - mi.Float(places.number)
 
     @cached_property
     def _pixels(self) -> np.ndarray:
@@ -154,6 +159,10 @@ class PixelRays:
     @cached_property
     def _device_pixels(self) -> mi.UInt32:
         return upload(mi.UInt32, self._pixels)
+
+    @cached_property
+    def _device_numbers(self) -> mi.Float:
+        return upload(mi.Float, self.numbers)
 
     @cached_property
     def _device_rows(self) -> tuple[mi.UInt32, mi.UInt32]:
@@ -166,18 +175,20 @@ def _levels(wanted: np.ndarray) -> np.ndarray:
     lowest, top = int(np.log2(_LEVELS[0])), len(_LEVELS) - 1
     wanted = wanted - np.mean(wanted)
 
-    def rounded(constant):
-        return np.clip(np.round(wanted + constant) - lowest, 0, top).astype(np.int64)
+    def rounded(values, constant):
+        return np.clip(np.round(values + constant) - lowest, 0, top).astype(np.int64)
 
     # In units of the least number of rays
     whole = len(wanted) * MULTIPLE
     reach = float(np.ptp(wanted)) + top
     low, high = -reach, reach
+    # Numbers that are rounded already have few values
+    values, counts = np.unique(wanted, return_counts=True)
     # The remainder makes up for the rest
     for _ in range(30):
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if np.sum(1 << rounded(middle)) > whole else (middle, high)
-    level = rounded(low)
+        low, high = (low, middle) if np.sum(counts << rounded(values, middle)) > whole else (middle, high)
+    level = rounded(wanted, low)
     left, lacking = whole - int(np.sum(1 << level)), wanted + low - lowest - level
     # The next level of a pixel costs as much as its level. A remainder is a multiple of the least level below the top,
     # so that it can always be spent
