@@ -1,7 +1,7 @@
 """Albedo, normal and depth of the first surfaces that are neither mirror nor glass.
 
-They guide the denoiser, and are layers of images on request. They have as many samples as the image, but at least 16
-and at most 64 per pixel; if time is limited, 16 and up to 64 more in a twenty-fifth of the limit.
+They guide the denoiser, and are layers of images on request. They have twice the samples of the image, but at least 16
+and at most 144 per pixel; if time is limited, 16 and up to 144 more in 6% of the limit.
 """
 
 import math
@@ -18,9 +18,12 @@ from vpl.core.garbage import garbage_kept
 from vpl.core.sampling import derived_seed, independent_sampler
 
 # Fewest and most samples per pixel: squares, to which some of Mitsuba's samplers round
-FEATURE_SPP = 16, 64  # 64 instead of 16: denoised error 2 to 10% less in four scenes (decisions.md)
+FEATURE_SPP = 16, 144  # 144 instead of 16: denoised error 4, 6 and 10% less in images of 4, 16, 64 (decisions.md)
 FEATURE_WAVEFRONT = 1 << 22  # most samples of an image rendered at once, some 400 MB, or the fewest per pixel
-FEATURE_SHARE = 0.04  # of a time limit; the samples of a path take about 25 times as long
+# A sample of a path takes 20 to 25 times as long. Features and image gain equally by more time if the features have
+# about twice the samples of the image (decisions.md), which take a tenth of its time with the first ones
+PER_SAMPLE = 2
+FEATURE_SHARE = 0.06  # of a time limit, for the samples after the first ones
 FEATURE_SEED = 0xFEA7  # combined with the seed of the image, to avoid correlated noise
 DEEPEST = 16  # interactions with mirrors, panes and masks
 # Channels of each feature; the names are those of Cycles' layers
@@ -61,7 +64,7 @@ def features_of(scene, sensor, seed=0, spp=None, time_limit=None):
     """Return (the features of an image, a dict as of `auxiliary_features`; samples per pixel). `sensor`: a `mi.Sensor`;
     `seed`, `spp`, `time_limit`: of the image, None if unlimited."""
     fewest, most = FEATURE_SPP
-    wanted = most if spp is None else min(max(spp, fewest), most)
+    wanted = most if spp is None else min(max(PER_SAMPLE * spp, fewest), most)
     if time_limit is None:
         return auxiliary_features(scene, sensor, math.isqrt(wanted) ** 2, seed)
     # The first samples tell the time of the others; compilation counts, because people wait for it

@@ -11,14 +11,15 @@ small, because its own pixels have equal numbers.
 The first pass is small, as its cost is unknown. Sizes of passes that are not in parts, or end by error, are powers of
 two, from 4 if the number of pixels allows: Mitsuba compiles a single kernel for these sizes, but other kernels for
 sizes between, and, with some film filters, below 4. Each later pass has the size of the pass before it, or grows by a
-factor that the measured time allows. The first pass with a kernel includes compilation, so its time is an upper bound
-of the cost: growing by it is safe. Shrinking requires a second pass of equal size; so does growth that risks twice the
-time, for passes that are slow to start.
+factor that the measured time allows. Compilation is measured and does not count. Even so, the first pass with a kernel
+takes up to twice as long as later ones, so its time is an upper bound of the cost: growing by it is safe. Shrinking
+requires a second pass of equal size; so does growth that risks twice the time, for passes that are slow to start.
 
 Passes in parts report the time of their start, so that one pass tells the cost of any size, and sizes from the second
 pass on may be any number: `manylights` needs a single further kernel for them. A second pass may have virtual lights
 where the small first pass has none, and cost more: it is planned for half of the remaining time, or less if it
-determines samples.
+determines samples. The pass after a second one that determines samples has kernels of its own: it is expected to
+compile as long as the first pass.
 """
 
 import math
@@ -63,10 +64,11 @@ class PassSizes:
         self._largest = _power_of_two(largest_pass(pixels, in_parts))
         self._least = USUAL if USUAL * pixels <= FIRST_SAMPLES else 1
         self._current, self._seconds, self._asked = fixed or self._least, {}, None
-        self._known = {}  # size -> seconds of the last pass; not of the first pass, which compiles
+        self._known = {}  # size -> seconds of the last pass; not of the first pass, which is slower
         self._starts = {}  # size -> seconds to start the last pass, of passes that report them
         self._lit, self._lit_cost = False, LIT  # whether a pass had virtual lights; their cost, at most
         self._before = None  # number of passes from a checkpoint; None until the first call
+        self._kernel_seconds = KERNEL_SECONDS  # expected compilation of the next pass
 
     def next(self, passes, elapsed):
         """Return the samples per pixel of the pass after `passes` (list of `Pass`) and `elapsed` seconds, or the limit
@@ -76,7 +78,8 @@ class PassSizes:
             self._before = len(passes)
             self._asked = passes[-1].spp if passes else None
         if passes:
-            self._learn(passes[-1], done, compiles=len(passes) == self._before + 1)
+            self._learn(passes[-1], done, is_first=len(passes) == self._before + 1)
+            self._kernel_seconds = max(passes[0].compile_seconds, KERNEL_SECONDS) if self.is_probe else KERNEL_SECONDS
         if self._spp is not None and done >= self._spp:
             return "spp"
         self.is_probe = self._probes and len(passes) == 1
@@ -107,7 +110,7 @@ class PassSizes:
             return self._kept(left) if self._probes else left
         return min(size, left if self._fixed or left < USUAL else _power_of_two(left))
 
-    def _learn(self, last, done, compiles):
+    def _learn(self, last, done, is_first):
         """Record the time of the `last` pass, and choose the size of later passes."""
         repeated, seconds = self._asked in self._seconds, last.repeated_seconds
         if last.start_seconds is not None:
@@ -115,9 +118,8 @@ class PassSizes:
             self._lit |= last.has_lights
             if last.growth is not None:
                 self._lit_cost = UNSURE * last.growth if last.growth > 1 else 1.0
-        # The first pass of a size may have compiled kernels
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
-        if not compiles:
+        if not is_first:
             before = self._known.get(self._asked, seconds)
             if not 1 / CHANGED < seconds / max(before, 1e-6) < CHANGED:
                 self._known.clear()  # the speed of the machine has changed
@@ -160,7 +162,7 @@ class PassSizes:
         elif self._any_size and not self._known and not self._lit:
             left *= DOUBT
         if self._any_size and line:
-            filling = int((left - line[0] - KERNEL_SECONDS) / line[1])
+            filling = int((left - line[0] - self._kernel_seconds) / line[1])
             # Without virtual lights, small passes are as good as large ones
             if self._known and filling < (LEAST_GAIN * size if self._lit else least):
                 return 0
@@ -214,7 +216,7 @@ class PassSizes:
             each = max((longest - self._starts[large]) / large, LEAST_SHARE * longest / large)
             # Some passes learn for all passes of their size. Larger passes than the first one may have virtual lights
             start = min(self._starts[size] for size in (self._known.keys() & self._starts.keys()) or self._starts)
-            return start, each if self._known or self._lit else LIT * each
+            return start, each if self._known or self._lit else self._lit_cost * each
         small = min((size for size in self._known if MOST_GROWTH * size >= large), default=0)
         if small == large:
             return None

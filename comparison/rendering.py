@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from vpl.core.compilation import compilation_measured
 from vpl.core.garbage import garbage_kept
 from vpl.core.stages import Stage
 from vpl.split.pixel_rays import HALF, MULTIPLE
@@ -44,12 +45,14 @@ def largest_pass(pixels, in_parts=False):
 
 @dataclass
 class Pass:
-    """A finished pass: seed, samples per pixel, wall-clock seconds, and counters of the integrator."""
+    """A finished pass: seed, samples per pixel, wall-clock seconds, counters of the integrator, and the seconds of
+    compilation."""
 
     seed: int
     spp: int
     seconds: float
     statistics: dict = field(default_factory=dict)
+    compile_seconds: float = 0.0
 
     @property
     def weight(self):
@@ -70,9 +73,9 @@ class Pass:
 
     @property
     def repeated_seconds(self):
-        """Seconds without the pilot, if later passes share it."""
+        """Seconds without compilation, and without the pilot if later passes share it."""
         made = self.statistics.get("pilots", 0)
-        return self.seconds - (self.statistics["seconds"][Stage.PILOT] if made else 0.0)
+        return self.seconds - self.compile_seconds - (self.statistics["seconds"][Stage.PILOT] if made else 0.0)
 
     @property
     def start_seconds(self):
@@ -104,7 +107,8 @@ def render_pass(scene, sensor, integrator, spp, seed, first=None, shared=None, d
     """
     sensor, begin = scene.sensors()[sensor], time.perf_counter()
     shared = shared or SharedStart()
-    with _sharing(scene, sensor, integrator, (spp, seed), first or (spp, seed), shared, density, half):
+    sharing = _sharing(scene, sensor, integrator, (spp, seed), first or (spp, seed), shared, density, half)
+    with compilation_measured() as compilation, sharing:
         spp = _render(scene, sensor, integrator, spp, seed)
     seconds = time.perf_counter() - begin
     # The film, as the image of `mi.render` lacks names, and channels of nested integrators
@@ -112,7 +116,7 @@ def render_pass(scene, sensor, integrator, spp, seed, first=None, shared=None, d
     channels = [entry.name for entry in bitmap.struct_()]
     planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
     statistics = dict(getattr(integrator, "statistics", None) or {})
-    taken = Pass(seed, spp, seconds, statistics)
+    taken = Pass(seed, spp, seconds, statistics, compilation.seconds)
     if not half:
         return PassImage(planes, channels, taken)
     rest = [index for index, name in enumerate(channels) if not name.startswith(HALF)]

@@ -10,6 +10,7 @@
 - ``morton``: codes and orders along a Morton curve
 - ``cones``: axes of direction cones, rounding of cone cosines
 - ``clock``: seconds of a render by stage
+- ``compilation``: seconds that Dr.Jit compiles kernels
 - ``stages``: names of the stages of a render, keys of its timings
 - ``parameters``: parameters of scene objects, read without ``mitsuba.traverse``
 - ``meshes``: triangles of meshes, by the names that Mitsuba gives them

@@ -6,6 +6,7 @@ from time import perf_counter
 
 import drjit as dr
 
+from .compilation import compiled_since_last
 from .stages import Stage, tell
 
 
@@ -13,7 +14,8 @@ class Clock:
     """Seconds by stage; the first stage begins at once.
 
     A stage ends when the next one begins or the clock is stopped, and the device has finished.  A listener
-    (:func:`vpl.core.stages.listening`) is told of each stage.
+    (:func:`vpl.core.stages.listening`) is told of each stage.  Within
+    :func:`vpl.core.compilation.compilation_measured`, the compilation of kernels is a stage of its own.
     """
 
     def __init__(self, stage: Stage):
@@ -31,7 +33,8 @@ class Clock:
         """End the current stage."""
         if self._stage is not None:
             dr.sync_thread()
-            self.add({self._stage: perf_counter() - self._start})
+            spent, compiled = perf_counter() - self._start, compiled_since_last()
+            self.add({self._stage: spent - compiled} | ({Stage.COMPILE: compiled} if compiled else {}))
             self._stage = None
 
     def add(self, seconds: dict[str, float]) -> None:

@@ -7,16 +7,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from time import perf_counter
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import NO_LIMIT, channel_mean, download, finite_or_zero, spectrum_to_rgb, upload
+from ..core.clock import Clock
 from ..core.cones import COSINE_ROUNDING
 from ..core.sampling import Choice, derived_seed, find_interval, independent_sampler, running_sums, stratified
-from ..core.stages import Stage, tell
+from ..core.stages import Stage
 from .emission import bounding_sphere
 from .emitters import Emitters
 from .focus import Focus, spacing
@@ -221,8 +221,7 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, places: np.
     For ``max_depth`` up to 2 no paths are traced, because light cannot bounce.  ``places``: some visible points, (n, 3)
     world units.
     """
-    tell(Stage.TRACE)
-    start = perf_counter()
+    clock = Clock(Stage.TRACE)
     found, traced = [], None
     if options.direct != "none" and options.max_depth >= 2:
         found += [emitters.points, emitters.spots, emitters.directional]
@@ -233,10 +232,7 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, places: np.
         focus = Focus.of(places, bounding_sphere(scene))
         traced = trace_lights(scene, emitters, options.vpl_count, derived_seed(seed, 21), settings, focus)
         found.append(traced.lights)
-    seconds = {Stage.TRACE: perf_counter() - start}
-
-    tell(Stage.TREE)
-    start = perf_counter()
+    clock.begin(Stage.TREE)
     groups, dropped = [], 0
     for number, kind in enumerate(KINDS):
         of_kind = [lights for lights in found if lights.kind == kind]
@@ -247,10 +243,10 @@ def prepare_lights(scene, emitters: Emitters, options: LightOptions, places: np.
         if lights.count:
             tree = light_tree(lights, derived_seed(seed, 22, number)) if options.trees else None
             groups.append(LightGroup(kind, DeviceLights(lights), tree))
-    seconds[Stage.TREE] = perf_counter() - start
+    clock.stop()
     clamp = options.clamping * _spacing(found, traced, places)
     paths = traced.paths if traced else 0
-    return LightSet(groups, clamp, options.max_depth, paths, dropped + (traced.dropped if traced else 0), seconds)
+    return LightSet(groups, clamp, options.max_depth, paths, dropped + (traced.dropped if traced else 0), clock.seconds)
 
 
 def _spacing(found: list[VirtualLights], traced: TracedLights | None, places: np.ndarray) -> float:

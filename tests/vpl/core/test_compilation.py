@@ -1,0 +1,73 @@
+"""The time of compilation: measured apart from the stages of a render, and only on request."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from comparison import rendering
+from tests.support.scenes import cornell
+from vpl.core.clock import Clock
+from vpl.core.compilation import compilation_measured
+from vpl.core.stages import Stage
+
+
+def launch(number):
+    """Launch a kernel with a constant of its own."""
+    value = dr.opaque(mi.Float, 2.0, 100)
+    for power in range(50):
+        value = dr.sin(value * mi.Float(number + power)) + value
+    dr.eval(value)
+
+
+@pytest.fixture
+def number(variant):
+    """A constant that no kernel in the cache has."""
+    return np.random.default_rng().random()
+
+
+def test_a_kernel_is_compiled_once(number):
+    with compilation_measured() as first:
+        launch(number)
+    with compilation_measured() as again:
+        launch(number)
+    assert 0.001 < first.seconds < 10 and again.seconds == 0.0
+
+
+def test_a_clock_tells_compilation_apart_from_the_stage(number):
+    with compilation_measured() as compilation:
+        clock = Clock(Stage.TRACED)
+        launch(number)
+        clock.begin(Stage.CUTS)
+        launch(number)
+        clock.stop()
+    assert clock.seconds[Stage.COMPILE] == compilation.seconds > 0 and clock.seconds[Stage.TRACED] > 0
+    assert list(clock.seconds) == [Stage.TRACED, Stage.COMPILE, Stage.CUTS]
+    clock = Clock(Stage.TRACED)
+    launch(number + 1)
+    clock.stop()
+    assert list(clock.seconds) == [Stage.TRACED]
+
+
+def test_the_history_of_a_caller_is_left_alone(number):
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        with compilation_measured() as compilation:
+            launch(number)
+        assert compilation.seconds == 0.0
+        assert sum(not kernel.get("cache_hit", True) for kernel in dr.kernel_history()) == 1
+    assert not dr.flag(dr.JitFlag.KernelHistory)
+
+
+def test_an_exception_ends_the_measurement(number):
+    with pytest.raises(RuntimeError, match="stop"), compilation_measured():
+        raise RuntimeError("stop")
+    assert not dr.flag(dr.JitFlag.KernelHistory) and dr.kernel_history() == []
+
+
+@pytest.mark.parametrize("integrator", ["path", "manylights"])
+def test_passes_tell_their_compilation(integrator, number):
+    scene, plugin = cornell(16).load(), mi.load_dict({"type": integrator, "max_depth": 3})
+    first, second = (rendering.render_pass(scene, 0, plugin, 4, seed).taken for seed in (0, 1))
+    assert 0 <= first.compile_seconds < first.seconds and second.compile_seconds == 0
+    assert second.repeated_seconds <= second.seconds
