@@ -18,8 +18,7 @@ requires a second pass of equal size; so does growth that risks twice the time, 
 Passes in parts report the time of their start, so that one pass tells the cost of any size, and sizes from the second
 pass on may be any number: `manylights` needs a single further kernel for them. A second pass may have virtual lights
 where the small first pass has none, and cost more: it is planned for half of the remaining time, or less if it
-determines samples. The pass after a second one that determines samples has kernels of its own: it is expected to
-compile as long as the first pass.
+determines samples.
 """
 
 import math
@@ -68,7 +67,6 @@ class PassSizes:
         self._starts = {}  # size -> seconds to start the last pass, of passes that report them
         self._lit, self._lit_cost = False, LIT  # whether a pass had virtual lights; their cost, at most
         self._before = None  # number of passes from a checkpoint; None until the first call
-        self._kernel_seconds = KERNEL_SECONDS  # expected compilation of the next pass
 
     def next(self, passes, elapsed):
         """Return the samples per pixel of the pass after `passes` (list of `Pass`) and `elapsed` seconds, or the limit
@@ -79,7 +77,6 @@ class PassSizes:
             self._asked = passes[-1].spp if passes else None
         if passes:
             self._learn(passes[-1], done, is_first=len(passes) == self._before + 1)
-            self._kernel_seconds = max(passes[0].compile_seconds, KERNEL_SECONDS) if self.is_probe else KERNEL_SECONDS
         if self._spp is not None and done >= self._spp:
             return "spp"
         self.is_probe = self._probes and len(passes) == 1
@@ -162,7 +159,7 @@ class PassSizes:
         elif self._any_size and not self._known and not self._lit:
             left *= DOUBT
         if self._any_size and line:
-            filling = int((left - line[0] - self._kernel_seconds) / line[1])
+            filling = int((left - line[0] - KERNEL_SECONDS) / line[1])
             # Without virtual lights, small passes are as good as large ones
             if self._known and filling < (LEAST_GAIN * size if self._lit else least):
                 return 0

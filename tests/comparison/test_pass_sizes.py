@@ -231,19 +231,6 @@ def test_compilation_that_is_measured_does_not_count(in_parts):
     assert found[0] == found[1] > 4
 
 
-@pytest.mark.parametrize("compilation", [0.0, 3.0])
-def test_the_pass_after_a_probe_is_expected_to_compile_as_long_as_the_first_one(compilation):
-    """The second pass compiles nothing, the third one its own kernels."""
-    sizes, passes, elapsed = PassSizes(SQUARE // 2, time=20, in_parts=True, probes=True), [], 0.0
-    while not isinstance(spp := sizes.next(passes, elapsed), str):
-        compiled = compilation if len(passes) in (0, 2) else 0.0
-        seconds = {Stage.TRACED: 0.05 * spp, Stage.CUTS: 0.0}
-        passes.append(Pass(0, spp, 0.1 + 0.05 * spp + compiled, {"seconds": seconds}, compiled))
-        elapsed += passes[-1].seconds
-        assert sizes.is_probe == (len(passes) == 2)
-    assert 19 < elapsed < 20.2 and passes[2].spp > 100
-
-
 @pytest.mark.parametrize("in_parts", [False, True])
 def test_a_pass_of_a_given_size_begins_if_half_of_it_fits(in_parts):
     for time, size in ((8, 8), (6, "time")):

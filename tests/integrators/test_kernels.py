@@ -5,9 +5,11 @@ import gc
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 
 import integrators
+from comparison import rendering
 from tests.support.marks import stress
 from tests.support.rendering import plugin_with_model
 from tests.support.scenes import area_light, closed_box
@@ -146,4 +148,24 @@ def test_sites_and_lights_find_irradiance_by_one_kernel(monkeypatch, lights_cost
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         mi.render(scene, integrator=mi.load_dict({"type": "manylights", "max_depth": 4}), spp=64).numpy()
     assert len(launched) == 2
+    assert len(set(launched)) == 1
+
+
+@pytest.mark.parametrize("lit", [False, True])
+def test_pixels_with_different_numbers_of_samples_use_the_kernel_of_equal_numbers(lit):
+    scene = mi.load_dict(closed_box({"lamp": area_light()}))
+    film = scene.sensors()[0].film()
+    film_shape, launched = tuple(film.crop_size())[::-1], []
+    density = np.where(np.arange(np.prod(film_shape)) % 2, 2.0, 0.5).reshape(film_shape)
+    with (
+        plugin_with_model(pays_below=1e30 if lit else 0.0),
+        dr.scoped_set_flag(dr.JitFlag.KernelHistory, True),
+    ):
+        plugin = mi.load_dict({"type": "manylights", "max_depth": 4, "denoised": True})
+        for numbers in (None, density, density * np.linspace(1, 3, film_shape[1])):
+            dr.kernel_history_clear()
+            taken = rendering.render_pass(scene, 0, plugin, 8, 0, density=numbers).taken
+            assert taken.has_lights == lit
+            history = [one for one in dr.kernel_history() if one["type"] == dr.KernelType.JIT]
+            launched.append(max(history, key=lambda one: one["operation_count"])["hash"])
     assert len(set(launched)) == 1

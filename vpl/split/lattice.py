@@ -84,7 +84,8 @@ class Lattice:
         multipliers = [1] * len(sizes), [lattice_multiplier(size) for size in sizes]
         steps = ([round(g * 2**32 / size) % 2**32 for g, size in zip(row, sizes, strict=True)] for row in multipliers)
         self._samples, self._begin, self._rows, *self._steps = (
-            dr.gather(mi.UInt32, upload(mi.UInt32, np.array(values)), places.level)
+            # Two entries at least: Dr.Jit makes a table of one a constant, which would take another kernel
+            dr.gather(mi.UInt32, upload(mi.UInt32, np.resize(list(values), max(len(sizes), 2))), places.level)
             for values in (sizes, begins, rows, *steps)
         )
 
