@@ -1,10 +1,9 @@
 """Albedo, normal and depth of the first surfaces that are neither mirror nor glass.
 
 They guide the denoiser, and are layers of images on request. They have twice the samples of the image, but at least 16
-and at most 144 per pixel; if time is limited, 16 and up to 144 more in 6% of the limit.
+and at most 128 per pixel; if time is limited, 16 and up to 128 more in 6% of the limit.
 """
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,9 +16,13 @@ import numpy as np
 from vpl.core.garbage import garbage_kept
 from vpl.core.sampling import derived_seed, independent_sampler
 
-# Fewest and most samples per pixel: squares, to which some of Mitsuba's samplers round
-FEATURE_SPP = 16, 144  # 144 instead of 16: denoised error 4, 6 and 10% less in images of 4, 16, 64 (decisions.md)
-FEATURE_WAVEFRONT = 1 << 22  # most samples of an image rendered at once, some 400 MB, or the fewest per pixel
+# Fewest and most samples per pixel. 144 instead of 16: denoised error 4, 6 and 10% less in images of 4, 16 and 64
+# samples (decisions.md)
+FEATURE_SPP = 16, 128
+# Samples per pixel of a render: squares, to which some of Mitsuba's samplers round, and powers of two, which share a
+# kernel that compiles for 0.6 s in kitchen
+AT_ONCE = 64, 16
+FEATURE_WAVEFRONT = 1 << 22  # most samples of an image rendered at once, some 400 MB, or the least of `AT_ONCE`
 # A sample of a path takes 20 to 25 times as long. Features and image gain equally by more time if the features have
 # about twice the samples of the image (decisions.md), which take a tenth of its time with the first ones
 PER_SAMPLE = 2
@@ -66,17 +69,15 @@ def features_of(scene, sensor, seed=0, spp=None, time_limit=None):
     fewest, most = FEATURE_SPP
     wanted = most if spp is None else min(max(PER_SAMPLE * spp, fewest), most)
     if time_limit is None:
-        return auxiliary_features(scene, sensor, math.isqrt(wanted) ** 2, seed)
+        return auxiliary_features(scene, sensor, wanted, seed)
     # The first samples tell the time of the others; compilation counts, because people wait for it
     begin = time.perf_counter()
     first = auxiliary_features(scene, sensor, fewest, seed)
     spent = time.perf_counter() - begin
-    # Mitsuba's stratified samplers round to squares
     possible = min(FEATURE_SHARE * time_limit / spent * fewest, most if spp is None else wanted - fewest)
     if possible < fewest:
         return first
-    more = auxiliary_features(scene, sensor, math.isqrt(int(possible)) ** 2, derived_seed(seed, 1))
-    return _mean_of([first, more])
+    return _mean_of([first, auxiliary_features(scene, sensor, int(possible), derived_seed(seed, 1))])
 
 
 def _mean_of(renders):
@@ -87,17 +88,18 @@ def _mean_of(renders):
 
 def auxiliary_features(scene, sensor, spp, seed):
     """Render "albedo", "normal" and "depth", a dict of (height, width, channels) float32, of the first surfaces that
-    are neither mirror nor glass, with the film's filter and at least `spp` samples per pixel; `sensor` is a
-    `mi.Sensor`. The samples are stratified if the sensor's sampler is `independent`. Return the dict and the samples
-    per pixel, which are more only in large images.
+    are neither mirror nor glass, with the film's filter and about `spp` samples per pixel; `sensor` is a `mi.Sensor`.
+    The samples are stratified if the sensor's sampler is `independent`. Return the dict and the samples per pixel: a
+    multiple of one of `AT_ONCE`, up to `spp` if that is 16 or more.
 
     Albedo, 0 to 1: directional albedo, estimated by one BSDF sample, times the throughput of mirrors and glass before
     the surface, plus emission. Normal: shading normal in world space, turned towards the viewer. Depth: length of the
     path from the near clipping distance of the camera, world units, as in Mitsuba's `aov`. All are 0 in empty
     directions.
     """
-    fewest, pixels = FEATURE_SPP[0], int(np.prod(sensor.film().crop_size()))
-    each, parts = (spp, 1) if spp * pixels <= FEATURE_WAVEFRONT else (fewest, math.ceil(spp / fewest))
+    pixels = int(np.prod(sensor.film().crop_size()))
+    each = next((size for size in AT_ONCE if size <= spp and size * pixels <= FEATURE_WAVEFRONT), AT_ONCE[-1])
+    parts = max(spp // each, 1)
     return _mean_of([(_rendered(scene, sensor, each, (seed, part)), each) for part in range(parts)])
 
 

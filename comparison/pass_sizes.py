@@ -18,7 +18,7 @@ requires a second pass of equal size; so does growth that risks twice the time, 
 Passes in parts report the time of their start, so that one pass tells the cost of any size, and sizes from the second
 pass on may be any number: `manylights` needs a single further kernel for them. A second pass may have virtual lights
 where the small first pass has none, and cost more: it is planned for half of the remaining time, or less if it
-determines samples.
+determines samples, or for all of it up to the size for which the first pass predicts the cost.
 """
 
 import math
@@ -37,7 +37,7 @@ DOUBT = 0.5  # fraction of the remaining time for a second pass, which may have 
 PROBE = 0.25  # fraction of the remaining time, or samples, for a second pass that determines the samples of the pixels
 LONGEST = 2.0  # times the wanted seconds: longer passes shrink
 CHANGED = 1.5  # ratio of the times of two passes of equal size at which earlier times are discarded
-MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of a prediction from one size for another
+MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of predictions, also that of `Pass.growth`
 USUAL = 4  # samples per pixel; all powers of two from here have the same kernels
 FIRST_SAMPLES = 2**19  # maximum pixel samples of a first pass, unless one per pixel is more
 KERNEL_SECONDS = 0.1  # to compile the kernel of the first size that is no power of two
@@ -66,6 +66,7 @@ class PassSizes:
         self._known = {}  # size -> seconds of the last pass; not of the first pass, which is slower
         self._starts = {}  # size -> seconds to start the last pass, of passes that report them
         self._lit, self._lit_cost = False, LIT  # whether a pass had virtual lights; their cost, at most
+        self._growth_of = 0  # size of the pass whose cost was predicted by the last pass
         self._before = None  # number of passes from a checkpoint; None until the first call
 
     def next(self, passes, elapsed):
@@ -114,6 +115,7 @@ class PassSizes:
             self._starts[self._asked] = last.start_seconds
             self._lit |= last.has_lights
             if last.growth is not None:
+                self._growth_of = MOST_GROWTH * self._asked
                 self._lit_cost = UNSURE * last.growth if last.growth > 1 else 1.0
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
         if not is_first:
@@ -153,13 +155,13 @@ class PassSizes:
         pass in parts would be far smaller than usual.
         """
         least = size if self._fixed else min(size, self._least)
-        line, whole = self._line(), left
+        line, whole, predicted = self._line(), left, 0
         if self.is_probe:
             left = PROBE * min(left, PART_SECONDS)
         elif self._any_size and not self._known and not self._lit:
-            left *= DOUBT
+            predicted, left = self._growth_of, DOUBT * left
         if self._any_size and line:
-            filling = int((left - line[0] - KERNEL_SECONDS) / line[1])
+            filling = max(_filling(left, *line), min(_filling(whole, *line), predicted))
             # Without virtual lights, small passes are as good as large ones
             if self._known and filling < (LEAST_GAIN * size if self._lit else least):
                 return 0
@@ -220,6 +222,11 @@ class PassSizes:
         each = (longest - self._known[small]) / (large - small)
         each = min(max(each, LEAST_SHARE * longest / large), longest / large)
         return longest - each * large, each
+
+
+def _filling(seconds, start, each):
+    """Return the size of a pass of some `seconds`, from its start and the seconds per sample."""
+    return int((seconds - start - KERNEL_SECONDS) / each)
 
 
 def _power_of_two(number):

@@ -158,12 +158,12 @@ def test_without_the_package_the_message_says_what_to_install(tmp_path, monkeypa
     assert command("-o", tmp_path / "a.exr") == 0  # nothing else needs it
 
 
-@pytest.mark.parametrize(("spp", "samples"), [(1, 16), (13, 25), (40, 64), (1000, 144), (None, 144)])
+@pytest.mark.parametrize(("spp", "samples"), [(1, 16), (13, 16), (20, 32), (40, 64), (1000, 128), (None, 128)])
 def test_albedo_and_normal_have_twice_the_samples_of_the_image_within_limits(spp, samples):
     assert Denoiser(cornell(16).load(), spp=spp).feature_spp == samples
 
 
-@pytest.mark.parametrize(("time_limit", "samples"), [(1e-3, 16), (1e6, 160)])
+@pytest.mark.parametrize(("time_limit", "samples"), [(1e-3, 16), (1e6, 144)])
 def test_albedo_and_normal_take_a_small_part_of_a_time_limit(time_limit, samples):
     assert Denoiser(cornell(16).load(), time_limit=time_limit).feature_spp == samples
 

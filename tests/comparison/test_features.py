@@ -102,7 +102,7 @@ def test_features_of_more_samples_are_those_of_fewer_with_less_noise(monkeypatch
     timed, count = features.features_of(scene, sensor, 0, None, 1e6)
     monkeypatch.setattr(features, "FEATURE_WAVEFRONT", 1)
     in_parts, of_parts = features.auxiliary_features(scene, sensor, 50, 0)
-    assert (count, of_parts) == (160, 64)
+    assert (count, of_parts) == (144, 48)
     for name, plane in exact.items():
         first, *others = (np.square(found[name] - plane).mean() for found in (few, timed, in_parts))
         assert max(others) < 0.5 * first < 0.05
