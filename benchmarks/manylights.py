@@ -12,11 +12,8 @@ in ``product`` also ``manylights``.
   product is proportional to the time for a given error.  Bias: excess of the mean over that of ``path``, with its
   standard error.  Plain: the ratio of the variances of all pixels.  Sets: spread of the mean of the image between
   passes, each of which has its own light set.
-- ``denoised``: error of ``--passes`` denoised images against the reference, without the noise of the reference, and
-  the time of ``path`` for equal error, with the sampler ``independent`` and with the better sampler.
-  ``manylights.render`` ends the images of ``manylights`` after ``--seconds``, with their pilots and first passes; those
-  of ``path`` are single passes, which stratify best, with the same denoiser.  Times include albedo, normal and
-  denoiser.  Kernels are compiled before.
+- ``denoised``: error of ``--passes`` denoised images, and the time of ``path`` for equal error, see
+  :mod:`benchmarks.denoised`.  Without ``--scenes``, of the scenes with a reference.
 - ``timed``: variance × time of ``--passes`` images that ``manylights.render`` ends after ``--seconds``, with their
   pilots and first passes.  ``path`` uses its better sampler, ``manylights`` its own stratified samples.  Kernels are
   compiled before.
@@ -44,8 +41,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
-from benchmarks import noise_classes, results, sample_cost, scenes  # noqa: E402
-from benchmarks.rivals import DEPTH, KINDS, SAMPLERS, TRIMMED, Rival, Timed, load, measure_in_turn  # noqa: E402
+from benchmarks import denoised, noise_classes, results, sample_cost, scenes  # noqa: E402
+from benchmarks.rivals import DEPTH, KINDS, SAMPLERS, Rival, Timed, load, measure_in_turn  # noqa: E402
 from benchmarks.views import move_cameras  # noqa: E402
 
 NAMES = (*scenes.NAMES, "classroom", "hall")
@@ -71,23 +68,10 @@ print(time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_m
 """
 
 
-def reference_of(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """The reference of a scene, 256 pixels wide, and its standard error."""
-    bitmap = mi.Bitmap(str(scenes.reference_file(name)))
-    names, values = [field.name for field in bitmap.struct_()], np.array(bitmap, np.float64)
-    truth, noise = ([names.index(prefix + channel) for channel in "RGB"] for prefix in ("", "se."))
-    return values[..., truth], values[..., noise]
-
-
 def scale_of(name: str, images: list, width: int, view: int = 0) -> np.ndarray:
     """What squared errors are relative to."""
-    known = scenes.reference_file(name) and width == 256 and not view
-    return scale_of_truth(reference_of(name)[0] if known else np.mean(images, axis=0))
-
-
-def scale_of_truth(truth: np.ndarray) -> np.ndarray:
-    """Denominator of relative squared errors."""
-    return truth**2 + 0.01 * truth.mean() ** 2
+    known = None if view else scenes.reference_at(name, width)
+    return scenes.scale_of_truth(known[0] if known else np.mean(images, axis=0))
 
 
 def product(names, width: int, seconds: float, passes: int, views: int) -> dict:
@@ -171,62 +155,19 @@ def timed(names, width: int, seconds: float, passes: int) -> dict:
     return rows
 
 
-def denoised(names, width: int, seconds: float, passes: int) -> dict:
-    """Print the denoised error, and the time that ``path`` takes for the denoised error of ``manylights``."""
-    print(f"denoised, {width} wide, images of {seconds:g} s: error, samples; time of `path` for equal error over that")
-    print("of manylights, with the sampler `independent` and with the better sampler")
-    rows = {}
-    for name in names:
-        if scenes.reference_file(name) is None:
-            print(f"skipped {name}: it has no reference")
-            continue
-        rows[name] = denoised_of(name, width, seconds, passes)
+def with_references() -> list[str]:
+    """The names of scenes with a reference; prints the others."""
+    missing = [name for name in scenes.available(NAMES) if scenes.reference_file(name) is None]
+    print(f"skipped without a reference: {', '.join(missing) or 'none'}")
+    return [name for name in scenes.available(NAMES) if name not in missing]
+
+
+def denoised_part(names, width: int, seconds: float, passes: int) -> dict:
+    """Print the denoised errors, and the time of ``path`` for those of ``manylights`` over their time."""
+    rows = denoised.denoised(names, width, seconds, passes)
     print_mean(rows)
     print_mean(rows, "independent_speedup", "with the sampler independent: ")
     return rows
-
-
-def denoised_of(name: str, width: int, seconds: float, passes: int) -> dict:
-    """Print the denoised errors of a scene, and the relative times of ``path`` for equal error; returns the row."""
-    from comparison.denoising import Denoiser
-
-    scene = load(name, width)
-    # The first denoiser compiles
-    denoiser = [Denoiser(scene, time_limit=seconds) for _ in range(2)][-1]
-    fixed = denoiser.seconds + denoiser.filter_seconds
-    rivals = [Rival(name, scene, "path", sampler, width, seconds - fixed) for sampler in SAMPLERS]
-    # manylights stratifies the samples of this sampler
-    rivals.append(Timed(scene, "manylights", "independent", seconds, denoise=True, denoised=True))
-    measure_in_turn(rivals, passes)
-    reference = reference_of(name)
-    clean = [[denoiser.denoise(image, ["R", "G", "B"]) for image in rival.images] for rival in rivals[:-1]]
-    errors = [denoised_error(images, *reference) for images in (*clean, rivals[-1].images)]
-    times = [float(np.median(rival.seconds)) for rival in rivals]
-    points = list(zip(errors, [*(spent + fixed for spent in times[:-1]), times[-1]], strict=True))
-    *theirs, (ours, our_time) = points
-    # Denoised errors fall by 1.37 where samples double; the denoiser works once
-    ratios = [
-        ((spent - fixed) * (max(error, 1e-9) / max(ours, 1e-9)) ** (np.log(2) / np.log(1.37)) + fixed) / our_time
-        for error, spent in theirs
-    ]
-    columns = "".join(
-        f"  {rival.kind} ({rival.sampler[:5]}) {error:.5f} ({rival.spp}, {spent:.2f} s)"
-        for rival, (error, spent) in zip(rivals, points, strict=True)
-    )
-    print(f"{name:16s}{columns}  {ratios[0]:7.2f} {min(ratios):7.2f}", flush=True)
-    best = theirs[int(np.argmin(ratios))]
-    row = {
-        kind: {"relmse": error, "seconds": spent}
-        for kind, (error, spent) in zip(KINDS, (best, points[-1]), strict=True)
-    }
-    return row | {"independent_speedup": float(ratios[0]), "speedup": float(min(ratios))}
-
-
-def denoised_error(images: list, truth: np.ndarray, noise: np.ndarray) -> float:
-    """Trimmed relative squared error of denoised images without the noise of the reference."""
-    scale = scale_of_truth(truth)
-    error = np.mean([((image - truth) ** 2 - noise**2) / scale for image in images], axis=0).mean(-1)
-    return float(np.sort(error.ravel())[int(TRIMMED * error.size) : int((1 - TRIMMED) * error.size)].mean())
 
 
 def lights(names, width: int, seconds: float, passes: int) -> dict:
@@ -296,7 +237,7 @@ def main() -> None:
     parts = {
         "product": lambda: product(names, width, seconds, passes, options.views),
         "timed": lambda: timed(names, width, seconds, passes),
-        "denoised": lambda: denoised(names, 256, seconds, passes),
+        "denoised": lambda: denoised_part(options.scenes or with_references(), width, seconds, passes),
         "cost": lambda: sample_cost.cost(names, width, passes),
         "classes": lambda: noise_classes.classes(names, width, passes),
         "lights": lambda: lights(names, width, seconds, passes),

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 PROJECT = Path(__file__).resolve().parent.parent
 SHARED = PROJECT.parent / "shared"
-REFERENCES = SHARED / "references"
+REFERENCES, REFERENCE_WIDTH = SHARED / "references", 256
 NAMES = (
     "cornell", "kitchen", "sponza_crytek", "staircase2", "living_room", "dining_room", "bistro_interior",
     "veach_ajar", "everything8003",
@@ -38,6 +39,22 @@ def reference_file(name: str) -> Path | None:
     """Path-traced reference of a scene at a width of 256, None if absent."""
     path = REFERENCES / f"{name}.exr"
     return path if path.exists() else None
+
+
+def reference_at(name: str, width: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """The reference of a scene and its standard error, (height, width, 3), None without one of this ``width``."""
+    file = reference_file(name)
+    if file is None or width != REFERENCE_WIDTH:
+        return None
+    bitmap = mi.Bitmap(str(file))
+    names, values = [field.name for field in bitmap.struct_()], np.array(bitmap, np.float64)
+    truth, noise = ([names.index(prefix + channel) for channel in "RGB"] for prefix in ("", "se."))
+    return values[..., truth], values[..., noise]
+
+
+def scale_of_truth(truth: np.ndarray) -> np.ndarray:
+    """Denominator of relative squared errors."""
+    return truth**2 + 0.01 * truth.mean() ** 2
 
 
 def height(name: str, width: int) -> int:

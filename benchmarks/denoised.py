@@ -1,0 +1,96 @@
+"""Denoised error of ``manylights`` and of ``path``, and the time that ``path`` takes for that of ``manylights``.
+
+``manylights.render`` ends the images of ``manylights`` by time, with their pilots and first passes; those of ``path``
+are single passes, which stratify best, with the same denoiser.  Times include albedo, normal and denoiser.  Kernels are
+compiled before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks import scenes
+from benchmarks.rivals import KINDS, SAMPLERS, TRIMMED, Rival, Timed, load, measure_in_turn
+from comparison.denoising import Denoiser
+
+# Denoised errors fall by this factor where samples double: measured with ``path`` in the scenes with references
+FALL = 1.37
+# Seconds of each of the two renders of a reference, over those of an image
+REFERENCE_TIMES = 3
+# Seeds of these renders, in units of the benchmark's seeds
+REFERENCE_SEEDS = 1, 2
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Two estimates of the exact image, (height, width, 3): with independent noise, so that the product of the
+    deviations from both is the squared error in the mean; or a single one twice, with its standard error ``noise``."""
+
+    first: np.ndarray
+    second: np.ndarray
+    noise: np.ndarray | float = 0.0
+
+    @classmethod
+    def of(cls, name: str, scene, seconds: float, width: int) -> Truth:
+        """The reference of a scene, or without one for this ``width``, two renders by ``manylights`` of at least
+        ``seconds`` each."""
+        known = scenes.reference_at(name, width)
+        if known:
+            truth, noise = known
+            return cls(truth, truth, noise)
+        rendered = Timed(scene, "manylights", "independent", REFERENCE_TIMES * seconds)
+        return cls(*(rendered.render(seed)[0] for seed in REFERENCE_SEEDS))
+
+    @property
+    def scale(self) -> np.ndarray:
+        """Denominator of relative squared errors."""
+        return scenes.scale_of_truth(0.5 * (self.first + self.second))
+
+    def error(self, images: list) -> float:
+        """Relative squared error of images, without the pixels of the least and the largest ones."""
+        squares = [(image - self.first) * (image - self.second) - self.noise**2 for image in images]
+        error = np.sort((np.mean(squares, axis=0) / self.scale).mean(-1).ravel())
+        return float(error[int(TRIMMED * error.size) : int((1 - TRIMMED) * error.size)].mean())
+
+
+def denoised(names, width: int, seconds: float, passes: int) -> dict:
+    """Print the rows of all scenes; returns them by name."""
+    print(f"denoised, {width} wide, images of {seconds:g} s: error, samples; time of `path` for equal error over that")
+    print("of manylights, with the sampler `independent` and with the better sampler")
+    return {name: denoised_of(name, width, seconds, passes) for name in names}
+
+
+def denoised_of(name: str, width: int, seconds: float, passes: int) -> dict:
+    """Print the denoised errors of a scene, and the relative times of ``path`` for equal error; returns the row."""
+    scene = load(name, width)
+    # The first denoiser compiles
+    denoiser = [Denoiser(scene, time_limit=seconds) for _ in range(2)][-1]
+    fixed = denoiser.seconds + denoiser.filter_seconds
+    rivals = [Rival(name, scene, "path", sampler, width, seconds - fixed) for sampler in SAMPLERS]
+    # manylights stratifies the samples of this sampler
+    rivals.append(Timed(scene, "manylights", "independent", seconds, denoise=True, denoised=True))
+    measure_in_turn(rivals, passes)
+    truth = Truth.of(name, scene, seconds, width)
+    clean = [[denoiser.denoise(image, ["R", "G", "B"]) for image in rival.images] for rival in rivals[:-1]]
+    errors = [truth.error(images) for images in (*clean, rivals[-1].images)]
+    times = [float(np.median(rival.seconds)) for rival in rivals]
+    points = list(zip(errors, [*(spent + fixed for spent in times[:-1]), times[-1]], strict=True))
+    *theirs, (ours, our_time) = points
+    # The denoiser works once
+    ratios = [
+        ((spent - fixed) * (max(error, 1e-9) / max(ours, 1e-9)) ** (np.log(2) / np.log(FALL)) + fixed) / our_time
+        for error, spent in theirs
+    ]
+    columns = "".join(
+        f"  {rival.kind} ({rival.sampler[:5]}) {error:.5f} ({rival.spp}, {spent:.2f} s)"
+        for rival, (error, spent) in zip(rivals, points, strict=True)
+    )
+    print(f"{name:16s}{columns}  {ratios[0]:7.2f} {min(ratios):7.2f}", flush=True)
+    best = theirs[int(np.argmin(ratios))]
+    row = {
+        kind: {"relmse": error, "seconds": spent}
+        for kind, (error, spent) in zip(KINDS, (best, points[-1]), strict=True)
+    }
+    return row | {"independent_speedup": float(ratios[0]), "speedup": float(min(ratios))}
