@@ -40,7 +40,7 @@ CHANGED = 1.5  # ratio of the times of two passes of equal size at which earlier
 MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of predictions, also that of `Pass.growth`
 USUAL = 4  # samples per pixel; all powers of two from here have the same kernels
 FIRST_SAMPLES = 2**19  # maximum pixel samples of a first pass, unless one per pixel is more
-KERNEL_SECONDS = 0.1  # to compile the kernel of the first size that is no power of two
+KERNEL_SECONDS = 0.1  # to compile the kernel of the first size that is no power of two, if the first pass compiled any
 LEAST_SHARE = 0.1  # minimum fraction of a pass's time that is assumed proportional to its samples
 PARTS = 8  # with an error limit, a pass has at most this fraction, 1/8, of the samples so far
 
@@ -67,6 +67,7 @@ class PassSizes:
         self._starts = {}  # size -> seconds to start the last pass, of passes that report them
         self._lit, self._lit_cost = False, LIT  # whether a pass had virtual lights; their cost, at most
         self._growth_of = 0  # size of the pass whose cost was predicted by the last pass
+        self._kernel_seconds = 0.0  # expected compilation of the next pass
         self._before = None  # number of passes from a checkpoint; None until the first call
 
     def next(self, passes, elapsed):
@@ -111,6 +112,7 @@ class PassSizes:
     def _learn(self, last, done, is_first):
         """Record the time of the `last` pass, and choose the size of later passes."""
         repeated, seconds = self._asked in self._seconds, last.repeated_seconds
+        self._kernel_seconds = KERNEL_SECONDS if is_first and last.compile_seconds > 0 else 0.0
         if last.start_seconds is not None:
             self._starts[self._asked] = last.start_seconds
             self._lit |= last.has_lights
@@ -161,7 +163,7 @@ class PassSizes:
         elif self._any_size and not self._known and not self._lit:
             predicted, left = self._growth_of, DOUBT * left
         if self._any_size and line:
-            filling = max(_filling(left, *line), min(_filling(whole, *line), predicted))
+            filling = max(self._filling(left, *line), min(self._filling(whole, *line), predicted))
             # Without virtual lights, small passes are as good as large ones
             if self._known and filling < (LEAST_GAIN * size if self._lit else least):
                 return 0
@@ -172,6 +174,10 @@ class PassSizes:
         while size > least and self._expected(size) > left:
             size = max(least, _power_of_two(size - 1))
         return size if self._expected(size) <= max(2 * left, whole) else 0
+
+    def _filling(self, seconds, start, each):
+        """Return the size of a pass of some `seconds`, from its start and the seconds per sample."""
+        return int((seconds - self._kernel_seconds - start) / each)
 
     def _certain(self, size):
         """Return the largest size up to `size` that takes no longer than expected if its pass has virtual lights."""
@@ -222,11 +228,6 @@ class PassSizes:
         each = (longest - self._known[small]) / (large - small)
         each = min(max(each, LEAST_SHARE * longest / large), longest / large)
         return longest - each * large, each
-
-
-def _filling(seconds, start, each):
-    """Return the size of a pass of some `seconds`, from its start and the seconds per sample."""
-    return int((seconds - start - KERNEL_SECONDS) / each)
 
 
 def _power_of_two(number):

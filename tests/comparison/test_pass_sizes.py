@@ -221,7 +221,7 @@ def test_in_parts_the_pilot_of_the_first_pass_is_not_expected_again():
 @pytest.mark.parametrize("in_parts", [False, True])
 def test_compilation_that_is_measured_does_not_count(in_parts):
     found = []
-    for compilation in (0.0, 5.0):
+    for compilation in (0.5, 5.0):
         sizes = PassSizes(SQUARE // 2, time=10 + compilation, in_parts=in_parts)
         statistics = {"seconds": {Stage.TRACED: 0.3, Stage.CUTS: 0.0, Stage.COMPILE: compilation}} if in_parts else {}
         first = Pass(0, sizes.next([], 0.0), 0.4 + compilation, statistics, compilation)
