@@ -41,6 +41,7 @@ MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of predictions,
 USUAL = 4  # samples per pixel; all powers of two from here have the same kernels
 FIRST_SAMPLES = 2**19  # maximum pixel samples of a first pass, unless one per pixel is more
 KERNEL_SECONDS = 0.1  # to compile the kernel of the first size that is no power of two, if the first pass compiled any
+OVERRUN = 0.02  # of a time limit: sizes are not always free, and the cost of a pass is not known better
 LEAST_SHARE = 0.1  # minimum fraction of a pass's time that is assumed proportional to its samples
 PARTS = 8  # with an error limit, a pass has at most this fraction, 1/8, of the samples so far
 
@@ -167,7 +168,7 @@ class PassSizes:
             # Without virtual lights, small passes are as good as large ones
             if self._known and filling < (LEAST_GAIN * size if self._lit else least):
                 return 0
-            certain = self._kept(self._certain(filling))
+            certain = self._nearest(self._certain(filling), line[1])
             # A single last pass, instead of several ever smaller ones
             if least <= certain <= self._largest and filling < (size if self._spp else 2 * size):
                 return certain
@@ -183,6 +184,12 @@ class PassSizes:
         """Return the largest size up to `size` that takes no longer than expected if its pass has virtual lights."""
         known = max(self._known, default=0)
         return int(size if self._lit or not known else min(size, max(known, size / self._lit_cost)))
+
+    def _nearest(self, size, each):
+        """Return the size nearest to `size` that the sampler keeps; larger sizes exceed the time limit by at most a
+        fraction `OVERRUN`, at `each` seconds per sample."""
+        most = size + int(OVERRUN * self._time / each)
+        return min(self._kept(size), self._kept(most), key=lambda kept: abs(kept - size))
 
     def _kept(self, size):
         """Return the largest size up to `size` that the sampler keeps."""
