@@ -155,16 +155,16 @@ def timed(names, width: int, seconds: float, passes: int) -> dict:
     return rows
 
 
-def with_references() -> list[str]:
-    """The names of scenes with a reference; prints the others."""
-    missing = [name for name in scenes.available(NAMES) if scenes.reference_file(name) is None]
+def with_references(names: list[str]) -> list[str]:
+    """The scenes with a reference; prints the others."""
+    missing = [name for name in names if scenes.reference_file(name) is None]
     print(f"skipped without a reference: {', '.join(missing) or 'none'}")
-    return [name for name in scenes.available(NAMES) if name not in missing]
+    return [name for name in names if name not in missing]
 
 
 def denoised_part(names, width: int, seconds: float, passes: int) -> dict:
     """Print the denoised errors, and the time of ``path`` for those of ``manylights`` over their time."""
-    rows = denoised.denoised(names, width, seconds, passes)
+    rows = denoised.compare(names, width, seconds, passes)
     print_mean(rows)
     print_mean(rows, "independent_speedup", "with the sampler independent: ")
     return rows
@@ -237,7 +237,7 @@ def main() -> None:
     parts = {
         "product": lambda: product(names, width, seconds, passes, options.views),
         "timed": lambda: timed(names, width, seconds, passes),
-        "denoised": lambda: denoised_part(options.scenes or with_references(), width, seconds, passes),
+        "denoised": lambda: denoised_part(names if options.scenes else with_references(names), width, seconds, passes),
         "cost": lambda: sample_cost.cost(names, width, passes),
         "classes": lambda: noise_classes.classes(names, width, passes),
         "lights": lambda: lights(names, width, seconds, passes),

@@ -18,9 +18,9 @@ from .images import colour
 from .scene_files import known_parameters
 
 QUALITIES = ("high", "balanced", "fast")  # of Open Image Denoise: networks of three sizes
-# Pixels, width of the image whose denoising is timed, in 0.02 s. A pixel of it takes 1.05 to 1.2 times as long as one
-# of an image of 256 to 1920
-TILE = 64
+# Width of the tile whose denoising is timed, pixels, and least seconds that it takes; smaller tiles are doubled. On two
+# cores a pixel of a tile of 64 takes 1.05 to 1.2 times as long as one of an image of 256 to 1920
+TILE, TILE_SECONDS = 64, 0.015
 
 
 def import_oidn():
@@ -49,8 +49,8 @@ class Denoiser:
 
     `spp`, `time_limit`: samples per pixel and seconds of the image, None if unlimited; they limit the samples of the
     `features`, a dict as of `auxiliary_features`. `feature_spp`: samples per pixel of the features. `seconds`: time
-    spent so far, including the features, which the constructor renders. `filter_seconds`: estimated time of a call of
-    `denoise`, from that of a tile. `quality`: one of `QUALITIES`.
+    spent so far, including the features, which the constructor renders. `expected_seconds`: estimated time of a call
+    of `denoise`. `quality`: one of `QUALITIES`.
     """
 
     def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=QUALITIES[0]):
@@ -60,7 +60,7 @@ class Denoiser:
         self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
         self.features, self.feature_spp = features_of(scene, scene.sensors()[sensor], seed, spp, time_limit)
         self._guides = {name: self.features[name] for name in ("albedo", "normal")}
-        self.filter_seconds = self._expected_seconds()
+        self.expected_seconds = self._expected()
         self.seconds = time.perf_counter() - begin
 
     @property
@@ -82,16 +82,22 @@ class Denoiser:
         self.seconds += time.perf_counter() - begin
         return type(image)(planes) if isinstance(image, mi.TensorXf) else planes
 
-    def _expected_seconds(self):
+    def _expected(self):
         """Return the seconds that denoising an image is expected to take, by the time of a tile of it."""
-        tile = {name: plane[:TILE, :TILE] for name, plane in self._guides.items()}
-        tile, network = {"color": tile["albedo"], **tile}, self._networks[self.quality]
-        # The first call loads the weights of the network
-        self._filtered({name: plane[:1, :1] for name, plane in tile.items()}, network)
+        width, whole = TILE, self._guides["albedo"]
+        while True:
+            tile = {name: plane[:width, :width] for name, plane in self._guides.items()}
+            # The first call loads the weights of the network
+            seconds = min(self._seconds_of({"color": tile["albedo"], **tile}) for _ in range(2))
+            if seconds >= TILE_SECONDS or tile["albedo"].shape == whole.shape:
+                return seconds * whole.size / tile["albedo"].size
+            width *= 2
+
+    def _seconds_of(self, inputs):
+        """Return the seconds that denoising takes."""
         begin = time.perf_counter()
-        self._filtered(tile, network)
-        each = (time.perf_counter() - begin) / tile["color"][..., 0].size
-        return each * self._guides["albedo"][..., 0].size
+        self._filtered(inputs, self._networks[self.quality])
+        return time.perf_counter() - begin
 
     def _filtered(self, inputs, quality):
         """Filter "color" of `inputs` (name -> (height, width, 3) float32), guided by "albedo" and "normal"."""

@@ -1,7 +1,7 @@
 """Albedo, normal and depth of the first surfaces that are neither mirror nor glass.
 
-They guide the denoiser, and are layers of images on request. They have twice the samples of the image, but at least 16
-and at most 128 per pixel; if time is limited, 16 and up to 128 more in 6% of the limit.
+They guide the denoiser, and are layers of images on request. They have about twice the samples of the image, but at
+least 16 and at most 128 per pixel; if time is limited, 16 and up to 128 more in 6% of the limit.
 """
 
 import time
@@ -17,7 +17,7 @@ from vpl.core.garbage import garbage_kept
 from vpl.core.sampling import derived_seed, independent_sampler
 
 # Fewest and most samples per pixel. 144 instead of 16: denoised error 4, 6 and 10% less in images of 4, 16 and 64
-# samples (decisions.md)
+# samples, both without a filter (decisions.md)
 FEATURE_SPP = 16, 128
 # Samples per pixel of a render: squares, to which some of Mitsuba's samplers round, and powers of two, which share a
 # kernel that compiles for 0.6 s in kitchen
@@ -89,18 +89,20 @@ def _mean_of(renders):
 def auxiliary_features(scene, sensor, spp, seed):
     """Render "albedo", "normal" and "depth", a dict of (height, width, channels) float32, of the first surfaces that
     are neither mirror nor glass, with the film's filter and about `spp` samples per pixel; `sensor` is a `mi.Sensor`.
-    The samples are stratified if the sensor's sampler is `independent`. Return the dict and the samples per pixel: a
-    multiple of one of `AT_ONCE`, up to `spp` if that is 16 or more.
+    The samples are stratified if the sensor's sampler is `independent`. Return the dict and the samples per pixel:
+    `spp` rounded down to a multiple of 16, at least 16.
 
     Albedo, 0 to 1: directional albedo, estimated by one BSDF sample, times the throughput of mirrors and glass before
     the surface, plus emission. Normal: shading normal in world space, turned towards the viewer. Depth: length of the
     path from the near clipping distance of the camera, world units, as in Mitsuba's `aov`. All are 0 in empty
     directions.
     """
-    pixels = int(np.prod(sensor.film().crop_size()))
-    each = next((size for size in AT_ONCE if size <= spp and size * pixels <= FEATURE_WAVEFRONT), AT_ONCE[-1])
-    parts = max(spp // each, 1)
-    return _mean_of([(_rendered(scene, sensor, each, (seed, part)), each) for part in range(parts)])
+    pixels, large, small = int(np.prod(sensor.film().crop_size())), *AT_ONCE
+    several = spp // large if large * pixels <= FEATURE_WAVEFRONT else 0
+    sizes = [large] * several + [small] * ((spp - several * large) // small)
+    return _mean_of(
+        [(_rendered(scene, sensor, each, (seed, part)), each) for part, each in enumerate(sizes or [small])]
+    )
 
 
 def _rendered(scene, sensor, spp, key):

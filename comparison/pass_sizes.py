@@ -3,7 +3,7 @@
 Passes in parts take long, as they can be stopped between parts, and large passes are the most efficient: virtual lights
 pay only from a certain size, and samples are stratified within a pass. Such a pass takes about ten seconds, or twice
 the time of its start, and the last pass up to twice that. With a time limit of ten seconds a render has a small pass,
-one of a third to half of the time, and one that fills the rest.
+one of about half of the time, and one that fills the rest.
 
 In images that will be denoised, the second pass may determine the samples of the pixels in later passes. It is then
 small, because its own pixels have equal numbers.
@@ -17,8 +17,8 @@ requires a second pass of equal size; so does growth that risks twice the time, 
 
 Passes in parts report the time of their start, so that one pass tells the cost of any size, and sizes from the second
 pass on may be any number: `manylights` needs a single further kernel for them. A second pass may have virtual lights
-where the small first pass has none, and cost more: it is planned for half of the remaining time, or less if it
-determines samples, or for all of it up to the size for which the first pass predicts the cost.
+where the small first pass has none, and cost more. Up to the size for which the first pass predicts the cost, it may
+take all of the remaining time; beyond this size, half. A pass that determines samples takes less.
 """
 
 import math
@@ -41,7 +41,6 @@ MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of predictions,
 USUAL = 4  # samples per pixel; all powers of two from here have the same kernels
 FIRST_SAMPLES = 2**19  # maximum pixel samples of a first pass, unless one per pixel is more
 KERNEL_SECONDS = 0.1  # to compile the kernel of the first size that is no power of two, if the first pass compiled any
-OVERRUN = 0.02  # of a time limit: sizes are not always free, and the cost of a pass is not known better
 LEAST_SHARE = 0.1  # minimum fraction of a pass's time that is assumed proportional to its samples
 PARTS = 8  # with an error limit, a pass has at most this fraction, 1/8, of the samples so far
 
@@ -113,7 +112,7 @@ class PassSizes:
     def _learn(self, last, done, is_first):
         """Record the time of the `last` pass, and choose the size of later passes."""
         repeated, seconds = self._asked in self._seconds, last.repeated_seconds
-        self._kernel_seconds = KERNEL_SECONDS if is_first and last.compile_seconds > 0 else 0.0
+        self._kernel_seconds = KERNEL_SECONDS if is_first and last.compile_seconds != 0 else 0.0
         if last.start_seconds is not None:
             self._starts[self._asked] = last.start_seconds
             self._lit |= last.has_lights
@@ -168,7 +167,7 @@ class PassSizes:
             # Without virtual lights, small passes are as good as large ones
             if self._known and filling < (LEAST_GAIN * size if self._lit else least):
                 return 0
-            certain = self._nearest(self._certain(filling), line[1])
+            certain = self._kept(self._certain(filling))
             # A single last pass, instead of several ever smaller ones
             if least <= certain <= self._largest and filling < (size if self._spp else 2 * size):
                 return certain
@@ -184,12 +183,6 @@ class PassSizes:
         """Return the largest size up to `size` that takes no longer than expected if its pass has virtual lights."""
         known = max(self._known, default=0)
         return int(size if self._lit or not known else min(size, max(known, size / self._lit_cost)))
-
-    def _nearest(self, size, each):
-        """Return the size nearest to `size` that the sampler keeps; larger sizes exceed the time limit by at most a
-        fraction `OVERRUN`, at `each` seconds per sample."""
-        most = size + int(OVERRUN * self._time / each)
-        return min(self._kept(size), self._kept(most), key=lambda kept: abs(kept - size))
 
     def _kept(self, size):
         """Return the largest size up to `size` that the sampler keeps."""

@@ -128,7 +128,7 @@ def render(
     planes = layers_of(layers, scene, sensor, denoiser, seed=seed, spp=spp, time_limit=time)
     # The error is that of the raw image, which equal numbers of samples suit best
     progressive = Progressive(scene, seed, sensor, integrator, denoiser.denoise if denoiser and not error else None)
-    reserved = denoiser.filter_seconds if denoiser else 0.0
+    reserved = denoiser.expected_seconds if denoiser else 0.0
     sizes = PassSizes(
         progressive.pixels, spp, time and time - reserved, pass_spp, error is not None, progressive.in_parts,
         progressive.accepts, progressive.differs,

@@ -1,7 +1,7 @@
 """Progressive rendering: passes with different seeds, and their average."""
 
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -46,13 +46,13 @@ def largest_pass(pixels, in_parts=False):
 @dataclass
 class Pass:
     """A finished pass: seed, samples per pixel, wall-clock seconds, counters of the integrator, and the seconds of
-    compilation."""
+    compilation, None if they were not measured."""
 
     seed: int
     spp: int
     seconds: float
     statistics: dict = field(default_factory=dict)
-    compile_seconds: float = 0.0
+    compile_seconds: float | None = None
 
     @property
     def weight(self):
@@ -75,7 +75,8 @@ class Pass:
     def repeated_seconds(self):
         """Seconds without compilation, and without the pilot if later passes share it."""
         made = self.statistics.get("pilots", 0)
-        return self.seconds - self.compile_seconds - (self.statistics["seconds"][Stage.PILOT] if made else 0.0)
+        not_repeated = (self.compile_seconds or 0.0) + (self.statistics["seconds"][Stage.PILOT] if made else 0.0)
+        return max(self.seconds - not_repeated, 0.0)
 
     @property
     def start_seconds(self):
@@ -100,15 +101,16 @@ class PassImage:
 def render_pass(scene, sensor, integrator, spp, seed, first=None, shared=None, density=None, half=False):
     """Render a pass of `spp` samples per pixel, which stratified samplers round up; return a `PassImage`.
 
-    `sensor`: an index. `first`: (samples per pixel, seed) of the first pass of the render, by default this pass, on
-    which the start depends that passes of `manylights` share; `shared`: the `SharedStart` of the render. `density`,
-    `half`: samples of each pixel over `spp`, and whether to return an image of every second sample; see
-    `ManyLightsIntegrator.pass_of`.
+    `sensor`: an index. `first`: (samples per pixel, seed) of the first pass of the render, by default this pass, which
+    then measures compilation; the start that passes of `manylights` share depends on it. `shared`: the `SharedStart` of
+    the render. `density`, `half`: samples of each pixel over `spp`, and whether to return an image of every second
+    sample; see `ManyLightsIntegrator.pass_of`.
     """
     sensor, begin = scene.sensors()[sensor], time.perf_counter()
     shared = shared or SharedStart()
     sharing = _sharing(scene, sensor, integrator, (spp, seed), first or (spp, seed), shared, density, half)
-    with compilation_measured() as compilation, sharing:
+    # Later passes compile little, and measuring takes time
+    with compilation_measured() if first is None else nullcontext() as compilation, sharing:
         spp = _render(scene, sensor, integrator, spp, seed)
     seconds = time.perf_counter() - begin
     # The film, as the image of `mi.render` lacks names, and channels of nested integrators
@@ -116,7 +118,7 @@ def render_pass(scene, sensor, integrator, spp, seed, first=None, shared=None, d
     channels = [entry.name for entry in bitmap.struct_()]
     planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
     statistics = dict(getattr(integrator, "statistics", None) or {})
-    taken = Pass(seed, spp, seconds, statistics, compilation.seconds)
+    taken = Pass(seed, spp, seconds, statistics, compilation and compilation.seconds)
     if not half:
         return PassImage(planes, channels, taken)
     rest = [index for index, name in enumerate(channels) if not name.startswith(HALF)]

@@ -57,7 +57,7 @@ class DistributedRender:
             limits = {"seed": self._seed, "spp": self.spp, "time_limit": self._time}
             denoiser = Denoiser(scene, self._sensor, **limits, quality=quality_of(denoise)) if denoise else None
             planes = layers_of(layers, scene, self._sensor, denoiser, **limits)
-            reserved = denoiser.filter_seconds if denoiser else 0.0
+            reserved = denoiser.expected_seconds if denoiser else 0.0
             ending = Ending(self.spp, self._time and self._time - reserved, self._error, reserved)
             if self._time:
                 self.passes.deadline = begin + self._time - reserved

@@ -158,7 +158,7 @@ def test_without_the_package_the_message_says_what_to_install(tmp_path, monkeypa
     assert command("-o", tmp_path / "a.exr") == 0  # nothing else needs it
 
 
-@pytest.mark.parametrize(("spp", "samples"), [(1, 16), (13, 16), (20, 32), (40, 64), (1000, 128), (None, 128)])
+@pytest.mark.parametrize(("spp", "samples"), [(1, 16), (13, 16), (20, 32), (40, 80), (1000, 128), (None, 128)])
 def test_albedo_and_normal_have_twice_the_samples_of_the_image_within_limits(spp, samples):
     assert Denoiser(cornell(16).load(), spp=spp).feature_spp == samples
 
@@ -166,6 +166,33 @@ def test_albedo_and_normal_have_twice_the_samples_of_the_image_within_limits(spp
 @pytest.mark.parametrize(("time_limit", "samples"), [(1e-3, 16), (1e6, 144)])
 def test_albedo_and_normal_take_a_small_part_of_a_time_limit(time_limit, samples):
     assert Denoiser(cornell(16).load(), time_limit=time_limit).feature_spp == samples
+
+
+@pytest.mark.parametrize("size", [1, 40, 300])
+def test_the_time_of_the_denoiser_is_expected_from_a_tile(size, monkeypatch):
+    """A made-up denoiser needs 10 microseconds for a pixel after the first call, which takes longer."""
+    scene, widths = cornell(size).load(), []
+
+    def seconds_of(self, inputs):
+        widths.append(inputs["color"].shape[0])
+        assert {plane.shape for plane in inputs.values()} == {(widths[-1], widths[-1], 3)}
+        return 1e-5 * widths[-1] ** 2 + (1.0 if len(widths) == 1 else 0.0)
+
+    monkeypatch.setattr(Denoiser, "_seconds_of", seconds_of)
+    assert Denoiser(scene).expected_seconds == pytest.approx(1e-5 * size**2)
+    assert widths == [min(size, 64)] * 2
+
+
+def test_tiles_become_larger_where_the_denoiser_is_fast(monkeypatch):
+    scene, widths = cornell(300).load(), []
+    monkeypatch.setattr(Denoiser, "_seconds_of", lambda self, inputs: widths.append(len(inputs["color"])) or 1e-9)
+    assert Denoiser(scene).expected_seconds == 1e-9
+    assert widths == [64, 64, 128, 128, 256, 256, 300, 300]
+
+
+def test_the_smallest_image_in_the_shortest_time():
+    image, took = manylights.render(cornell(1).load(), "manylights", time=0.01, denoise=True)
+    assert image.shape == (1, 1, 3) and np.isfinite(image.numpy()).all() and took.spp > 0
 
 
 def test_mono_variant(tmp_path):

@@ -33,7 +33,9 @@ class Clock:
         """End the current stage."""
         if self._stage is not None:
             dr.sync_thread()
-            spent, compiled = perf_counter() - self._start, compiled_since_last()
+            spent = perf_counter() - self._start
+            # Less than the stage: other threads may compile at the same time
+            compiled = min(compiled_since_last(), spent)
             self.add({self._stage: spent - compiled} | ({Stage.COMPILE: compiled} if compiled else {}))
             self._stage = None
 

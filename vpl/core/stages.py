@@ -15,7 +15,7 @@ class Stage(StrEnum):
     """Stage of a render; the value is the key in ``statistics["seconds"]``."""
 
     # ---- Every integrator
-    COMPILE = "compile"  # Dr.Jit compiles kernels, if this time is measured; not a stage that a listener is told of
+    COMPILE = "compile"  # Dr.Jit compiles kernels, during any stage; only in first passes, and never told to a listener
     SCENE = "scene"  # emitters and materials are read
     GATHER = "gather"  # camera rays are followed to gather points
     SOURCES = "sources"  # emitters become sources in clusters
