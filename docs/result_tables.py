@@ -91,12 +91,21 @@ TABLES = {
         order="speedup",
     ),
     "denoised": Table(
-        {"short": ("manylights_denoised",), "": ("manylights_denoised10",)},
+        {
+            "short": ("manylights_denoised",),
+            "": ("manylights_denoised10",),
+            "long": ("manylights_denoised60",),
+            "wide": ("manylights_denoised_wide",),
+        },
         (
             Column("2.5 s", ratio="short.speedup"),
             Column("over `independent`", ratio="short.independent_speedup"),
             Column("10 s", ratio="speedup"),
             Column("over `independent`", ratio="independent_speedup"),
+            Column("60 s", ratio="long.speedup"),
+            Column("over `independent`", ratio="long.independent_speedup"),
+            Column("768 wide, 40 s", ratio="wide.speedup"),
+            Column("over `independent`", ratio="wide.independent_speedup"),
         ),
         order="speedup",
     ),
