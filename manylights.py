@@ -111,7 +111,8 @@ def parse(arguments):
              "variance between passes")  # fmt: skip
     add("--denoise", action="store_true", help="denoise by Open Image Denoise (pip install 'manylights[denoise]')")
     add("--denoise-quality", choices=QUALITIES,
-        help=f"with --denoise: network, from best to quickest (default: {QUALITIES[0]})")  # fmt: skip
+        help=f"with --denoise: network, from best to quickest (default: {QUALITIES[0]}; with --time the network that "
+             "leaves the least error, because a quick one leaves time for samples)")  # fmt: skip
     add("--layers", type=layer_names, default=(), metavar="NAMES",
         help=f"layers of EXR files, separated by commas: {', '.join(FEATURES)}, of the first surface that is neither "
              f"mirror nor glass, as the denoiser gets them; {', '.join(LENGTHS)}, the light of paths with one, two, "

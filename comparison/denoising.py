@@ -18,6 +18,12 @@ from .images import colour
 from .scene_files import known_parameters
 
 QUALITIES = ("high", "balanced", "fast")  # of Open Image Denoise: networks of three sizes
+# Error of images denoised by each of them, over that by "high" (decisions.md)
+ERRORS = dict(zip(QUALITIES, (1.0, 1.12, 1.26), strict=True))
+# The error is proportional to this power of the time for samples: it falls by 1.37 where they double
+ERROR_POWER = -0.454
+# Fraction of the remaining time below which the best network is not compared: all of it would lower the error by 10%
+NEGLIGIBLE = 0.2
 # Width of the tile whose denoising is timed, pixels, and least seconds that it takes; smaller tiles are doubled. On two
 # cores a pixel of a tile of 64 takes 1.05 to 1.2 times as long as one of an image of 256 to 1920
 TILE, TILE_SECONDS = 64, 0.015
@@ -35,10 +41,10 @@ def import_oidn():
 
 
 def quality_of(denoise):
-    """Return the quality that the value of a parameter `denoise` names, the best one for True. Raises ValueError for a
-    string that is not one of `QUALITIES`."""
+    """Return the quality that the value of a parameter `denoise` names, None for True. Raises ValueError for a string
+    that is not one of `QUALITIES`."""
     if not isinstance(denoise, str):
-        return QUALITIES[0]
+        return None
     if denoise not in QUALITIES:
         raise ValueError(f"denoise must be True, False or one of {', '.join(QUALITIES)}, got {denoise!r}")
     return denoise
@@ -50,17 +56,20 @@ class Denoiser:
     `spp`, `time_limit`: samples per pixel and seconds of the image, None if unlimited; they limit the samples of the
     `features`, a dict as of `auxiliary_features`. `feature_spp`: samples per pixel of the features. `seconds`: time
     spent so far, including the features, which the constructor renders. `expected_seconds`: estimated time of a call
-    of `denoise`. `quality`: one of `QUALITIES`.
+    of `denoise`. `quality`: one of `QUALITIES`; by default the best one, or with a time limit the one that leaves the
+    least error, as the time that it saves is for samples.
     """
 
-    def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=QUALITIES[0]):
+    def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None):
         self._oidn, begin = import_oidn(), time.perf_counter()
-        self.quality = quality
         self._networks = {name: getattr(self._oidn.Quality, name.capitalize()) for name in QUALITIES}
         self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
         self.features, self.feature_spp = features_of(scene, scene.sensors()[sensor], seed, spp, time_limit)
         self._guides = {name: self.features[name] for name in ("albedo", "normal")}
-        self.expected_seconds = self._expected()
+        self.quality = quality or QUALITIES[0]
+        self.expected_seconds = self._expected(self.quality)
+        if time_limit is not None and not quality:
+            self._choose(time_limit - (time.perf_counter() - begin))
         self.seconds = time.perf_counter() - begin
 
     @property
@@ -82,21 +91,32 @@ class Denoiser:
         self.seconds += time.perf_counter() - begin
         return type(image)(planes) if isinstance(image, mi.TensorXf) else planes
 
-    def _expected(self):
+    def _choose(self, left):
+        """Choose the quality that leaves the least error `left` seconds before the limit."""
+        if self.expected_seconds < NEGLIGIBLE * left:
+            return
+        seconds = {name: self._expected(name) for name in QUALITIES}
+        errors = {
+            name: ERRORS[name] * (left - seconds[name]) ** ERROR_POWER for name in QUALITIES if seconds[name] < left
+        }
+        self.quality = min(errors, key=errors.get, default=QUALITIES[-1])
+        self.expected_seconds = seconds[self.quality]
+
+    def _expected(self, quality):
         """Return the seconds that denoising an image is expected to take, by the time of a tile of it."""
         width, whole = TILE, self._guides["albedo"]
         while True:
             tile = {name: plane[:width, :width] for name, plane in self._guides.items()}
             # The first call loads the weights of the network
-            seconds = min(self._seconds_of({"color": tile["albedo"], **tile}) for _ in range(2))
+            seconds = min(self._seconds_of({"color": tile["albedo"], **tile}, quality) for _ in range(2))
             if seconds >= TILE_SECONDS or tile["albedo"].shape == whole.shape:
                 return seconds * whole.size / tile["albedo"].size
             width *= 2
 
-    def _seconds_of(self, inputs):
+    def _seconds_of(self, inputs, quality):
         """Return the seconds that denoising takes."""
         begin = time.perf_counter()
-        self._filtered(inputs, self._networks[self.quality])
+        self._filtered(inputs, self._networks[quality])
         return time.perf_counter() - begin
 
     def _filtered(self, inputs, quality):

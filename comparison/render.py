@@ -88,9 +88,9 @@ def render(
     seconds, compilation included; `spp`, samples per pixel. The default is the scene's samples per pixel. There
     is at least one pass. The log has a warning if `spp` or `time` ends a render above its `error`. `seed`: of the first
     pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py), by
-    the network "high" (True), "balanced" or "fast"; an integrator given by name is then created with its property
-    `denoised`, if it has one. `manylights` with this property gives more samples to pixels where the denoiser leaves
-    noise (sample_density.py), unless there is an `error`.
+    the network "high", "balanced" or "fast", or, if True, by the one that suits the `time`; an integrator given by name
+    is then created with its property `denoised`, if it has one. `manylights` with this property gives more samples to
+    pixels where the denoiser leaves noise (sample_density.py), unless there is an `error`.
     `progress`: called after each pass with the cost and the image so far; integrators of this project also call it at
     the start of each stage of a pass, with None for the image. If it returns False, no other pass begins; an exception
     ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a `checkpoint.Checkpoint` of the

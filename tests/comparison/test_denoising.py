@@ -173,7 +173,7 @@ def test_the_time_of_the_denoiser_is_expected_from_a_tile(size, monkeypatch):
     """A made-up denoiser needs 10 microseconds for a pixel after the first call, which takes longer."""
     scene, widths = cornell(size).load(), []
 
-    def seconds_of(self, inputs):
+    def seconds_of(self, inputs, quality):
         widths.append(inputs["color"].shape[0])
         assert {plane.shape for plane in inputs.values()} == {(widths[-1], widths[-1], 3)}
         return 1e-5 * widths[-1] ** 2 + (1.0 if len(widths) == 1 else 0.0)
@@ -185,9 +185,25 @@ def test_the_time_of_the_denoiser_is_expected_from_a_tile(size, monkeypatch):
 
 def test_tiles_become_larger_where_the_denoiser_is_fast(monkeypatch):
     scene, widths = cornell(300).load(), []
-    monkeypatch.setattr(Denoiser, "_seconds_of", lambda self, inputs: widths.append(len(inputs["color"])) or 1e-9)
+    monkeypatch.setattr(
+        Denoiser, "_seconds_of", lambda self, inputs, quality: widths.append(len(inputs["color"])) or 1e-9
+    )
     assert Denoiser(scene).expected_seconds == 1e-9
     assert widths == [64, 64, 128, 128, 256, 256, 300, 300]
+
+
+@pytest.mark.parametrize(
+    ("share", "chosen"),
+    [(0.02, "high"), (0.1, "high"), (0.3, "balanced"), (0.6, "fast"), (2.0, "fast"), (50.0, "fast")],
+)
+def test_the_network_suits_the_time(share, chosen, monkeypatch):
+    """Made-up networks, of which the best takes a `share` of the time limit."""
+    times = {"high": 1.0, "balanced": 0.45, "fast": 0.24}
+    monkeypatch.setattr(Denoiser, "_seconds_of", lambda self, inputs, quality: times[quality] * share * 1000)
+    found = Denoiser(cornell(40).load(), time_limit=1000)
+    assert found.quality == chosen and found.expected_seconds == pytest.approx(times[chosen] * share * 1000)
+    assert Denoiser(cornell(40).load(), time_limit=1000, quality="high").quality == "high"
+    assert Denoiser(cornell(40).load()).quality == "high"
 
 
 def test_the_smallest_image_in_the_shortest_time():
