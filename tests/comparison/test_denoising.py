@@ -194,7 +194,7 @@ def test_tiles_become_larger_where_the_denoiser_is_fast(monkeypatch):
 
 @pytest.mark.parametrize(
     ("share", "chosen"),
-    [(0.02, "high"), (0.1, "high"), (0.3, "balanced"), (0.6, "fast"), (2.0, "fast"), (50.0, "fast")],
+    [(0.1, "high"), (0.3, "high"), (0.5, "balanced"), (0.95, "fast"), (2.0, "fast"), (50.0, "fast")],
 )
 def test_the_network_suits_the_time(share, chosen, monkeypatch):
     """Made-up networks, of which the best takes a `share` of the time limit."""
