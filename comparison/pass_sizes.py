@@ -34,6 +34,7 @@ LEAST_GAIN = 1 / 16  # minimum size of a last pass with virtual lights, as a fra
 LIT = 2.0  # usual cost of a sample with virtual lights over that without, at most: small passes have no lights
 UNSURE = 1.25  # cost over a predicted one, at most in most scenes: predictions are within a fifth (decisions.md)
 DOUBT = 0.5  # fraction of the remaining time for a second pass, which may have lights and cost more than expected
+DIFFERENT = 1.08  # usual cost of a sample where pixels have different numbers: there are more at edges and on glass
 PROBE = 0.25  # fraction of the remaining time, or samples, for a second pass that determines the samples of the pixels
 LONGEST = 2.0  # times the wanted seconds: longer passes shrink
 CHANGED = 1.5  # ratio of the times of two passes of equal size at which earlier times are discarded
@@ -68,6 +69,7 @@ class PassSizes:
         self._lit, self._lit_cost = False, LIT  # whether a pass had virtual lights; their cost, at most
         self._growth_of = 0  # size of the pass whose cost was predicted by the last pass
         self._kernel_seconds = 0.0  # expected compilation of the next pass
+        self._dearer = 1.0  # expected cost of a sample of the next pass over that of known passes
         self._before = None  # number of passes from a checkpoint; None until the first call
 
     def next(self, passes, elapsed):
@@ -81,6 +83,7 @@ class PassSizes:
             self._learn(passes[-1], done, is_first=len(passes) == self._before + 1)
         if self._spp is not None and done >= self._spp:
             return "spp"
+        self._dearer = DIFFERENT if self.is_probe else 1.0
         self.is_probe = self._probes and len(passes) == 1
         size = self._size(passes, done, elapsed)
         if self.is_probe and size < LEAST_SAMPLES:
@@ -177,7 +180,7 @@ class PassSizes:
 
     def _filling(self, seconds, start, each):
         """Return the size of a pass of some `seconds`, from its start and the seconds per sample."""
-        return int((seconds - self._kernel_seconds - start) / each)
+        return int((seconds - self._kernel_seconds - start) / (self._dearer * each))
 
     def _certain(self, size):
         """Return the largest size up to `size` that takes no longer than expected if its pass has virtual lights."""

@@ -251,6 +251,17 @@ def test_in_parts_a_predicted_cost_makes_the_second_pass_larger():
     assert second_size(growth=1.0, time=10.4) == 65
 
 
+def test_in_parts_samples_after_a_probe_are_expected_to_cost_more():
+    """Samples of pixels with different numbers cost 8% more."""
+    sizes, passes, elapsed = PassSizes(SQUARE // 2, time=10, in_parts=True, probes=True), [], 0.0
+    while not isinstance(spp := sizes.next(passes, elapsed), str):
+        traced = (0.05 if len(passes) < 2 else 0.054) * spp
+        passes.append(Pass(0, spp, 0.1 + traced, {"seconds": {Stage.TRACED: traced, Stage.CUTS: 0.0}}, 0.0))
+        elapsed += passes[-1].seconds
+        assert sizes.is_probe == (len(passes) == 2)
+    assert 9.6 < elapsed < 10 and len(passes) <= 4
+
+
 def test_in_parts_time_for_kernels_is_left_if_the_first_pass_compiled_or_was_not_measured():
     assert second_size(1.0, 0.0, 1.4) == 12
     assert second_size(1.0, 0.2, 1.4) == second_size(1.0, None, 1.4) == 10
