@@ -1,8 +1,8 @@
 """Denoised error of ``manylights`` and of ``path``, and the time that ``path`` takes for that of ``manylights``.
 
 ``manylights.render`` ends the images of ``manylights`` by time, with their pilots and first passes; those of ``path``
-are single passes, which stratify best, with the same denoiser.  Times include albedo, normal and denoiser.  Kernels are
-compiled before.
+are single passes, which stratify best, or the mean of several where memory limits a pass, with the same denoiser.
+Times include albedo, normal and denoiser.  Kernels are compiled before.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from comparison.denoising import Denoiser
 # Denoised errors fall by this factor where samples double: measured with ``path`` in the scenes with references
 FALL = 1.37
 # Seconds of each of the two renders of a reference, over those of an image
-REFERENCE_TIMES = 4
+REFERENCE_TIMES = 3
 # Seeds of these renders, in units of the benchmark's seeds
 REFERENCE_SEEDS = 1, 2
 
@@ -60,6 +60,20 @@ class Truth:
         return float(error[int(TRIMMED * error.size) : int((1 - TRIMMED) * error.size)].mean())
 
 
+class Several(Rival):
+    """Images of ``path`` of about ``seconds``: means of as few passes as memory allows."""
+
+    def __init__(self, name: str, scene, sampler: str, width: int, seconds: float):
+        super().__init__(name, scene, "path", sampler, width, seconds)
+        self.count = max(round(seconds / self.render(0)[1]), 1)
+
+    def measure(self, seed: int) -> None:
+        """Render and keep one more image."""
+        passes = [self.render(1000 * seed + number) for number in range(self.count)]
+        self.images.append(np.mean([image for image, _ in passes], axis=0))
+        self.seconds.append(sum(spent for _, spent in passes))
+
+
 def compare(names, width: int, seconds: float, passes: int) -> dict:
     """Print the rows of all scenes; returns them by name."""
     print(f"denoised, {width} wide, images of {seconds:g} s: error, samples; time of `path` for equal error over that")
@@ -74,7 +88,7 @@ def compare_one(name: str, width: int, seconds: float, passes: int) -> dict:
     denoiser = [Denoiser(scene, time_limit=seconds) for _ in range(2)][-1]
     denoiser.denoise(denoiser.features["albedo"], ["R", "G", "B"])
     fixed = denoiser.seconds
-    rivals = [Rival(name, scene, "path", sampler, width, seconds - fixed) for sampler in SAMPLERS]
+    rivals = [Several(name, scene, sampler, width, seconds - fixed) for sampler in SAMPLERS]
     # manylights stratifies the samples of this sampler
     rivals.append(Timed(scene, "manylights", "independent", seconds, denoise=True, denoised=True))
     measure_in_turn(rivals, passes)
@@ -90,7 +104,7 @@ def compare_one(name: str, width: int, seconds: float, passes: int) -> dict:
         for error, spent in theirs
     ]
     columns = "".join(
-        f"  {rival.kind} ({rival.sampler[:5]}) {error:.5f} ({rival.spp}, {spent:.2f} s)"
+        f"  {rival.kind} ({rival.sampler[:5]}) {error:.5f} ({rival.spp * getattr(rival, 'count', 1)}, {spent:.2f} s)"
         for rival, (error, spent) in zip(rivals, points, strict=True)
     )
     doubt = "" if min(errors) > 0 else "  an error is below the noise of the reference"
