@@ -95,7 +95,6 @@ TABLES = {
             "short": ("manylights_denoised",),
             "": ("manylights_denoised10",),
             "long": ("manylights_denoised60",),
-            "wide": ("manylights_denoised_wide",),
         },
         (
             Column("2.5 s", ratio="short.speedup"),
@@ -104,8 +103,6 @@ TABLES = {
             Column("over `independent`", ratio="independent_speedup"),
             Column("60 s", ratio="long.speedup"),
             Column("over `independent`", ratio="long.independent_speedup"),
-            Column("768 wide, 40 s", ratio="wide.speedup"),
-            Column("over `independent`", ratio="wide.independent_speedup"),
         ),
         order="speedup",
     ),
