@@ -43,7 +43,8 @@ def test_every_stage_that_takes_time_is_told_as_it_begins(scene, name):
     _, took = manylights.render(
         scene, plugin(name), spp=8, pass_spp=4, progress=lambda took, image: told.append((took, image))
     )
-    assert {one.stage for one, _ in told} - {None} == set(took.statistics["seconds"])
+    # Compilation happens during stages, and only without a kernel in the cache
+    assert {one.stage for one, _ in told} - {None} == set(took.statistics["seconds"]) - {Stage.COMPILE}
     assert all((one.stage is None) == (image is not None) for one, image in told)
     between = [number for number, (one, _) in enumerate(told) if one.stage is None]
     assert [told[number][0].passes for number in between] == [1, 2]
