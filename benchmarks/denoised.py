@@ -14,10 +14,8 @@ import numpy as np
 from benchmarks import scenes
 from benchmarks.rivals import KINDS, SAMPLERS, TRIMMED, Rival, Timed, load, measure_in_turn
 from comparison.convergence import box_mean
-from comparison.denoising import Denoiser
+from comparison.denoising import FALL, Denoiser
 
-# Denoised errors fall by this factor where samples double: mean of the scenes with references, of 1.15 to 1.6
-FALL = 1.37
 # Seconds of each of the two renders of a reference, over those of an image
 REFERENCE_TIMES = 3
 # Seeds of these renders, in units of the benchmark's seeds
@@ -65,7 +63,7 @@ class Several(Rival):
 
     def __init__(self, name: str, scene, sampler: str, width: int, seconds: float):
         super().__init__(name, scene, "path", sampler, width, seconds)
-        self.count = max(round(seconds / self.render(0)[1]), 1)
+        self.count = max(round(seconds / self.pass_seconds), 1)
 
     def measure(self, seed: int) -> None:
         """Render and keep one more image."""
@@ -104,7 +102,7 @@ def compare_one(name: str, width: int, seconds: float, passes: int) -> dict:
         for error, spent in theirs
     ]
     columns = "".join(
-        f"  {rival.kind} ({rival.sampler[:5]}) {error:.5f} ({rival.spp * getattr(rival, 'count', 1)}, {spent:.2f} s)"
+        f"  {rival.kind} ({rival.sampler[:5]}) {error:.5f} ({rival.spp * rival.count}, {spent:.2f} s)"
         for rival, (error, spent) in zip(rivals, points, strict=True)
     )
     doubt = "" if min(errors) > 0 else "  an error is below the noise of the reference"

@@ -60,7 +60,10 @@ def trimmed_variance(images: list, scale: np.ndarray, trimmed: float = TRIMMED) 
 
 class Rival:
     """Passes of one integrator with one sampler on one scene, of about ``seconds`` each; ``light_paths``: factor on the
-    chosen number; ``more``: properties of ``manylights``."""
+    chosen number; ``more``: properties of ``manylights``.  ``pass_seconds``: of a pass; ``count`` of them in an image.
+    """
+
+    count = 1
 
     def __init__(
         self, name: str, scene, kind: str, sampler: str, width: int, seconds: float, light_paths: float = 1, **more
@@ -81,7 +84,7 @@ class Rival:
             self.spp = min(max(round(max(wanted, 16) ** 0.5), 4), most) ** 2
         else:
             self.spp = min(max(round(wanted), 16), most**2)
-        self.render(0)
+        self.pass_seconds = self.render(0)[1]
 
     def render(self, seed: int):
         """Render: (image, float64; seconds)."""

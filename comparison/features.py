@@ -82,8 +82,10 @@ def features_of(scene, sensor, seed=0, spp=None, time_limit=None):
 
 def _mean_of(renders):
     """Return the mean of (images by name, samples) by samples, and the sum of the samples."""
-    whole = sum(samples for _, samples in renders)
-    return {name: sum(samples / whole * one[name] for one, samples in renders) for name in renders[0][0]}, whole
+    sums, whole = dict.fromkeys(FEATURES, 0.0), 0
+    for one, samples in renders:
+        sums, whole = {name: sums[name] + samples * one[name] for name in FEATURES}, whole + samples
+    return {name: total / whole for name, total in sums.items()}, whole
 
 
 def auxiliary_features(scene, sensor, spp, seed):
@@ -100,9 +102,8 @@ def auxiliary_features(scene, sensor, spp, seed):
     pixels, large, small = int(np.prod(sensor.film().crop_size())), *AT_ONCE
     several = spp // large if large * pixels <= FEATURE_WAVEFRONT else 0
     sizes = [large] * several + [small] * ((spp - several * large) // small)
-    return _mean_of(
-        [(_rendered(scene, sensor, each, (seed, part)), each) for part, each in enumerate(sizes or [small])]
-    )
+    # One after the other: large images take much memory
+    return _mean_of((_rendered(scene, sensor, each, (seed, part)), each) for part, each in enumerate(sizes or [small]))
 
 
 def _rendered(scene, sensor, spp, key):
