@@ -14,7 +14,7 @@ class TotalStatistics:
     """Sum of the integrators' counters over passes.
 
     Numbers are summed, also in nested dicts ("seconds"); the sum of "precision" is that of the image. Descriptions,
-    such as the text "plan", the dict "lights" and the ratio "growth", come from the pass with the most samples, the
+    such as the text "plan", the dict "lights" and the list "growth", come from the pass with the most samples, the
     last of equal passes.
     """
 
@@ -34,7 +34,7 @@ def _add(total, statistics, describe):
     for key, value in statistics.items():
         if isinstance(value, dict) and key != "lights":
             _add(total.setdefault(key, {}), value, describe)
-        elif isinstance(value, int | float | np.number) and not isinstance(value, bool) and key != "growth":
+        elif isinstance(value, int | float | np.number) and not isinstance(value, bool):
             total[key] = total.get(key, 0) + (value.item() if isinstance(value, np.number) else value)
         elif describe or key not in total:
             total[key] = value

@@ -17,8 +17,8 @@ requires a second pass of equal size; so does growth that risks twice the time, 
 
 Passes in parts report the time of their start, so that one pass tells the cost of any size, and sizes from the second
 pass on may be any number: `manylights` needs a single further kernel for them. A second pass may have virtual lights
-where the small first pass has none, and cost more. Up to the size for which the first pass predicts the cost, it may
-take all of the remaining time; beyond this size, half. A pass that determines samples takes less.
+where the small first pass has none, and cost more. Up to the largest size for which the first pass predicts the cost,
+it may take all of the remaining time; beyond this size, half. A pass that determines samples takes less.
 """
 
 import math
@@ -32,13 +32,13 @@ PASS_SECONDS = 2.0
 PART_SECONDS, LEAST_REST = 10.0, 1.0  # of a pass in parts; minimum ratio of its rest to its start, which has priority
 LEAST_GAIN = 1 / 16  # minimum size of a last pass with virtual lights, as a fraction of the intended size
 LIT = 2.0  # usual cost of a sample with virtual lights over that without, at most: small passes have no lights
-UNSURE = 1.25  # cost over a predicted one, at most in most scenes: predictions are within a fifth (decisions.md)
+UNSURE = 1.1  # cost over a predicted one, at most: 0.67 to 0.95 in nine scenes, 16 and 64 samples, 256 wide
 DOUBT = 0.5  # fraction of the remaining time for a second pass, which may have lights and cost more than expected
 DIFFERENT = 1.08  # usual cost of a sample where pixels have different numbers: there are more at edges and on glass
 PROBE = 0.25  # fraction of the remaining time, or samples, for a second pass that determines the samples of the pixels
 LONGEST = 2.0  # times the wanted seconds: longer passes shrink
 CHANGED = 1.5  # ratio of the times of two passes of equal size at which earlier times are discarded
-MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of predictions, also that of `Pass.growth`
+MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of extrapolated times
 USUAL = 4  # samples per pixel; all powers of two from here have the same kernels
 FIRST_SAMPLES = 2**19  # maximum pixel samples of a first pass, unless one per pixel is more
 KERNEL_SECONDS = 0.1  # to compile the kernel of the first size that is no power of two, if the first pass compiled any
@@ -67,7 +67,7 @@ class PassSizes:
         self._known = {}  # size -> seconds of the last pass; not of the first pass, which is slower
         self._starts = {}  # size -> seconds to start the last pass, of passes that report them
         self._lit, self._lit_cost = False, LIT  # whether a pass had virtual lights; their cost, at most
-        self._growth_of = 0  # size of the pass whose cost was predicted by the last pass
+        self._predicted = []  # (size, cost of a sample over those so far, at most) for sizes up to it, by the last pass
         self._kernel_seconds = 0.0  # expected compilation of the next pass
         self._dearer = 1.0  # expected cost of a sample of the next pass over that of known passes
         self._before = None  # number of passes from a checkpoint; None until the first call
@@ -119,9 +119,9 @@ class PassSizes:
         if last.start_seconds is not None:
             self._starts[self._asked] = last.start_seconds
             self._lit |= last.has_lights
-            if last.growth is not None:
-                self._growth_of = MOST_GROWTH * self._asked
-                self._lit_cost = UNSURE * last.growth if last.growth > 1 else 1.0
+            if last.growth:
+                costs = [(times * self._asked, UNSURE * cost if cost > 1 else 1.0) for times, cost in last.growth]
+                self._predicted, self._lit_cost = costs, max(cost for _, cost in costs)
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
         if not is_first:
             before = self._known.get(self._asked, seconds)
@@ -160,13 +160,15 @@ class PassSizes:
         pass in parts would be far smaller than usual.
         """
         least = size if self._fixed else min(size, self._least)
-        line, whole, predicted = self._line(), left, 0
+        line, whole, predicted = self._line(), left, []
         if self.is_probe:
             left = PROBE * min(left, PART_SECONDS)
         elif self._any_size and not self._known and not self._lit:
-            predicted, left = self._growth_of, DOUBT * left
+            predicted, left = self._predicted, DOUBT * left
         if self._any_size and line:
-            filling = max(self._filling(left, *line), min(self._filling(whole, *line), predicted))
+            filling = self._filling(left, *line)
+            for most, cost in predicted:
+                filling = max(filling, min(self._filling(whole, *self._line(cost)), most))
             # Without virtual lights, small passes are as good as large ones
             if self._known and filling < (LEAST_GAIN * size if self._lit else least):
                 return 0
@@ -212,8 +214,9 @@ class PassSizes:
         start, each = line
         return start + each * size
 
-    def _line(self):
-        """Return the seconds to start a pass, and the seconds per sample per pixel; None if unknown.
+    def _line(self, lit_cost=None):
+        """Return the seconds to start a pass, and the seconds per sample per pixel; None if unknown. `lit_cost`: cost
+        of the samples of a second pass over those of the first, by default the largest one that is expected.
 
         From the shortest start that passes report, or else from the largest size and the least one within
         `MOST_GROWTH` of it.
@@ -224,7 +227,7 @@ class PassSizes:
             each = max((longest - self._starts[large]) / large, LEAST_SHARE * longest / large)
             # Some passes learn for all passes of their size. Larger passes than the first one may have virtual lights
             start = min(self._starts[size] for size in (self._known.keys() & self._starts.keys()) or self._starts)
-            return start, each if self._known or self._lit else self._lit_cost * each
+            return start, each if self._known or self._lit else (lit_cost or self._lit_cost) * each
         small = min((size for size in self._known if MOST_GROWTH * size >= large), default=0)
         if small == large:
             return None

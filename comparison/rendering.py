@@ -67,8 +67,8 @@ class Pass:
 
     @property
     def growth(self):
-        """Cost of a sample in a pass of four times the samples over that in this pass, as `manylights` predicts it;
-        None if the integrator does not predict it."""
+        """Expected costs of a sample of larger passes, a list of (ratio of the sizes, cost over that in this pass) by
+        size; None if the integrator does not predict them."""
         return self.statistics.get("growth")
 
     @property

@@ -34,8 +34,8 @@ from .manual import manual_page
 _SHARED_SAMPLES = 16
 # Largest depth that prb can count, with 32 bits
 _DEEPEST = 2**32 - 1
-# Ratio of the size of a later pass of a render, of which a pass predicts the cost
-_LARGER = 4
+# Ratios of the sizes of later passes of a render, of which a pass predicts the cost
+_LARGER = 4, 8, 16
 # Names of channels and layers of images, which are no names of groups of emitters
 _RESERVED = (*LENGTHS, OTHER, "albedo", "normal", "depth", *"RGBAXYZ")
 
@@ -300,7 +300,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
             raise RuntimeError("the start of the first pass is missing: render the first pass before later ones")
         view = self._view(scene, sampler, ray, active, known)
         clock.begin(Stage.PILOT)
-        start = known or make_start(view, self.virtual_lights, shared is not None)
+        start = known or make_start(view, self.virtual_lights)
         if shared:
             shared.start = start
         if self._only_starts:
@@ -310,7 +310,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         found = estimate(view, start, kept, self.should_stop, clock)
         self.statistics = found.statistics | {"pilots": int(known is None)}
         if shared:
-            self.statistics["growth"] = found.decision.growth(_LARGER)
+            self.statistics["growth"] = [(times, found.decision.growth(times)) for times in _LARGER]
         channels = [channel for name in self._layer_names for channel in found.layers[name]]
         if view.rays.differ:
             channels = [view.rays.evenly(channel) for channel in channels]

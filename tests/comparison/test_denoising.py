@@ -189,7 +189,7 @@ def test_tiles_become_larger_where_the_denoiser_is_fast(monkeypatch):
         Denoiser, "_seconds_of", lambda self, inputs, quality: widths.append(len(inputs["color"])) or 1e-9
     )
     assert Denoiser(scene).expected_seconds == 1e-9
-    assert widths == [64, 64, 128, 128, 256, 256, 300, 300]
+    assert widths == [64, 64, 128, 256, 300]
 
 
 @pytest.mark.parametrize(

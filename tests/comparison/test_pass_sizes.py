@@ -231,11 +231,12 @@ def test_compilation_that_is_measured_does_not_count(in_parts):
     assert found[0] == found[1] > 4
 
 
-def second_size(growth=None, compiled=0.0, time=10.0, **limits):
+def second_size(growth=(), compiled=0.0, time=10.0, **limits):
     """Size of the second pass, after one of 4 samples that takes 0.4 s without compilation, of which 0.1 s are a start,
-    and the rest of `time`."""
+    and predicts the costs `growth` of 16, 32, ... samples; the rest of `time` is left."""
     sizes = PassSizes(SQUARE // 2, time=time, in_parts=True, **limits)
-    statistics = {"seconds": {Stage.TRACED: 0.3}} | ({"growth": growth} if growth else {})
+    costs = [(4 * 2**index, cost) for index, cost in enumerate(growth)]
+    statistics = {"seconds": {Stage.TRACED: 0.3}} | ({"growth": costs} if costs else {})
     first = Pass(0, sizes.next([], 0.0), 0.4 + (compiled or 0), statistics, compiled)
     return sizes.next([first], 0.4)
 
@@ -244,11 +245,19 @@ def test_in_parts_a_predicted_cost_makes_the_second_pass_larger():
     """One second is left. Without a prediction, half of it is for samples of twice the cost; with one, 16 samples may
     take all of it."""
     assert second_size(time=1.4) == 4
-    assert second_size(growth=1.0, time=1.4) == 12
-    assert second_size(growth=1.2, time=1.4) == 8
+    assert second_size([1.0], time=1.4) == 12
+    # 1.1 times the predicted cost is expected
+    assert second_size([1.2], time=1.4) == 9
     # Beyond four times the first size nothing is predicted
-    assert second_size(growth=1.0, time=2.4) == 16
-    assert second_size(growth=1.0, time=10.4) == 65
+    assert second_size([1.0], time=2.4) == 16
+    assert second_size([1.0], time=10.4) == 65
+
+
+def test_in_parts_costs_may_be_predicted_for_several_sizes():
+    assert second_size([1.0, 1.0], time=2.4) == 25
+    # 32 samples may cost so much that 16 are the most that surely fit
+    assert second_size([1.0, 3.0], time=2.4) == 16
+    assert second_size([1.0, 1.2], time=2.4) == 19
 
 
 def test_in_parts_samples_after_a_probe_are_expected_to_cost_more():
@@ -263,8 +272,8 @@ def test_in_parts_samples_after_a_probe_are_expected_to_cost_more():
 
 
 def test_in_parts_time_for_kernels_is_left_if_the_first_pass_compiled_or_was_not_measured():
-    assert second_size(1.0, 0.0, 1.4) == 12
-    assert second_size(1.0, 0.2, 1.4) == second_size(1.0, None, 1.4) == 10
+    assert second_size([1.0], 0.0, 1.4) == 12
+    assert second_size([1.0], 0.2, 1.4) == second_size([1.0], None, 1.4) == 10
 
 
 @pytest.mark.parametrize("in_parts", [False, True])

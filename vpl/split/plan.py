@@ -1,12 +1,14 @@
 """Plan: whether virtual lights pay, the number of lights, and the fineness of the clusters.
 
 An :class:`Option` is a choice of light kinds.  :func:`price` predicts the variance × cost of an option by the cost
-model; :func:`choose` takes the option with the least product, or no lights.  In images that are denoised, the product
-has a power of the variance: what a denoiser leaves is in part made at edges, which virtual lights do not change.
+model; :func:`choose` measures the options that may pay, and takes the one with the least product, or no lights.  In
+images that are denoised, the product has a power of the variance: what a denoiser leaves is in part made at edges,
+which virtual lights do not change.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -50,15 +52,25 @@ class Option:
     """Kinds of virtual lights: on ``surfaces``, for ``emitters``, or both.
 
     Values (n,) of a pilot's paths: ``traced``: radiance without lights on surfaces; ``indirect``: part of ``traced``
-    available to lights on surfaces; ``residual``: measured radiance without the part carried by lights on surfaces,
-    None if not measured.
+    available to lights on surfaces.  ``measure`` returns the :attr:`residual`, None if nothing can be measured.
     """
 
     surfaces: bool
     emitters: bool
     traced: np.ndarray
     indirect: np.ndarray
-    residual: np.ndarray | None = None
+    measure: Callable[[], np.ndarray] | None = None
+
+    @cached_property
+    def residual(self) -> np.ndarray | None:
+        """Measured radiance (n,) without the part carried by lights on surfaces.  Measuring takes time, and is done for
+        the first pass that needs it; until then, prices are based on an assumption."""
+        return self.measure() if self.measure else None
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether :attr:`residual` is known."""
+        return "residual" in vars(self)
 
     @property
     def expected(self) -> np.ndarray:
@@ -77,7 +89,9 @@ class Option:
         if not self.surfaces:
             return traced
         assumed = traced - model.carried_fraction * (traced - min(evidence.variance(self.expected), traced))
-        measured = assumed if self.residual is None else evidence.variance(self.residual)
+        if not self.is_measured or self.residual is None:
+            return assumed
+        measured = evidence.variance(self.residual)
         return measured if measured > model.doubtful * assumed else assumed
 
 
@@ -139,7 +153,7 @@ class Decision:
         if not self.options:
             return 1.0
         larger = replace(self.evidence, paths=times * self.evidence.paths, samples=times * self.evidence.samples)
-        return choose(larger, self.options).cost / self.plan.cost
+        return choose(larger, self.options, measures=False).cost / self.plan.cost
 
     def precision(self, samples: int) -> float:
         """Expected inverse of the relative variance of a pixel with ``samples``; ``samples`` for a black image.
@@ -151,13 +165,23 @@ class Decision:
         return samples / variance if variance > 0 else float(samples)
 
 
-def choose(evidence: Evidence, options: list[Option]) -> Plan:
-    """The plan of the option with the least variance × cost; without lights if no option pays."""
+def choose(evidence: Evidence, options: list[Option], measures: bool = True) -> Plan:
+    """The plan of the option with the least variance × cost; without lights if no option pays.
+
+    ``measures``: whether to measure options that are predicted to pay.  Measuring only raises a price, so the choice
+    is independent of which options were measured for other passes.
+    """
     if not options:
         return without_lights("no light comes by way of surfaces that virtual lights could stand for")
-    product, best = min((_priced(evidence, option) for option in options), key=lambda option: option[0])
+    most, found = _most_to_pay(evidence), []
+    for product, plan, option in sorted(((*_priced(evidence, x), x) for x in options), key=lambda priced: priced[0]):
+        if measures and not option.is_measured and product <= min([most, *(other for other, _ in found)]):
+            _ = option.residual
+            product, plan = _priced(evidence, option)
+        found.append((product, plan))
+    product, best = min(found, key=lambda priced: priced[0])
     remains = best.variance / max(evidence.whole, _TINY)
-    if product > _most_to_pay(evidence):
+    if product > most:
         costs = f"virtual lights would cost {best.cost - 1:.2g} times as much as the paths"
         return without_lights(f"{costs} and leave {remains:.0%} of the variance")
     return replace(best, reason=f"virtual lights remove {1 - remains:.0%} of the variance")
@@ -171,11 +195,6 @@ def without_lights(reason: str) -> Plan:
 def price(evidence: Evidence, option: Option) -> float:
     """Variance × cost with the lights of an option; a power of the variance in images that are denoised."""
     return _priced(evidence, option)[0]
-
-
-def may_pay(evidence: Evidence, option: Option, others: list[Option]) -> bool:
-    """Whether the lights of an option are predicted to pay, and to pay more than every option of ``others``."""
-    return price(evidence, option) <= min([_most_to_pay(evidence), *(price(evidence, other) for other in others)])
 
 
 def _most_to_pay(evidence: Evidence) -> float:

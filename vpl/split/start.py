@@ -1,20 +1,20 @@
-"""Start of a pass: the pilot, the emitter sampler that learned from the pilot, and measured kinds of virtual lights.
+"""Start of a pass: the pilot, the emitter sampler that learned from the pilot, and kinds of virtual lights to compare.
 
 The passes of a render may share a start.  Larger passes learn the emitters again, by more rays.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..core.sampling import derived_seed
+from ..lights.light_set import LightSet
 from .emitters.base import EmitterSampler
 from .emitters.cell_choice import learning_rays
 from .pilot import Pilot, relative_variance
-from .plan import Evidence, Option, may_pay, price
+from .plan import Evidence, Option
 from .view import Stream, View, ViewLights
 
 
@@ -56,14 +56,13 @@ class Start:
         return self.later[power]
 
 
-def make_start(view: View, virtual_lights: bool, is_shared: bool) -> Start:
-    """Trace the pilot of a view, learn from it, and measure kinds of virtual lights.
+def make_start(view: View, virtual_lights: bool) -> Start:
+    """Trace the pilot of a view, and learn from it.  ``virtual_lights``: whether virtual lights are allowed.
 
-    ``virtual_lights``: whether virtual lights are allowed; ``is_shared``: whether passes of different sizes use the
-    start, which requires measuring every kind.
+    The start keeps the camera rays of the view, because the first pass that may have virtual lights measures these.
     """
     (pilot, learned), refusal = learning_pilot(view), _refusal(view, virtual_lights)
-    options = [] if refusal else _options(view, pilot, evidence_of(view, pilot), is_shared)
+    options = [] if refusal else _options(view, pilot)
     return Start(pilot, view.emitters, learned, options, refusal, view.learning_count, view.seed)
 
 
@@ -109,29 +108,24 @@ def _refusal(view: View, virtual_lights: bool) -> str:
     return ""
 
 
-def _options(view: View, pilot: Pilot, evidence: Evidence, measures_all: bool) -> list[Option]:
-    """Kinds of lights that may pay; measures the residual of lights on surfaces if the residual can change the choice,
-    or always."""
-    options, assumed, emitters = [], _with_surfaces(view, pilot, False), None
-    if evidence.emitters:
-        emitters = view.emitter_lights([])
-        traced = Pilot.trace(view, ViewLights(emitters=emitters))
-        options.append(Option(False, True, traced.radiance, traced.indirect))
-        assumed += _with_surfaces(view, traced, True)
-    # A measured residual only raises the price of an option: options are tried in the order of the assumed price, and
-    # an option is measured only if still better than earlier options
-    for option in sorted(assumed, key=partial(price, evidence)):
-        if measures_all or may_pay(evidence, option, options):
-            # The distance between lights is not known yet. With c = 0 lights carry the most
-            surfaces = view.light_set([], 0.0)
-            residual = Pilot.trace(view, ViewLights(surfaces, emitters if option.emitters else None))
-            option = replace(option, residual=residual.radiance)
-        options.append(option)
-    return options
+def _options(view: View, pilot: Pilot) -> list[Option]:
+    """Kinds of virtual lights that are possible."""
+    if not _may_carry_emitters(view):
+        return _with_surfaces(view, pilot, None)
+    emitters = view.emitter_lights([])
+    traced = Pilot.trace(view, ViewLights(emitters=emitters))
+    only_emitters = Option(False, True, traced.radiance, traced.indirect)
+    return [only_emitters, *_with_surfaces(view, pilot, None), *_with_surfaces(view, traced, emitters)]
 
 
-def _with_surfaces(view: View, traced: Pilot, emitters: bool) -> list[Option]:
-    """The option of lights on surfaces, if there is indirect light; ``traced``: pilot without lights on surfaces."""
+def _with_surfaces(view: View, traced: Pilot, emitters: LightSet | None) -> list[Option]:
+    """The option of lights on surfaces, if there is indirect light, beside lights for ``emitters``; ``traced``: pilot
+    without lights on surfaces."""
     if view.rules.max_depth <= 2 or not traced.indirect.any():
         return []
-    return [Option(True, emitters, traced.radiance, traced.indirect)]
+
+    def residual():
+        # The distance between lights is not known yet. With c = 0 lights carry the most
+        return Pilot.trace(view, ViewLights(view.light_set([], 0.0), emitters)).radiance
+
+    return [Option(True, emitters is not None, traced.radiance, traced.indirect, residual)]

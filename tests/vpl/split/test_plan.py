@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vpl.split.cost_model import CostModel, table
-from vpl.split.plan import Evidence, Option, choose, may_pay, price
+from vpl.split.plan import Evidence, Option, choose, price
 
 DENOISED = CostModel()
 # Lights pay as in raw images, and are as many as in denoised ones
@@ -16,8 +16,8 @@ UNSEEN = 0.0
 
 
 def balanced(direct, indirect, paths, samples, left=None):
-    """The balance of an image of an even brightness; ``left``: of it besides lights on surfaces, if followed."""
-    option = Option(True, False, direct + indirect, indirect, left)
+    """The balance of an image of an even brightness; ``left``: of it besides lights on surfaces, if measured."""
+    option = Option(True, False, direct + indirect, indirect, lambda: left)
     return choose(
         Evidence(direct + indirect, UNSEEN, direct, np.ones(len(direct)), paths, samples, False, MODEL), [option]
     )
@@ -82,34 +82,61 @@ def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
     assert balanced(0.1 * direct, indirect, 10**8, 64, left=0.95 * indirect).light_paths == 0
 
 
+def measured(option, residual):
+    """The option with a measured residual."""
+    found = replace(option, measure=lambda: residual)
+    assert found.residual is residual and found.is_measured
+    return found
+
+
 @pytest.mark.parametrize("emitters", (False, True))
 @pytest.mark.parametrize("samples", (1, 64, 1024))
 @pytest.mark.parametrize("paths", (10**4, 10**6, 10**9))
 def test_the_more_lights_leave_the_higher_their_price(paths, samples, emitters):
-    """The lights prove worse than assumed only after they are followed."""
+    """The lights prove worse than assumed only after they are measured."""
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
     for scale in (1e-3, 1, 1e3):
         traced, small = direct + scale * indirect, 1e-3 * indirect
         evidence = Evidence(traced, UNSEEN, direct, np.ones(10_000), paths, samples, emitters, MODEL)
         assumed = Option(True, emitters, traced, scale * indirect)
-        prices = [price(evidence, replace(assumed, residual=noise * traced)) for noise in (0, 0.1, 0.5, 1, 2, 8, 64)]
+        prices = [price(evidence, measured(assumed, noise * traced)) for noise in (0, 0.1, 0.5, 1, 2, 8, 64)]
         assert prices[0] == price(evidence, assumed)
         assert (np.diff(prices) >= 0).all() and prices[-1] > 10 * prices[0]
-        assert price(evidence, replace(assumed, residual=small)) == prices[0]
+        assert price(evidence, measured(assumed, small)) == prices[0]
 
 
-def test_what_is_followed_has_to_promise_more_than_all_that_is_known():
+def test_options_are_measured_once_and_only_where_they_may_pay():
+    rng, calls = np.random.default_rng(0), []
+    indirect, direct = rng.exponential(size=(2, 10_000))
+    evidence = Evidence(direct + indirect, UNSEEN, direct, np.ones(10_000), 10**8, 64, False, MODEL)
+
+    def option(scale, residual, name):
+        return Option(True, False, direct + indirect, scale * indirect, lambda: calls.append(name) or residual)
+
+    good, worse = option(1.0, None, "good"), option(0.6, None, "worse")
+    assert choose(replace(evidence, paths=10), [good]).light_paths == 0 and not calls
+    assert choose(evidence, [good], measures=False).light_paths > 0 and not calls
+    both = choose(evidence, [worse, good])
+    assert both.light_paths > 0 and calls == ["good"]
+    assert choose(evidence, [worse, good]) == both and calls == ["good"]
+    # A residual that proves useless: the next option is measured
+    useless = option(1.0, 4 * indirect, "useless")
+    assert choose(evidence, [useless, worse]) == choose(evidence, [worse])
+    assert calls == ["good", "useless", "worse"]
+
+
+def test_a_choice_is_independent_of_earlier_measurements():
+    """Passes of a render share options, and workers render the passes in any order."""
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
-    evidence, none = (
-        Evidence(direct + indirect, UNSEEN, direct, np.ones(10_000), 10**8, 64, False, MODEL),
-        np.zeros(10_000),
-    )
-    good, better = Option(True, False, direct + indirect, indirect), Option(False, True, 0.1 * direct, none)
-    useless = replace(good, residual=4 * indirect)
-    assert may_pay(evidence, good, []) and may_pay(evidence, better, [good])
-    assert not may_pay(evidence, good, [better]) and not may_pay(evidence, useless, [])
+    for left in (None, 0.3 * indirect, 2 * indirect):
+        for paths in (10**4, 10**6, 10**8):
+            evidence = Evidence(direct + indirect, UNSEEN, direct, np.ones(10_000), paths, 64, False, MODEL)
+            fresh, shared = (Option(True, False, direct + indirect, indirect, lambda x=left: x) for _ in range(2))
+            choose(replace(evidence, paths=10**9), [shared])
+            assert shared.is_measured
+            assert choose(evidence, [fresh]).light_paths == choose(evidence, [shared]).light_paths
 
 
 def test_more_vertices_are_lit_the_less_noise_there_is_besides():
