@@ -126,7 +126,7 @@ def make_lights(view: View, decision: Decision, kept: KeptLights | None, clock: 
 
 def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clock: Clock):
     """(Light set on surfaces, or None; statistics)."""
-    wanted, arrivals = decision.plan.light_paths, decision.pilot.arrivals
+    wanted, pilot = decision.plan.light_paths, decision.pilot
     if not wanted:
         return None, {}
     clock.begin(Stage.LIGHTS)
@@ -134,13 +134,13 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
 
     def make():
         drawn.append(wanted)
-        return surface_lights(view, arrivals, wanted, lambda: clock.begin(Stage.TREE))
+        return surface_lights(view, pilot.octree, wanted, lambda: clock.begin(Stage.TREE))
 
     made = kept.find(view.scene, (view.seed, view.rules.max_depth, view.model.shared), make) if kept else make()
     statistics = {"light_paths": sum(drawn), "lights": {"surface": made.lights.count}}
     if not made.groups:
         return None, statistics
-    return view.light_set(made.groups, made.spacing(arrivals)), statistics
+    return view.light_set(made.groups, pilot.spacing(made.octree, made.lines)), statistics
 
 
 # ---------------------- Image ----------------------

@@ -24,6 +24,8 @@ from ..core.morton import interleave
 
 # Largest number of arrivals in a leaf; largest depth of the octree: the number of bits per axis of a Morton code
 _LARGEST_LEAF, _LEVELS = 16, 20
+# Number of prior arrivals of average radiance in each leaf: a leaf holds up to 16 arrivals
+_PRIOR = 2.0
 # Fraction of the lines through parents of leaves and through the whole scene: keeps the density positive everywhere
 _PARENT_SHARE, _SCENE_SHARE = 0.15, 0.05
 # Margin of a box around the arrivals, as a fraction of the leaf; largest |M|, below 1 to reach both sides
@@ -84,7 +86,7 @@ class ArrivalOctree:
         low, extent = position.min(0), np.ptp(position, axis=0)
         self._size = max(float(extent.max()), 1e-6 * scene_size) * generator.uniform(1.1, 2.0)
         self._low = low - generator.random(3) * (self._size - extent)
-        self._scene_low, self._scene_size = np.asarray(scene_low, np.float64), float(scene_size)
+        self._scene_low, self.scene_size = np.asarray(scene_low, np.float64), float(scene_size)
         leaf = _leaves(self._finest(position))
         self._leaves = self._boxes_around(leaf, position, normal, weight)
         self.leaf_of_point = np.searchsorted(self._leaves.number, leaf)
@@ -98,6 +100,14 @@ class ArrivalOctree:
         )
         self.choose_by(self.leaf_weight)
 
+    def choose_by_radiance(self, radiance: np.ndarray) -> None:
+        """Draw leaves in proportion to the number of arrivals times the root mean square of their ``radiance`` (n,)."""
+        leaf, size = self.leaf_of_point, len(self.leaf_weight)
+        number, typical = np.bincount(leaf, minlength=size), np.mean(radiance**2)
+        if typical > 0:
+            squared = np.bincount(leaf, radiance**2, size)
+            self.choose_by(number * np.sqrt((squared + _PRIOR * typical) / (number + _PRIOR)))
+
     def choose_by(self, importance: np.ndarray) -> None:
         """Draw leaves in proportion to ``importance``, (leaves,) float64."""
         share = importance / importance.sum()
@@ -109,7 +119,7 @@ class ArrivalOctree:
         parts = (self._leaves, self._parents)
         chance = np.concatenate([*(part.chance for part in parts), [_SCENE_SHARE]])
         low = np.concatenate([*(part.low for part in parts), self._scene_low[None]])
-        size = np.concatenate([*(part.size for part in parts), np.full((1, 3), self._scene_size)])
+        size = np.concatenate([*(part.size for part in parts), np.full((1, 3), self.scene_size)])
         turn = np.concatenate([*(part.turn for part in parts), np.zeros((1, 3))])
         sample = (np.arange(count) + generator.random(count)) / count
         row = np.minimum(np.searchsorted(np.cumsum(chance), sample * chance.sum(), side="right"), len(chance) - 1)
@@ -124,7 +134,7 @@ class ArrivalOctree:
     def density(self, position, normal) -> np.ndarray:
         """Expected hits per area of one line, on the side of a surface with the ``normal`` (n, 3): (n,) float64."""
         position = np.asarray(position, np.float64)
-        found = np.full(len(position), _SCENE_SHARE / (6 * self._scene_size**2))
+        found = np.full(len(position), _SCENE_SHARE / (6 * self.scene_size**2))
         for boxes in (self._leaves, self._parents):
             surface = boxes.surface
             for row, inside in self._found(boxes, position):
@@ -179,13 +189,18 @@ def _inside(position, low, size) -> np.ndarray:
 
 def _leaves(finest: np.ndarray) -> np.ndarray:
     """Number of the leaf of each point: the largest node with few enough points."""
-    leaf = finest.copy()
+    order = np.argsort(finest, kind="stable")
+    inside, leaf = finest[order], finest[order]
     for level in range(_LEVELS - 1, -1, -1):
-        number = finest >> np.uint64(3 * (_LEVELS - level))
-        _, inverse, count = np.unique(number, return_inverse=True, return_counts=True)
-        few = count[inverse] <= _LARGEST_LEAF
+        # Points of a node are neighbours in the order
+        number = inside >> np.uint64(3 * (_LEVELS - level))
+        first = np.flatnonzero(np.concatenate([[True], number[1:] != number[:-1]]))
+        count = np.diff(np.append(first, len(number)))
+        few = np.repeat(count <= _LARGEST_LEAF, count)
         leaf[few] = number[few]
-    return leaf
+    found = np.empty_like(leaf)
+    found[order] = leaf
+    return found
 
 
 def _chords(size: np.ndarray, generator):

@@ -10,8 +10,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import channel_mean, download, upload
+from ..core.sampling import derived_seed
+from ..lights.emission import bounding_box
 from .cost_model import CostModel
 from .gather_vertices import GatherVertices, SecondVertices
+from .line_sampling import ArrivalOctree
 from .path_tracer import Traced, trace_camera_rays
 from .view import Gathering, Stream, View, ViewLights
 
@@ -49,7 +52,8 @@ class Pilot:
 
     ``pixel``, ``radiance`` (n,): of each path; ``seen`` (n,): emission on the first edge; ``indirect`` (n,): part of
     the radiance through arrivals.  Values may be negative if virtual lights carry a part.  ``vertices``: positions and
-    normals (k, 3) of first and second vertices; ``size``: width of the image and number of pixels.
+    normals (k, 3) of first and second vertices; ``size``: width of the image and number of pixels; ``cube``: lower
+    corner and size of a cube around the scene, world units; ``seed`` of the octree.
     """
 
     arrivals: Arrivals
@@ -60,6 +64,8 @@ class Pilot:
     seen: np.ndarray
     indirect: np.ndarray
     size: tuple[int, int]
+    cube: tuple[np.ndarray, float]
+    seed: int
     model: CostModel
 
     @classmethod
@@ -69,10 +75,11 @@ class Pilot:
         lane = view.pairs(min(model.pilot_rays, int(model.pilot_share * view.learning_count)))
         settings = view.settings(lights, Gathering.AT_FIRST)
         traced = trace_camera_rays(view, upload(mi.UInt32, lane), settings, Stream.PILOT)
-        return cls.of(traced, view.rays.pixel_of(lane), (view.width, view.pixels), model)
+        size, seed = (view.width, view.pixels), derived_seed(view.seed, Stream.OCTREE)
+        return cls.of(traced, view.rays.pixel_of(lane), size, _cube_around(view.scene), seed, model)
 
     @classmethod
-    def of(cls, traced: Traced, pixel: np.ndarray, size: tuple[int, int], model: CostModel) -> Pilot:
+    def of(cls, traced: Traced, pixel: np.ndarray, size, cube, seed: int, model: CostModel) -> Pilot:
         """The pilot of traced paths in the pixels ``pixel`` (n,)."""
         radiance, seen = (
             np.nan_to_num(download(x).astype(np.float64), posinf=0, neginf=0)
@@ -82,7 +89,29 @@ class Pilot:
         arrivals, onward, indirect = _second_vertices(traced.gathered.second, radiance, edges)
         first, facing = _first_vertices(traced.gathered.first)
         vertices = np.concatenate([first, arrivals.position]), np.concatenate([facing, arrivals.normal])
-        return cls(arrivals, onward, vertices, pixel, radiance, seen, indirect, size, model)
+        return cls(arrivals, onward, vertices, pixel, radiance, seen, indirect, size, cube, seed, model)
+
+    @cached_property
+    def octree(self) -> ArrivalOctree:
+        """Octree over the arrivals, drawn by their radiance: lights matter where visible and bright.  All passes of a
+        render share the octree."""
+        arrivals, generator = self.arrivals, np.random.default_rng(self.seed)
+        octree = ArrivalOctree(arrivals.position, arrivals.normal, arrivals.weight, *self.cube, generator)
+        octree.choose_by_radiance(arrivals.radiance)
+        return octree
+
+    def spacing(self, octree: ArrivalOctree, lines: int) -> float:
+        """Typical distance between the lights of ``lines`` lines through ``octree``, where paths arrive, world
+        units."""
+        of_one = self._spacing if octree is self.octree else self._spacing_of(octree)
+        return of_one / lines**0.5
+
+    @cached_property
+    def _spacing(self) -> float:
+        return self._spacing_of(self.octree)
+
+    def _spacing_of(self, octree: ArrivalOctree) -> float:
+        return float(np.median(octree.density(self.arrivals.position, self.arrivals.normal) ** -0.5))
 
     @property
     def brightness(self) -> np.ndarray:
@@ -128,6 +157,15 @@ def _first_vertices(first: GatherVertices) -> tuple[np.ndarray, np.ndarray]:
     position, facing, depth = (download(x) for x in (first.position, first.normal, first.depth))
     seen = (depth > 0) & np.isfinite(position).all(1)
     return position[seen], facing[seen]
+
+
+def _cube_around(scene) -> tuple[np.ndarray, float]:
+    """(Lower corner, size) of a cube around the surfaces of a scene, world units."""
+    box = bounding_box(scene)
+    low, extent = np.array(box.min, np.float64), np.array(box.extents(), np.float64)
+    # A little larger, so no surface lies on the sides of the cube
+    size = 1.001 * max(float(extent.max()), np.finfo(np.float32).tiny)
+    return low + 0.5 * (extent - size), size
 
 
 # ---------------------- Relative variance ----------------------

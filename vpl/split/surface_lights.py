@@ -21,7 +21,6 @@ import numpy as np
 from ..core.arrays import download, ones, spectrum_to_rgb
 from ..core.parameters import fingerprint_without_camera
 from ..core.sampling import derived_seed, independent_sampler
-from ..lights.emission import bounding_box
 from ..lights.light_set import ScatteredGroup
 from ..lights.virtual_lights import VirtualLights
 from .emitters.base import EmitterSampler, Places, irradiance_from_emitters
@@ -29,12 +28,9 @@ from .lattice import Lattice
 from .line_hits import LineHits, hits_of
 from .line_sampling import ArrivalOctree
 from .path_tracer import trace_paths
-from .pilot import Arrivals
 from .roulette import OutgoingRadiance
 from .view import FirstEdge, Gathering, PathSettings, State, Stream, View, ViewLights
 
-# Number of prior arrivals of average radiance in each leaf: a leaf holds up to 16 arrivals
-_PRIOR = 2.0
 # Emitter samples of a light in scenes of many emitters: with one, a light near a lamp was a bright blotch
 _EMITTER_SAMPLES = 4
 # Largest number of kept lights over every seed, some 400 bytes each
@@ -53,20 +49,18 @@ class SurfaceLights:
     lines: int
     groups: list[ScatteredGroup]
 
-    def spacing(self, arrivals: Arrivals) -> float:
-        """Typical distance between lights where camera paths arrive, world units."""
-        density = self.lines * self.octree.density(arrivals.position, arrivals.normal)
-        return float(np.median(1 / np.sqrt(density)))
 
+def surface_lights(view: View, octree: ArrivalOctree, count: int, announce_tree: Callable[[], None]) -> SurfaceLights:
+    """The lights at the crossings of ``count`` lines, with trees; calls ``announce_tree`` before building the trees.
 
-def surface_lights(view: View, arrivals: Arrivals, count: int, announce_tree: Callable[[], None]) -> SurfaceLights:
-    """The lights at the crossings of ``count`` lines, with trees; calls ``announce_tree`` before building the trees."""
+    ``octree``: of the arrivals of a pilot.
+    """
     # A path from a light lacks the two edges between camera and light; the expected contribution is unknown, because
     # the path is no camera path
     rules = replace(view.rules, max_depth=view.rules.max_depth - 2, rr_depth=1)
     settings = replace(view, rules=rules, outgoing=OutgoingRadiance.unknown()).settings(ViewLights())
     seed = derived_seed(view.seed, Stream.SURFACE_LIGHTS)
-    lights, octree = _drawn_lights(view.scene, view.emitters, arrivals, count, settings, seed)
+    lights = _drawn_lights(view.scene, view.emitters, octree, count, settings, seed)
     parts = _by_sign(lights)
     if parts:
         announce_tree()
@@ -86,34 +80,17 @@ def _by_sign(lights: VirtualLights) -> list[tuple[VirtualLights, float]]:
     return [(part, sign) for part, sign in parts if part.count]
 
 
-def _drawn_lights(scene, emitters: EmitterSampler, arrivals: Arrivals, count: int, settings: PathSettings, seed: int):
-    """(Lights at the crossings of ``count`` lines, octree of the lines)."""
+def _drawn_lights(
+    scene, emitters: EmitterSampler, octree: ArrivalOctree, count: int, settings: PathSettings, seed: int
+):
+    """The lights at the crossings of ``count`` lines."""
     generator = np.random.default_rng(seed)
-    box = bounding_box(scene)
-    low, extent = np.array(box.min, np.float64), np.array(box.extents(), np.float64)
-    # A little larger, so no surface lies on the sides of the cube
-    size = 1.001 * max(float(extent.max()), np.finfo(np.float32).tiny)
-    octree = ArrivalOctree(
-        arrivals.position, arrivals.normal, arrivals.weight, low + 0.5 * (extent - size), size, generator
-    )  # fmt: skip
-    octree.choose_by(_importance(octree, arrivals))
-    hits = hits_of(scene, octree.lines(count, generator), size, generator)
+    hits = hits_of(scene, octree.lines(count, generator), octree.scene_size, generator)
     lights = _lights_at(scene, emitters, hits, settings, derived_seed(seed, 1))
     density = count * octree.density(lights.position, lights.direction)
     with np.errstate(over="ignore"):
         lights.intensity = (lights.intensity / density[:, None]).astype(np.float32)
-    return lights, octree
-
-
-def _importance(octree: ArrivalOctree, arrivals: Arrivals) -> np.ndarray:
-    """Fraction of the lights for each leaf: number of arrivals times root mean square radiance."""
-    leaf, size = octree.leaf_of_point, len(octree.leaf_weight)
-    number = np.bincount(leaf, minlength=size)
-    squared = np.bincount(leaf, arrivals.radiance**2, size)
-    typical = np.mean(arrivals.radiance**2)
-    if not typical > 0:
-        return octree.leaf_weight
-    return number * np.sqrt((squared + _PRIOR * typical) / (number + _PRIOR))
+    return lights
 
 
 def _lights_at(scene, emitters: EmitterSampler, hits: LineHits, settings: PathSettings, seed: int) -> VirtualLights:

@@ -33,6 +33,7 @@ class Stream(IntEnum):
     LEARNING = 6
     EMITTER_LIGHTS = 7
     ALPHA = 8
+    OCTREE = 9
 
 
 class State:
