@@ -115,7 +115,8 @@ class Denoiser:
         while True:
             seconds, size = self._seconds_of(tile(width), quality), tile(width)["color"].size
             if seconds >= TILE_SECONDS or size == whole:
-                return seconds * whole / size
+                # A large image multiplies the error of a single measurement
+                return min(seconds, self._seconds_of(tile(width), quality)) * whole / size
             width *= 2
 
     def _seconds_of(self, inputs, quality):

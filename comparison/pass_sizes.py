@@ -32,7 +32,7 @@ PASS_SECONDS = 2.0
 PART_SECONDS, LEAST_REST = 10.0, 1.0  # of a pass in parts; minimum ratio of its rest to its start, which has priority
 LEAST_GAIN = 1 / 16  # minimum size of a last pass with virtual lights, as a fraction of the intended size
 LIT = 2.0  # usual cost of a sample with virtual lights over that without, at most: small passes have no lights
-UNSURE = 1.1  # cost over a predicted one, at most: 0.67 to 0.95 in nine scenes, 16 and 64 samples, 256 wide
+UNSURE = 1.1  # cost over a predicted one, at most: measured are 0.67 to 0.95 at 256 pixels wide, up to 1.11 at others
 DOUBT = 0.5  # fraction of the remaining time for a second pass, which may have lights and cost more than expected
 DIFFERENT = 1.08  # usual cost of a sample where pixels have different numbers: there are more at edges and on glass
 PROBE = 0.25  # fraction of the remaining time, or samples, for a second pass that determines the samples of the pixels
@@ -66,8 +66,8 @@ class PassSizes:
         self._current, self._seconds, self._asked = fixed or self._least, {}, None
         self._known = {}  # size -> seconds of the last pass; not of the first pass, which is slower
         self._starts = {}  # size -> seconds to start the last pass, of passes that report them
-        self._lit, self._lit_cost = False, LIT  # whether a pass had virtual lights; their cost, at most
-        self._predicted = []  # (size, cost of a sample over those so far, at most) for sizes up to it, by the last pass
+        self._lit = False  # whether a pass had virtual lights
+        self._predicted = []  # (largest size, cost of a sample over those so far, at most) of ranges of sizes
         self._kernel_seconds = 0.0  # expected compilation of the next pass
         self._dearer = 1.0  # expected cost of a sample of the next pass over that of known passes
         self._before = None  # number of passes from a checkpoint; None until the first call
@@ -120,8 +120,9 @@ class PassSizes:
             self._starts[self._asked] = last.start_seconds
             self._lit |= last.has_lights
             if last.growth:
-                costs = [(times * self._asked, UNSURE * cost if cost > 1 else 1.0) for times, cost in last.growth]
-                self._predicted, self._lit_cost = costs, max(cost for _, cost in costs)
+                costs = [UNSURE * cost if cost > 1 else 1.0 for _, cost in last.growth]
+                sizes = [times * self._asked for times, _ in last.growth]
+                self._predicted = list(zip(sizes, costs, strict=True))
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
         if not is_first:
             before = self._known.get(self._asked, seconds)
@@ -142,9 +143,10 @@ class PassSizes:
     def _grown(self, seconds, wanted, repeated, line):
         """Return the size of a pass of at most `wanted` seconds, from the `seconds` of a pass of the current size."""
         if line:
-            start, each = line
             if self._any_size:
-                return self._kept(int((wanted - start) / each))
+                return self._kept(self._filling(wanted))
+            start, each = line
+            each *= self._last_cost if self._may_be_lit else 1.0
             return min(_power_of_two((wanted - start) / each), MOST_GROWTH * self._current)
         grown = _power_of_two(self._current * wanted / max(seconds, 1e-6))
         if repeated and seconds < wanted:
@@ -160,15 +162,13 @@ class PassSizes:
         pass in parts would be far smaller than usual.
         """
         least = size if self._fixed else min(size, self._least)
-        line, whole, predicted = self._line(), left, []
+        whole, predicted = left, 0
         if self.is_probe:
             left = PROBE * min(left, PART_SECONDS)
-        elif self._any_size and not self._known and not self._lit:
-            predicted, left = self._predicted, DOUBT * left
-        if self._any_size and line:
-            filling = self._filling(left, *line)
-            for most, cost in predicted:
-                filling = max(filling, min(self._filling(whole, *self._line(cost)), most))
+        elif self._any_size and self._may_be_lit:
+            left, predicted = DOUBT * left, self._predicted[-1][0] if self._predicted else 0
+        if self._any_size and self._line():
+            filling = max(self._filling(left), min(self._filling(whole), predicted))
             # Without virtual lights, small passes are as good as large ones
             if self._known and filling < (LEAST_GAIN * size if self._lit else least):
                 return 0
@@ -180,14 +180,35 @@ class PassSizes:
             size = max(least, _power_of_two(size - 1))
         return size if self._expected(size) <= max(2 * left, whole) else 0
 
-    def _filling(self, seconds, start, each):
-        """Return the size of a pass of some `seconds`, from its start and the seconds per sample."""
-        return int((seconds - self._kernel_seconds - start) / (self._dearer * each))
+    @property
+    def _may_be_lit(self):
+        """Whether the next pass may be the first one with virtual lights, and its cost is not known."""
+        return not self._known and not self._lit
+
+    def _cost_of(self, size):
+        """Return the expected cost of a sample of a pass with virtual lights, over those so far."""
+        return next((cost for most, cost in self._predicted if size <= most), self._last_cost)
+
+    @property
+    def _last_cost(self):
+        return self._predicted[-1][1] if self._predicted else LIT
+
+    def _filling(self, seconds):
+        """Return the largest size of a pass of some `seconds`, by its expected cost."""
+        start, each = self._line()
+        affordable = (seconds - self._kernel_seconds - start) / (self._dearer * each)
+        ranges = [*self._predicted, (math.inf, self._last_cost)] if self._may_be_lit else [(math.inf, 1.0)]
+        found = before = 0
+        for most, cost in ranges:
+            size = int(min(affordable / cost, most))
+            # The cost is that of sizes beyond the range before
+            found, before = size if size > before else found, most
+        return found
 
     def _certain(self, size):
         """Return the largest size up to `size` that takes no longer than expected if its pass has virtual lights."""
         known = max(self._known, default=0)
-        return int(size if self._lit or not known else min(size, max(known, size / self._lit_cost)))
+        return int(size if self._lit or not known else min(size, max(known, size / self._cost_of(size))))
 
     def _kept(self, size):
         """Return the largest size up to `size` that the sampler keeps."""
@@ -212,11 +233,10 @@ class PassSizes:
             large, longest = max((self._known or self._seconds).items())
             line = 0.0, longest / large
         start, each = line
-        return start + each * size
+        return start + each * size * (self._cost_of(size) if self._starts and self._may_be_lit else 1.0)
 
-    def _line(self, lit_cost=None):
-        """Return the seconds to start a pass, and the seconds per sample per pixel; None if unknown. `lit_cost`: cost
-        of the samples of a second pass over those of the first, by default the largest one that is expected.
+    def _line(self):
+        """Return the seconds to start a pass, and the seconds per sample per pixel of known passes; None if unknown.
 
         From the shortest start that passes report, or else from the largest size and the least one within
         `MOST_GROWTH` of it.
@@ -227,7 +247,7 @@ class PassSizes:
             each = max((longest - self._starts[large]) / large, LEAST_SHARE * longest / large)
             # Some passes learn for all passes of their size. Larger passes than the first one may have virtual lights
             start = min(self._starts[size] for size in (self._known.keys() & self._starts.keys()) or self._starts)
-            return start, each if self._known or self._lit else (lit_cost or self._lit_cost) * each
+            return start, each
         small = min((size for size in self._known if MOST_GROWTH * size >= large), default=0)
         if small == large:
             return None

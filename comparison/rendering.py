@@ -68,13 +68,13 @@ class Pass:
     @property
     def growth(self):
         """Expected costs of a sample of larger passes, a list of (ratio of the sizes, cost over that in this pass) by
-        size; None if the integrator does not predict them."""
+        size; None if the integrator does not predict them, as for a pass with virtual lights."""
         return self.statistics.get("growth")
 
     @property
     def repeated_seconds(self):
-        """Seconds without compilation, and without the pilot if later passes share it."""
-        made = self.statistics.get("pilots", 0)
+        """Seconds without compilation, and without the pilot and its measurements if later passes share them."""
+        made = self.statistics.get("pilots", 0) or self.statistics.get("measured", 0)
         not_repeated = (self.compile_seconds or 0.0) + (self.statistics["seconds"][Stage.PILOT] if made else 0.0)
         return max(self.seconds - not_repeated, 0.0)
 

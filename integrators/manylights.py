@@ -307,9 +307,11 @@ class ManyLightsIntegrator(GatheringIntegrator):
             none = [dr.zeros(mi.Float, view.count) for _ in self.aov_names()]
             return dr.zeros(mi.Spectrum, view.count), dr.zeros(mi.Bool, view.count), none
         kept = self._kept if self.keep_lights else None
+        before = start.measured
         found = estimate(view, start, kept, self.should_stop, clock)
-        self.statistics = found.statistics | {"pilots": int(known is None)}
-        if shared:
+        # Later passes share the pilot and its measurements
+        self.statistics = found.statistics | {"pilots": int(known is None), "measured": start.measured - before}
+        if shared and not found.decision.plan.gathers:
             self.statistics["growth"] = [(times, found.decision.growth(times)) for times in _LARGER]
         channels = [channel for name in self._layer_names for channel in found.layers[name]]
         if view.rays.differ:

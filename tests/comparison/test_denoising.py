@@ -180,7 +180,7 @@ def test_the_time_of_the_denoiser_is_expected_from_a_tile(size, monkeypatch):
 
     monkeypatch.setattr(Denoiser, "_seconds_of", seconds_of)
     assert Denoiser(scene).expected_seconds == pytest.approx(1e-5 * size**2)
-    assert widths == [min(size, 64)] * 2
+    assert widths == [min(size, 64)] * 3
 
 
 def test_tiles_become_larger_where_the_denoiser_is_fast(monkeypatch):
@@ -189,7 +189,7 @@ def test_tiles_become_larger_where_the_denoiser_is_fast(monkeypatch):
         Denoiser, "_seconds_of", lambda self, inputs, quality: widths.append(len(inputs["color"])) or 1e-9
     )
     assert Denoiser(scene).expected_seconds == 1e-9
-    assert widths == [64, 64, 128, 256, 300]
+    assert widths == [64, 64, 128, 256, 300, 300]
 
 
 @pytest.mark.parametrize(

@@ -258,6 +258,9 @@ def test_in_parts_costs_may_be_predicted_for_several_sizes():
     # 32 samples may cost so much that 16 are the most that surely fit
     assert second_size([1.0, 3.0], time=2.4) == 16
     assert second_size([1.0, 1.2], time=2.4) == 19
+    # The cost at 32 samples does not tell that of 12
+    assert second_size([3.0, 1.0], time=1.4) == 4
+    assert second_size([3.0, 1.0], time=2.4) == 25
 
 
 def test_in_parts_samples_after_a_probe_are_expected_to_cost_more():

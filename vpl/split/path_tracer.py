@@ -35,6 +35,7 @@ from .contributions import Contributions, LayerSums
 from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
 from .gather_vertices import Gathered, GatherVertices, SecondVertices
 from .lattice import Lattice
+from .pixel_rays import RayNumbers
 from .roulette import residual_survival, throughput_survival
 from .view import Edge, FirstEdge, Gathering, PathSettings, State, View
 
@@ -191,20 +192,46 @@ def trace_paths(
     return traced
 
 
+@dataclass(frozen=True)
+class CameraRays:
+    """Some camera rays of a view.
+
+    ``ray``; ``active``; ``importance`` of radiance, for Russian roulette; ``places`` in pixels; ``sizes``: the
+    different numbers of rays of pixels.
+    """
+
+    ray: mi.Ray3f
+    active: mi.Bool
+    importance: mi.Float
+    places: RayNumbers
+    sizes: tuple[int, ...]
+
+    @classmethod
+    def of(cls, view: View, lane: mi.UInt32) -> CameraRays:
+        """The rays with the indices ``lane``."""
+        ray, places = view.ray, view.rays.places(lane)
+        part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
+        # All numbers of rays, and counted and chosen lanes, use the same kernel
+        dr.eval(lane, places)
+        importance = dr.gather(mi.Float, view.importance, places.pixel)
+        return cls(part, dr.gather(mi.Bool, view.active, lane), importance, places, view.rays.sizes)
+
+    def trace(
+        self, scene, emitters: EmitterSampler, seed: int, settings: PathSettings, sums: LayerSums | None = None
+    ) -> Traced:
+        """Trace paths from the camera; ``sums`` by layer."""
+        edge = FirstEdge.of_camera(self.ray, self.importance, self.active)
+        lattice = Lattice(self.places, self.sizes, derived_seed(seed, 0))
+        sampler = independent_sampler(derived_seed(seed, 1), dr.width(self.places.pixel))
+        return trace_paths(scene, emitters, edge, lattice, sampler, settings, sums)
+
+
 def trace_camera_rays(
     view: View, lane: mi.UInt32, settings: PathSettings, *stream: int, sums: LayerSums | None = None
 ) -> Traced:
     """Trace the camera rays ``lane`` of a view; ``stream``: of random numbers; ``sums`` by layer."""
-    seed, ray = derived_seed(view.seed, *stream), view.ray
-    part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
-    places = view.rays.places(lane)
-    # All numbers of rays, and counted and chosen lanes, use the same kernel
-    dr.eval(lane, places)
-    importance = dr.gather(mi.Float, view.importance, places.pixel)
-    edge = FirstEdge.of_camera(part, importance, dr.gather(mi.Bool, view.active, lane))
-    lattice = Lattice(places, view.rays.sizes, derived_seed(seed, 0))
-    sampler = independent_sampler(derived_seed(seed, 1), dr.width(lane))
-    return trace_paths(view.scene, view.emitters, edge, lattice, sampler, settings, sums)
+    seed = derived_seed(view.seed, *stream)
+    return CameraRays.of(view, lane).trace(view.scene, view.emitters, seed, settings, sums)
 
 
 def _less_carried(path: Path, met: MetEmitter, settings: PathSettings):

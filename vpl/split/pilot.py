@@ -52,8 +52,8 @@ class Pilot:
 
     ``pixel``, ``radiance`` (n,): of each path; ``seen`` (n,): emission on the first edge; ``indirect`` (n,): part of
     the radiance through arrivals.  Values may be negative if virtual lights carry a part.  ``vertices``: positions and
-    normals (k, 3) of first and second vertices; ``size``: width of the image and number of pixels; ``cube``: lower
-    corner and size of a cube around the scene, world units; ``seed`` of the octree.
+    normals (k, 3) of first and second vertices; ``size``: width of the image and number of pixels; ``scene``;
+    ``seed`` of the octree.
     """
 
     arrivals: Arrivals
@@ -64,46 +64,46 @@ class Pilot:
     seen: np.ndarray
     indirect: np.ndarray
     size: tuple[int, int]
-    cube: tuple[np.ndarray, float]
+    scene: mi.Scene
     seed: int
     model: CostModel
 
     @classmethod
     def trace(cls, view: View, lights: ViewLights) -> Pilot:
         """Trace pairs of paths over the whole image, always the same paths, without the light carried by ``lights``."""
-        model = view.model
-        lane = view.pairs(min(model.pilot_rays, int(model.pilot_share * view.learning_count)))
-        settings = view.settings(lights, Gathering.AT_FIRST)
-        traced = trace_camera_rays(view, upload(mi.UInt32, lane), settings, Stream.PILOT)
-        size, seed = (view.width, view.pixels), derived_seed(view.seed, Stream.OCTREE)
-        return cls.of(traced, view.rays.pixel_of(lane), size, _cube_around(view.scene), seed, model)
+        lane = pilot_lanes(view)
+        traced = trace_camera_rays(
+            view, upload(mi.UInt32, lane), view.settings(lights, Gathering.AT_FIRST), Stream.PILOT
+        )
+        return cls.of(traced, view, view.rays.pixel_of(lane))
 
     @classmethod
-    def of(cls, traced: Traced, pixel: np.ndarray, size, cube, seed: int, model: CostModel) -> Pilot:
-        """The pilot of traced paths in the pixels ``pixel`` (n,)."""
-        radiance, seen = (
-            np.nan_to_num(download(x).astype(np.float64), posinf=0, neginf=0)
-            for x in (channel_mean(traced.radiance), traced.seen)
-        )
+    def of(cls, traced: Traced, view: View, pixel: np.ndarray) -> Pilot:
+        """The pilot of traced paths in the pixels ``pixel`` (n,) of a view."""
+        radiance, seen = mean_radiance(traced.radiance), _finite(traced.seen)
         edges = download(traced.edges).astype(np.int64)
         arrivals, onward, indirect = _second_vertices(traced.gathered.second, radiance, edges)
         first, facing = _first_vertices(traced.gathered.first)
         vertices = np.concatenate([first, arrivals.position]), np.concatenate([facing, arrivals.normal])
-        return cls(arrivals, onward, vertices, pixel, radiance, seen, indirect, size, cube, seed, model)
+        size, seed = (view.width, view.pixels), derived_seed(view.seed, Stream.OCTREE)
+        return cls(arrivals, onward, vertices, pixel, radiance, seen, indirect, size, view.scene, seed, view.model)
 
     @cached_property
     def octree(self) -> ArrivalOctree:
         """Octree over the arrivals, drawn by their radiance: lights matter where visible and bright.  All passes of a
         render share the octree."""
         arrivals, generator = self.arrivals, np.random.default_rng(self.seed)
-        octree = ArrivalOctree(arrivals.position, arrivals.normal, arrivals.weight, *self.cube, generator)
+        octree = ArrivalOctree(
+            arrivals.position, arrivals.normal, arrivals.weight, *_cube_around(self.scene), generator
+        )
         octree.choose_by_radiance(arrivals.radiance)
         return octree
 
     def spacing(self, octree: ArrivalOctree, lines: int) -> float:
         """Typical distance between the lights of ``lines`` lines through ``octree``, where paths arrive, world
         units."""
-        of_one = self._spacing if octree is self.octree else self._spacing_of(octree)
+        # Kept lights have the octree of another pilot
+        of_one = self._spacing if octree is vars(self).get("octree") else self._spacing_of(octree)
         return of_one / lines**0.5
 
     @cached_property
@@ -136,6 +136,20 @@ class Pilot:
     @cached_property
     def _of_others(self) -> tuple[np.ndarray, list[float]]:
         return means_of_others(self.radiance, self.pixel, *self.size, self.model)
+
+
+def pilot_lanes(view: View) -> np.ndarray:
+    """Indices (n,) of the camera rays of a pilot: pairs over the whole image."""
+    return view.pairs(min(view.model.pilot_rays, int(view.model.pilot_share * view.learning_count)))
+
+
+def mean_radiance(radiance) -> np.ndarray:
+    """Mean over channels (n,), float64; 0 where it is not finite."""
+    return _finite(channel_mean(radiance))
+
+
+def _finite(values: mi.Float) -> np.ndarray:
+    return np.nan_to_num(download(values).astype(np.float64), posinf=0, neginf=0)
 
 
 def _second_vertices(second: SecondVertices, radiance: np.ndarray, edges: np.ndarray):

@@ -47,30 +47,26 @@ class Plan:
         return self.emitters or self.light_paths > 0
 
 
-@dataclass(frozen=True)
+@dataclass
 class Option:
     """Kinds of virtual lights: on ``surfaces``, for ``emitters``, or both.
 
     Values (n,) of a pilot's paths: ``traced``: radiance without lights on surfaces; ``indirect``: part of ``traced``
-    available to lights on surfaces.  ``measure`` returns the :attr:`residual`, None if nothing can be measured.
+    available to lights on surfaces; ``residual``: measured radiance without the part carried by lights on surfaces,
+    None if not measured.  ``to_measure`` computes the residual; None if there is nothing to measure.
     """
 
     surfaces: bool
     emitters: bool
     traced: np.ndarray
     indirect: np.ndarray
-    measure: Callable[[], np.ndarray] | None = None
+    to_measure: Callable[[], np.ndarray] | None = None
+    residual: np.ndarray | None = None
 
-    @cached_property
-    def residual(self) -> np.ndarray | None:
-        """Measured radiance (n,) without the part carried by lights on surfaces.  Measuring takes time, and is done for
-        the first pass that needs it; until then, prices are based on an assumption."""
-        return self.measure() if self.measure else None
-
-    @property
-    def is_measured(self) -> bool:
-        """Whether :attr:`residual` is known."""
-        return "residual" in vars(self)
+    def measure(self) -> None:
+        """Compute the residual at the first call."""
+        if self.to_measure:
+            self.residual, self.to_measure = self.to_measure(), None
 
     @property
     def expected(self) -> np.ndarray:
@@ -83,16 +79,18 @@ class Option:
         total = np.sum(self.indirect)
         return len(self.indirect) * np.sum(self.indirect**2) / total**2 if total else 0.0
 
-    def variance(self, evidence: Evidence) -> float:
-        """Remaining relative variance of a path: the assumed value, or a much larger measured value."""
+    def assumed(self, evidence: Evidence) -> float:
+        """Assumed relative variance of a path that remains."""
         traced, model = evidence.variance(self.traced), evidence.model
         if not self.surfaces:
             return traced
-        assumed = traced - model.carried_fraction * (traced - min(evidence.variance(self.expected), traced))
-        if not self.is_measured or self.residual is None:
-            return assumed
-        measured = evidence.variance(self.residual)
-        return measured if measured > model.doubtful * assumed else assumed
+        return traced - model.carried_fraction * (traced - min(evidence.variance(self.expected), traced))
+
+    def variance(self, evidence: Evidence) -> float:
+        """Remaining relative variance of a path: the assumed value, or a much larger measured value."""
+        assumed = self.assumed(evidence)
+        measured = assumed if self.residual is None else evidence.variance(self.residual)
+        return measured if measured > evidence.model.doubtful * assumed else assumed
 
 
 @dataclass(frozen=True)
@@ -168,15 +166,15 @@ class Decision:
 def choose(evidence: Evidence, options: list[Option], measures: bool = True) -> Plan:
     """The plan of the option with the least variance × cost; without lights if no option pays.
 
-    ``measures``: whether to measure options that are predicted to pay.  Measuring only raises a price, so the choice
-    is independent of which options were measured for other passes.
+    ``measures``: whether to measure options that are predicted to pay.  Measuring only raises a price, so the lights
+    are independent of the options that were measured for other passes.
     """
     if not options:
         return without_lights("no light comes by way of surfaces that virtual lights could stand for")
     most, found = _most_to_pay(evidence), []
     for product, plan, option in sorted(((*_priced(evidence, x), x) for x in options), key=lambda priced: priced[0]):
-        if measures and not option.is_measured and product <= min([most, *(other for other, _ in found)]):
-            _ = option.residual
+        if measures and option.to_measure and product <= min([most, *(other for other, _ in found)]):
+            option.measure()
             product, plan = _priced(evidence, option)
         found.append((product, plan))
     product, best = min(found, key=lambda priced: priced[0])
@@ -204,8 +202,17 @@ def _most_to_pay(evidence: Evidence) -> float:
 
 def _priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:
     """(:func:`price`, best plan) with the lights of an option."""
+    assumed, left = option.assumed(evidence), option.variance(evidence)
+    product, plan = _priced_with(evidence, option, left)
+    if left > assumed:
+        # Limits of the numbers of lights and rays let the price fall a little where more variance remains
+        product = max(product, _priced_with(evidence, option, assumed)[0])
+    return product, plan
+
+
+def _priced_with(evidence: Evidence, option: Option, rest: float) -> tuple[float, Plan]:
+    """(Variance × cost, best plan) where paths leave the relative variance ``rest``."""
     model, paths, samples = evidence.model, evidence.paths, evidence.samples
-    rest = option.variance(evidence)
     cuts = model.emitter_cuts * option.emitters + option.surfaces
     rays, error = _cut_rays(rest, samples, model)
     # Never 0, because cuts leave a variance

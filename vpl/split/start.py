@@ -6,16 +6,21 @@ The passes of a render may share a start.  Larger passes learn the emitters agai
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
+from ..core.arrays import upload
 from ..core.sampling import derived_seed
 from ..lights.light_set import LightSet
 from .emitters.base import EmitterSampler
 from .emitters.cell_choice import learning_rays
-from .pilot import Pilot, relative_variance
+from .path_tracer import CameraRays
+from .pilot import Pilot, mean_radiance, pilot_lanes, relative_variance
 from .plan import Evidence, Option
-from .view import Stream, View, ViewLights
+from .view import Gathering, Stream, View, ViewLights
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,11 @@ class Start:
     paths: int
     seed: int
     later: dict[int, EmitterSampler] = field(default_factory=dict)
+
+    @property
+    def measured(self) -> int:
+        """Number of options that are measured."""
+        return sum(option.residual is not None for option in self.options)
 
     def emitters_for(self, paths: int) -> EmitterSampler:
         """The sampler for a pass of ``paths`` camera rays: large passes learn again from the same pilot, by more rays.
@@ -57,10 +67,7 @@ class Start:
 
 
 def make_start(view: View, virtual_lights: bool) -> Start:
-    """Trace the pilot of a view, and learn from it.  ``virtual_lights``: whether virtual lights are allowed.
-
-    The start keeps the camera rays of the view, because the first pass that may have virtual lights measures these.
-    """
+    """Trace the pilot of a view, and learn from it.  ``virtual_lights``: whether virtual lights are allowed."""
     (pilot, learned), refusal = learning_pilot(view), _refusal(view, virtual_lights)
     options = [] if refusal else _options(view, pilot)
     return Start(pilot, view.emitters, learned, options, refusal, view.learning_count, view.seed)
@@ -120,12 +127,21 @@ def _options(view: View, pilot: Pilot) -> list[Option]:
 
 def _with_surfaces(view: View, traced: Pilot, emitters: LightSet | None) -> list[Option]:
     """The option of lights on surfaces, if there is indirect light, beside lights for ``emitters``; ``traced``: pilot
-    without lights on surfaces."""
+    without lights on surfaces.
+
+    The option is measured for the first pass in which its lights may pay, and until then keeps the pilot's rays, but
+    not the view.
+    """
     if view.rules.max_depth <= 2 or not traced.indirect.any():
         return []
+    # The distance between lights is not known yet. With c = 0 lights carry the most
+    settings = view.settings(ViewLights(view.light_set([], 0.0), emitters), Gathering.AT_FIRST)
+    rays = CameraRays.of(view, upload(mi.UInt32, pilot_lanes(view)))
+    # Otherwise the rays would keep those of the view
+    dr.eval(rays.ray, rays.active, rays.importance, rays.places)
+    measured = partial(rays.trace, view.scene, view.emitters, derived_seed(view.seed, Stream.PILOT), settings)
 
     def residual():
-        # The distance between lights is not known yet. With c = 0 lights carry the most
-        return Pilot.trace(view, ViewLights(view.light_set([], 0.0), emitters)).radiance
+        return mean_radiance(measured().radiance)
 
     return [Option(True, emitters is not None, traced.radiance, traced.indirect, residual)]

@@ -14,7 +14,7 @@ from tests.support.marks import stress
 from tests.support.rendering import plugin_with_model, render
 from tests.support.scenes import closed_box, image, rgb, wall
 from tests.support.statistics import assert_same_mean
-from vpl.split import pilot, start
+from vpl.split import estimator, pilot, plan, start
 
 
 def spots(number, rng):
@@ -74,18 +74,24 @@ def assert_lights_stand_for_emitters(integrator, scene, spp):
 
 
 @pytest.mark.usefixtures("lights_cost_nothing")
-def test_lights_that_promise_less_are_not_followed(monkeypatch):
-    """The decision equals the decision after all lights are followed."""
+def test_lights_that_promise_less_are_not_measured(monkeypatch):
+    """The decision equals the decision after all lights are measured."""
     rng = np.random.default_rng(5)
     scene = mi.load_dict(closed_box(panels(40, rng) | balls(40, rng), 64))
-    found = []
-    for may_pay in (start.may_pay, lambda *_: True):
+    found, choose = [], plan.choose
+
+    def after_all(evidence, options, **more):
+        for option in options:
+            option.measure()
+        return choose(evidence, options, **more)
+
+    for choice in (choose, after_all):
         with monkeypatch.context() as patch:
-            followed = calls_of(patch, pilot, "trace_camera_rays")
-            patch.setattr(start, "may_pay", may_pay)
+            measured = calls_of(patch, start, "mean_radiance")
+            patch.setattr(estimator, "choose", choice)
             integrator = mi.load_dict({"type": "manylights", "max_depth": 5})
             mi.render(scene, integrator=integrator, spp=64)
-        found.append((integrator.statistics["plan"], integrator.statistics["lights"], len(followed)))
+        found.append((integrator.statistics["plan"], integrator.statistics["lights"], len(measured)))
     (*chosen, number), (*expected, of_all) = found
     assert chosen == expected and number < of_all
 

@@ -17,7 +17,7 @@ UNSEEN = 0.0
 
 def balanced(direct, indirect, paths, samples, left=None):
     """The balance of an image of an even brightness; ``left``: of it besides lights on surfaces, if measured."""
-    option = Option(True, False, direct + indirect, indirect, lambda: left)
+    option = Option(True, False, direct + indirect, indirect, left if left is None else lambda: left)
     return choose(
         Evidence(direct + indirect, UNSEEN, direct, np.ones(len(direct)), paths, samples, False, MODEL), [option]
     )
@@ -84,8 +84,9 @@ def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
 
 def measured(option, residual):
     """The option with a measured residual."""
-    found = replace(option, measure=lambda: residual)
-    assert found.residual is residual and found.is_measured
+    found = replace(option, to_measure=lambda: residual)
+    found.measure()
+    assert found.residual is residual and found.to_measure is None
     return found
 
 
@@ -126,17 +127,42 @@ def test_options_are_measured_once_and_only_where_they_may_pay():
     assert calls == ["good", "useless", "worse"]
 
 
-def test_a_choice_is_independent_of_earlier_measurements():
+@pytest.mark.parametrize("model", (MODEL, DENOISED))
+@pytest.mark.parametrize("emitters", (False, True))
+def test_a_choice_is_independent_of_earlier_measurements(emitters, model):
     """Passes of a render share options, and workers render the passes in any order."""
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
-    for left in (None, 0.3 * indirect, 2 * indirect):
-        for paths in (10**4, 10**6, 10**8):
-            evidence = Evidence(direct + indirect, UNSEEN, direct, np.ones(10_000), paths, 64, False, MODEL)
-            fresh, shared = (Option(True, False, direct + indirect, indirect, lambda x=left: x) for _ in range(2))
-            choose(replace(evidence, paths=10**9), [shared])
-            assert shared.is_measured
-            assert choose(evidence, [fresh]).light_paths == choose(evidence, [shared]).light_paths
+
+    def options(left):
+        kinds = [(True, False, 1.0), (False, True, 0.0), (True, True, 0.9)][: 3 if emitters else 1]
+        measures = [(lambda x=left: x) if surfaces else None for surfaces, *_ in kinds]
+        return [
+            Option(*kinds[k][:2], direct + indirect, kinds[k][2] * indirect, measures[k]) for k in range(len(kinds))
+        ]
+
+    for share in (0.0, 0.01, 0.03, 0.1, 0.3, 2.0):
+        for paths in 4 ** np.arange(6, 16):
+            evidence = Evidence(direct + indirect, UNSEEN, direct, np.ones(10_000), int(paths), 64, emitters, model)
+            fresh, shared = options(share * indirect), options(share * indirect)
+            choose(replace(evidence, paths=10**9), shared)
+            choose(replace(evidence, paths=10**5), shared)
+            chosen, expected = (replace(choose(evidence, some), reason="") for some in (fresh, shared))
+            assert chosen == expected
+
+
+@pytest.mark.parametrize("samples", (1, 64, 1024))
+def test_no_residual_lowers_a_price(samples):
+    """Where the numbers of lights and rays are at their limits, a price by the variance alone would fall."""
+    rng = np.random.default_rng(0)
+    indirect, direct = rng.exponential(size=(2, 10_000))
+    for paths in 10 ** np.arange(4, 10):
+        evidence = Evidence(direct + indirect, UNSEEN, direct, np.ones(10_000), int(paths), samples, True, DENOISED)
+        for scale in (1.0, 0.1, 0.01):
+            option = Option(True, True, scale * (direct + indirect), scale * indirect)
+            assumed = price(evidence, option)
+            for share in np.geomspace(1e-3, 3, 30):
+                assert price(evidence, measured(option, share * (direct + indirect))) >= assumed
 
 
 def test_more_vertices_are_lit_the_less_noise_there_is_besides():
