@@ -14,7 +14,7 @@ from tests.support.marks import stress
 from tests.support.rendering import plugin_with_model, render
 from tests.support.scenes import closed_box, image, rgb, wall
 from tests.support.statistics import assert_same_mean
-from vpl.split import estimator, pilot, plan, start
+from vpl.split import estimator, plan, start
 
 
 def spots(number, rng):
