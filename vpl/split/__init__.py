@@ -11,7 +11,7 @@ The formula, in the order to read in:
 - :mod:`vpl.transport.carried_share`: the share w of virtual lights
 - :mod:`vpl.transport.minorant`: the Lambertian minorant of a BSDF
 - ``path_tracer``: the paths of Mitsuba's ``path``, minus the part carried by virtual lights
-- ``start``: the pilot, learning, and measured kinds of lights: shared by the passes of a render
+- ``start``: the pilot, learning, and kinds of lights: shared by the passes of a render
 - ``estimator``: the steps from the plan to the image
 
 The terms of the estimator:
@@ -28,7 +28,7 @@ The terms of the estimator:
 
 The lights and the decisions:
 
-- ``pilot``: a few whole paths, the relative variance, and the brightness of the image nearby
+- ``pilot``: a few whole paths, the relative variance, the brightness of the image nearby, the octree of the lines
 - ``cost_model``: every constant of the decisions, with unit and evidence
 - ``plan``: whether lights pay, the number of lights, and the fineness of the clusters
 - ``line_sampling``: random lines with a known density on surfaces, drawn near the arrivals of camera paths

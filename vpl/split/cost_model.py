@@ -33,7 +33,7 @@ class CostModel:
     pilot_share: float = _constant(
         1 / 16,
         "1 / camera ray",
-        "Rays of a pilot for each camera ray of the image, at most: a pilot is traced up to four times.",
+        "Rays of a pilot for each camera ray of the image, at most: a pilot is traced up to five times.",
         "benchmarks/manylights.py --parts cost",
         most=1,
     )
