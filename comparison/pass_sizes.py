@@ -121,7 +121,7 @@ class PassSizes:
             self._lit |= last.has_lights
             if last.growth:
                 costs = [UNSURE * cost if cost > 1 else 1.0 for _, cost in last.growth]
-                sizes = [times * self._asked for times, _ in last.growth]
+                sizes = [round(times * self._asked) for times, _ in last.growth]
                 self._predicted = list(zip(sizes, costs, strict=True))
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
         if not is_first:

@@ -35,7 +35,7 @@ _SHARED_SAMPLES = 16
 # Largest depth that prb can count, with 32 bits
 _DEEPEST = 2**32 - 1
 # Ratios of the sizes of later passes of a render, of which a pass predicts the cost
-_LARGER = 4, 8, 16
+_LARGER = 1.5, 2, 4, 8, 16
 # Names of channels and layers of images, which are no names of groups of emitters
 _RESERVED = (*LENGTHS, OTHER, "albedo", "normal", "depth", *"RGBAXYZ")
 

@@ -145,12 +145,13 @@ class Decision:
         remains = next(x.expected for x in self.options if (x.surfaces, x.emitters) == kinds)
         return np.maximum(self.pilot.nearby(self.pilot.radiance - remains), 0)
 
-    def growth(self, times: int) -> float:
+    def growth(self, times: float) -> float:
         """Expected cost of a path of a pass with ``times`` as many samples, over that in this pass: larger passes may
         have virtual lights where this one has none."""
         if not self.options:
             return 1.0
-        larger = replace(self.evidence, paths=times * self.evidence.paths, samples=times * self.evidence.samples)
+        paths, samples = round(times * self.evidence.paths), round(times * self.evidence.samples)
+        larger = replace(self.evidence, paths=paths, samples=samples)
         return choose(larger, self.options, measures=False).cost / self.plan.cost
 
     def precision(self, samples: int) -> float:
