@@ -73,9 +73,14 @@ class Pass:
 
     @property
     def repeated_seconds(self):
-        """Seconds without compilation, and without the pilot and its measurements if later passes share them."""
-        made = self.statistics.get("pilots", 0) or self.statistics.get("measured", 0)
-        not_repeated = (self.compile_seconds or 0.0) + (self.statistics["seconds"][Stage.PILOT] if made else 0.0)
+        """Seconds without compilation, and without the work that later passes share: preparing emitters, the pilot, and
+        measurements by the pilot's paths."""
+        shared, stages = [], self.statistics.get("seconds", {})
+        if self.statistics.get("pilots", 0):
+            shared = [Stage.SCENE, Stage.PILOT]
+        elif self.statistics.get("measured", 0):
+            shared = [Stage.PILOT]
+        not_repeated = (self.compile_seconds or 0.0) + sum(stages.get(stage, 0.0) for stage in shared)
         return max(self.seconds - not_repeated, 0.0)
 
     @property

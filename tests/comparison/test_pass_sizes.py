@@ -208,14 +208,22 @@ def test_sizes_that_are_given_stay():
     assert [one.spp for one in passes] == [6, 6, 6, 2]
 
 
-def test_in_parts_the_pilot_of_the_first_pass_is_not_expected_again():
+@pytest.mark.parametrize("stage", [Stage.PILOT, Stage.SCENE])
+def test_in_parts_shared_work_of_the_first_pass_is_not_expected_again(stage):
     found = []
-    for pilot in (0.0, 3.0):
-        sizes = PassSizes(SQUARE // 2, time=10 + pilot, in_parts=True)
-        stages = {Stage.PILOT: pilot, Stage.TRACED: 0.4, Stage.CUTS: 0.0}
-        first = Pass(0, sizes.next([], 0.0), 0.6 + pilot, {"seconds": stages, "pilots": 1})
+    for shared in (0.0, 3.0):
+        sizes = PassSizes(SQUARE // 2, time=10 + shared, in_parts=True)
+        stages = {stage: shared, Stage.TRACED: 0.4, Stage.CUTS: 0.0}
+        first = Pass(0, sizes.next([], 0.0), 0.6 + shared, {"seconds": stages, "pilots": 1})
         found.append(sizes.next([first], first.seconds))
     assert found[0] == found[1] > 60
+
+
+def test_in_parts_measurements_of_a_later_pass_are_not_expected_again():
+    stages = {Stage.PILOT: 0.3, Stage.TRACED: 0.4, Stage.CUTS: 0.0}
+    one = Pass(0, 8, 1.0, {"seconds": stages, "pilots": 0, "measured": 1})
+    assert one.repeated_seconds == pytest.approx(0.7) and one.start_seconds == pytest.approx(0.3)
+    assert Pass(0, 8, 1.0, {"seconds": stages, "pilots": 0, "measured": 0}).repeated_seconds == 1.0
 
 
 @pytest.mark.parametrize("in_parts", [False, True])
