@@ -11,7 +11,7 @@ Camera paths usually arrive at a single side of a surface.  With M the mean norm
 reversed with probability |M| if it runs along M.  A fraction (1 + cos(n, M)) / 2 of the lines through a side with
 normal n runs against M, so the density on the side is A / S (1 + n·M).
 
-Parents of the leaves and the whole scene are drawn with a small probability, so the density is positive everywhere.
+Parents of the leaves and the whole scene are drawn with a smaller probability, so the density is positive everywhere.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from ..core.morton import interleave
 _LARGEST_LEAF, _LEVELS = 16, 20
 # Number of prior arrivals of average radiance in each leaf: a leaf holds up to 16 arrivals
 _PRIOR = 2.0
-# Fraction of the lines through parents of leaves and through the whole scene: keeps the density positive everywhere
-_PARENT_SHARE, _SCENE_SHARE = 0.15, 0.05
+# Fraction of the lines through parents of leaves and through the whole scene: keeps the density positive everywhere.
+# With a scene's share of 0.05, single bright lights in places without arrivals made spots (docs/decisions.md)
+_PARENT_SHARE, _SCENE_SHARE = 0.15, 0.2
 # Margin of a box around the arrivals, as a fraction of the leaf; largest |M|, below 1 to reach both sides
 _MARGIN, _LARGEST_TURN = 0.1, 0.9
 # The number of a node is its Morton code behind a leading 1: the first number of each level

@@ -47,8 +47,8 @@ def hits_on_ground(scene, count=100_000):
 @pytest.mark.parametrize("size", [10.0, 1e4, 1e5, 1e6])
 @pytest.mark.parametrize("shape", GROUNDS)
 def test_hits_measure_the_area_of_a_large_ground(shape, size):
-    """The sum of 1 / density over the hits on the upper side."""
-    hits, normal, density = hits_on_ground(mi.load_dict({"type": "scene", "ground": GROUNDS[shape](size)}))
+    """The sum of 1 / density over the hits on the upper side, the standard error of which is 1% with 400 000 lines."""
+    hits, normal, density = hits_on_ground(mi.load_dict({"type": "scene", "ground": GROUNDS[shape](size)}), 400_000)
     inside = (np.abs(hits.position) < 0.9).all(1) & (normal[:, 1] > 0)
     projected = np.where(inside, normal[:, 1] / density, 0)
     assert projected.sum() == pytest.approx(1.8**2, rel=0.02)
