@@ -113,10 +113,11 @@ class Denoiser:
         self._seconds_of(tile(TILE), quality)
         width, whole = TILE, self._guides["albedo"].size
         while True:
-            seconds, size = self._seconds_of(tile(width), quality), tile(width)["color"].size
+            inputs = tile(width)
+            seconds, size = self._seconds_of(inputs, quality), inputs["color"].size
             if seconds >= TILE_SECONDS or size == whole:
                 # A large image multiplies the error of a single measurement
-                return min(seconds, self._seconds_of(tile(width), quality)) * whole / size
+                return min(seconds, self._seconds_of(inputs, quality)) * whole / size
             width *= 2
 
     def _seconds_of(self, inputs, quality):

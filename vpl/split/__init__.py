@@ -16,6 +16,7 @@ The formula, in the order to read in:
 
 The terms of the estimator:
 
+- ``camera_rays``: camera rays of a view, traced to the ends of their paths
 - ``view``: camera rays, settings of their paths, streams of random numbers
 - ``roulette``: Russian roulette and the choice of its probabilities
 - ``contributions``: sums of the contributions of paths, for the image and for its layers

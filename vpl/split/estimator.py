@@ -21,10 +21,11 @@ from ..core.sampling import derived_seed
 from ..core.stages import Stage
 from ..points.camera_paths import SceneTraits
 from ..transport.evaluation import Transport
+from .camera_rays import trace_camera_rays
 from .contributions import LayerSums
 from .gather_vertices import LitVertices
 from .line_hits import has_large_curves
-from .path_tracer import Traced, trace_camera_rays
+from .path_tracer import Traced
 from .pilot import error_scale
 from .pixel_clusters import PixelClusters, light_clusters
 from .pixel_rays import PixelRays

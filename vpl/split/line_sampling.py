@@ -27,7 +27,7 @@ _LARGEST_LEAF, _LEVELS = 16, 20
 # Number of prior arrivals of average radiance in each leaf: a leaf holds up to 16 arrivals
 _PRIOR = 2.0
 # Fraction of the lines through parents of leaves and through the whole scene: keeps the density positive everywhere.
-# With a scene's share of 0.05, single bright lights in places without arrivals made spots (docs/decisions.md)
+# The scene's share makes the soft spots weaker that few bright lights in places without arrivals make (decisions.md)
 _PARENT_SHARE, _SCENE_SHARE = 0.15, 0.2
 # Margin of a box around the arrivals, as a fraction of the leaf; largest |M|, below 1 to reach both sides
 _MARGIN, _LARGEST_TURN = 0.1, 0.9

@@ -27,7 +27,6 @@ import mitsuba as mi
 
 from ..core.arrays import LARGEST_VALUE, channel_mean, select_record
 from ..core.loops import recorded_once
-from ..core.sampling import derived_seed, independent_sampler
 from ..direct.emitter_sampling import power_heuristic
 from ..transport.carried_share import carried_share
 from ..transport.minorant import agrees, is_diffuse, minorant_of, side_of
@@ -35,9 +34,8 @@ from .contributions import Contributions, LayerSums
 from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
 from .gather_vertices import Gathered, GatherVertices, SecondVertices
 from .lattice import Lattice
-from .pixel_rays import RayNumbers
 from .roulette import residual_survival, throughput_survival
-from .view import Edge, FirstEdge, Gathering, PathSettings, State, View
+from .view import Edge, FirstEdge, Gathering, PathSettings, State
 
 # ---------------------- State of the loop ----------------------
 
@@ -190,48 +188,6 @@ def trace_paths(
     traced = Traced(found.radiance, found.one, found.length, found.group, seen, path.valid, path.depth, gathered)
     dr.eval(traced)
     return traced
-
-
-@dataclass(frozen=True)
-class CameraRays:
-    """Some camera rays of a view.
-
-    ``ray``; ``active``; ``importance`` of radiance, for Russian roulette; ``places`` in pixels; ``sizes``: the
-    different numbers of rays of pixels.
-    """
-
-    ray: mi.Ray3f
-    active: mi.Bool
-    importance: mi.Float
-    places: RayNumbers
-    sizes: tuple[int, ...]
-
-    @classmethod
-    def of(cls, view: View, lane: mi.UInt32) -> CameraRays:
-        """The rays with the indices ``lane``."""
-        ray, places = view.ray, view.rays.places(lane)
-        part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
-        # All numbers of rays, and counted and chosen lanes, use the same kernel
-        dr.eval(lane, places)
-        importance = dr.gather(mi.Float, view.importance, places.pixel)
-        return cls(part, dr.gather(mi.Bool, view.active, lane), importance, places, view.rays.sizes)
-
-    def trace(
-        self, scene, emitters: EmitterSampler, seed: int, settings: PathSettings, sums: LayerSums | None = None
-    ) -> Traced:
-        """Trace paths from the camera; ``sums`` by layer."""
-        edge = FirstEdge.of_camera(self.ray, self.importance, self.active)
-        lattice = Lattice(self.places, self.sizes, derived_seed(seed, 0))
-        sampler = independent_sampler(derived_seed(seed, 1), dr.width(self.places.pixel))
-        return trace_paths(scene, emitters, edge, lattice, sampler, settings, sums)
-
-
-def trace_camera_rays(
-    view: View, lane: mi.UInt32, settings: PathSettings, *stream: int, sums: LayerSums | None = None
-) -> Traced:
-    """Trace the camera rays ``lane`` of a view; ``stream``: of random numbers; ``sums`` by layer."""
-    seed = derived_seed(view.seed, *stream)
-    return CameraRays.of(view, lane).trace(view.scene, view.emitters, seed, settings, sums)
 
 
 def _less_carried(path: Path, met: MetEmitter, settings: PathSettings):

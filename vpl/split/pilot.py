@@ -12,10 +12,11 @@ import numpy as np
 from ..core.arrays import channel_mean, download, upload
 from ..core.sampling import derived_seed
 from ..lights.emission import bounding_box
+from .camera_rays import trace_camera_rays
 from .cost_model import CostModel
 from .gather_vertices import GatherVertices, SecondVertices
 from .line_sampling import ArrivalOctree
-from .path_tracer import Traced, trace_camera_rays
+from .path_tracer import Traced
 from .view import Gathering, Stream, View, ViewLights
 
 

@@ -86,9 +86,8 @@ class Option:
             return traced
         return traced - model.carried_fraction * (traced - min(evidence.variance(self.expected), traced))
 
-    def variance(self, evidence: Evidence) -> float:
-        """Remaining relative variance of a path: the assumed value, or a much larger measured value."""
-        assumed = self.assumed(evidence)
+    def remaining(self, evidence: Evidence, assumed: float) -> float:
+        """Relative variance of a path that remains: the ``assumed`` value, or a much larger measured value."""
         measured = assumed if self.residual is None else evidence.variance(self.residual)
         return measured if measured > evidence.model.doubtful * assumed else assumed
 
@@ -203,7 +202,8 @@ def _most_to_pay(evidence: Evidence) -> float:
 
 def _priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:
     """(:func:`price`, best plan) with the lights of an option."""
-    assumed, left = option.assumed(evidence), option.variance(evidence)
+    assumed = option.assumed(evidence)
+    left = option.remaining(evidence, assumed)
     product, plan = _priced_with(evidence, option, left)
     if left > assumed:
         # Limits of the numbers of lights and rays let the price fall a little where more variance remains

@@ -15,9 +15,9 @@ import numpy as np
 from ..core.arrays import upload
 from ..core.sampling import derived_seed
 from ..lights.light_set import LightSet
+from .camera_rays import CameraRays
 from .emitters.base import EmitterSampler
 from .emitters.cell_choice import learning_rays
-from .path_tracer import CameraRays
 from .pilot import Pilot, mean_radiance, pilot_lanes, relative_variance
 from .plan import Evidence, Option
 from .view import Gathering, Stream, View, ViewLights

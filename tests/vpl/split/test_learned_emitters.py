@@ -13,11 +13,11 @@ from tests.support.rendering import render, render_with_statistics
 from tests.support.scenes import area_light, closed_box, image, rgb, sensor
 from vpl.core.arrays import download, upload, upload_vectors
 from vpl.lights.light_set import LightSet
+from vpl.split.camera_rays import trace_camera_rays
 from vpl.split.emitters import cell_choice
 from vpl.split.emitters.cell_choice import CellChoice
 from vpl.split.emitters.learned import LearnedEmitters
 from vpl.split.gather_vertices import LitVertices
-from vpl.split.path_tracer import trace_camera_rays
 from vpl.split.spatial_cells import SpatialCells
 from vpl.split.view import ViewLights
 
