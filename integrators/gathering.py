@@ -16,6 +16,7 @@ from vpl.core.exclusive import exclusive
 from vpl.core.garbage import garbage_kept
 from vpl.core.shared_code import share_code
 from vpl.core.stages import Stage
+from vpl.lights.emission import bounding_sphere
 from vpl.lights.emitters import Emitters, read_emitters
 from vpl.points.camera_paths import CameraPaths, PixelGrid, SceneTraits, follow_camera_rays, refuse_media, scene_traits
 
@@ -117,8 +118,9 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         raise NotImplementedError
 
     def check_scene(self, scene):
-        """Raise ValueError for a scene with a participating medium."""
+        """Raise ValueError for a scene with a participating medium, or without a finite size: CUDA's rays miss it."""
         refuse_media(scene)
+        bounding_sphere(scene)
 
     def _refuse_recording(self):
         """Raise RuntimeError while ``dr.freeze`` records."""

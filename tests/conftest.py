@@ -8,10 +8,10 @@ import mitsuba as mi
 import pytest
 
 from tests.support.comparisons import SWEEP
+from tests.support.marks import VARIANT
 from tests.support.processes import wait_until
 from tests.support.rendering import plugin_with_model
 
-VARIANT = "llvm_ad_rgb"
 MOST_PROCESSES = 4  # each holds some 2 GiB
 
 

@@ -33,8 +33,9 @@ class SceneTraits:
     ``delta``, ``null``, ``smooth``, ``glossy``, ``transmissive``: whether any BSDF has such a lobe; ``perturbed``:
     registry indices of shapes with bump or normal maps; ``open_shapes``: registry indices of shapes that transmit light
     unscattered, None for every shape; ``open_scene``: a scene of the open shapes alone, None if ``open_shapes`` is None
-    or empty; ``nearest_hits``: whether a shadow ray searches its nearest hit, as a path does.  On spheres of more than
-    some hundred units, Mitsuba's test for any hit reports the surface at the origin of a ray more often.
+    or empty, and on CUDA, where a kernel can trace rays in one scene only; ``nearest_hits``: whether a shadow ray
+    searches its nearest hit, as a path does.  On spheres of more than some hundred units, Mitsuba's test for any hit
+    reports the surface at the origin of a ray more often.
     """
 
     delta: bool
@@ -114,10 +115,10 @@ def scene_traits(scene) -> SceneTraits:
     kinds = mi.BSDFFlags
     transmissive = have(int(kinds.DiffuseTransmission) | int(kinds.GlossyTransmission))
     lobes = (have(kind) for kind in (kinds.Delta, kinds.Null, kinds.Smooth, kinds.Glossy))
-    if instances or not open_shapes:
-        return SceneTraits(*lobes, transmissive, perturbed_shapes(scene), None if instances else (), None)
-    open_scene = mi.load_dict({"type": "scene", **{f"open_{index}": shape for index, shape in open_shapes.items()}})
-    return SceneTraits(*lobes, transmissive, perturbed_shapes(scene), tuple(open_shapes), open_scene)
+    listed, open_scene = None if instances else tuple(open_shapes), None
+    if listed and dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
+        open_scene = mi.load_dict({"type": "scene", **{f"open_{index}": open_shapes[index] for index in listed}})
+    return SceneTraits(*lobes, transmissive, perturbed_shapes(scene), listed, open_scene)
 
 
 def refuse_media(scene) -> None:

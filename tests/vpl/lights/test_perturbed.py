@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tests.support.marks import stress
+from tests.support.marks import not_on_cuda, stress
 from tests.support.rendering import render
 from tests.support.scenes import closed_box, image, rgb, sensor, wall
 from tests.support.statistics import assert_same_mean
@@ -66,11 +66,13 @@ def assert_indirect_light_of_path(description, plugin, seeds=10, tiles=4, **more
 
 
 QUICK = ("two sides", "bumps")
+ROUNDING = "the difference of two images of path is not 0 where both are black: CUDA adds in any order"
 # The image is 0.8 ± 0.3% too dark, and a sixteenth of it 14%
 DARK = "never turned round"
 OTHERS = [name for name in CASES if name not in (*QUICK, DARK)]
 
 
+@not_on_cuda(ROUNDING)
 @pytest.mark.parametrize(
     "case",
     [*QUICK, pytest.param(DARK, marks=[pytest.mark.xfail(reason="too dark"), pytest.mark.stress]), *stress(*OTHERS)],
@@ -81,6 +83,7 @@ def test_a_sunlit_floor(case):
     assert_indirect_light_of_path(sunlit(floor(), direction), "vpl", tiles=1 if case == "bumps" else 4)
 
 
+@not_on_cuda(ROUNDING)
 @pytest.mark.parametrize("plugin", ["lightcuts", *stress(*(name for name in PLUGINS if name != "lightcuts"))])
 def test_every_plugin_knows_where_its_lights_shine(plugin):
     assert_indirect_light_of_path(sunlit(turned(45), [0.2, -1, 0]), plugin, 8, **PLUGINS[plugin])

@@ -204,7 +204,17 @@ FRAMES = """
 
 def rendered_frames(folder, *more):
     (folder / "a.xml").write_text(FRAMES)
-    command = [str(folder / "a.xml"), "--frames", "0..2", "--spp", "4", "-o", str(folder / "{frame}.exr")]
+    command = [
+        str(folder / "a.xml"),
+        "--frames",
+        "0..2",
+        "--spp",
+        "4",
+        "-o",
+        str(folder / "{frame}.exr"),
+        "-m",
+        mi.variant(),
+    ]
     status = manylights.main([*command, *more])
     return status, [images.read_exr(file)[0] for file in sorted(folder.glob("*.exr"))]
 

@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import not_on_cuda
 from tests.support.scenes import wall
 from vpl.core.arrays import download, upload_vectors
 from vpl.lights.emission import bounding_box
@@ -44,6 +45,7 @@ def hits_on_ground(scene, count=100_000):
     return hits, normal, count * octree.density(hits.position, normal)
 
 
+@not_on_cuda("OptiX finds hits on a plane of a million units to within 0.2 units")
 @pytest.mark.parametrize("size", [10.0, 1e4, 1e5, 1e6])
 @pytest.mark.parametrize("shape", GROUNDS)
 def test_hits_measure_the_area_of_a_large_ground(shape, size):
