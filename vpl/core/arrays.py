@@ -13,7 +13,7 @@ import numpy as np
 
 _NUMPY_DTYPES = {
     dr.VarType.Float32: np.float32, dr.VarType.Float64: np.float64,
-    dr.VarType.UInt32: np.uint32, dr.VarType.Int32: np.int32,
+    dr.VarType.UInt32: np.uint32, dr.VarType.Int32: np.int32, dr.VarType.UInt64: np.uint64,
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Morton codes of grid cells, and the order of points along a Morton curve (NumPy only)."""
+"""Morton codes of grid cells, and the order of points along a Morton curve."""
 
 from __future__ import annotations
 
@@ -13,15 +13,20 @@ def interleave(cells: np.ndarray) -> np.ndarray:
 
     Bit k of the coordinate along axis a becomes bit 3k + a.
     """
-    code = np.zeros(len(cells), np.uint64)
-    for axis in range(3):
-        bits = cells[:, axis].astype(np.uint64)
-        # Halve the groups of adjacent bits until bit k stands at 3k
-        for shift, mask in zip(_SHIFTS, _MASKS, strict=True):
-            bits |= bits << np.uint64(shift)
-            bits &= np.uint64(mask)
-        code |= bits << np.uint64(axis)
-    return code
+    return interleaved([cells[:, axis].astype(np.uint64) for axis in range(3)])
+
+
+def interleaved(columns):
+    """The same for columns of three unsigned 64-bit integers, by NumPy or Dr.Jit."""
+    x, y, z = (_spread(bits) for bits in columns)
+    return x | (y << 1) | (z << 2)
+
+
+def _spread(bits):
+    """Move bit k to 3k, by halving the groups of adjacent bits."""
+    for shift, mask in zip(_SHIFTS, _MASKS, strict=True):
+        bits = (bits | (bits << shift)) & mask
+    return bits
 
 
 def morton_order(points: np.ndarray, bits: int = 21) -> np.ndarray:

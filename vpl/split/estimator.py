@@ -135,13 +135,13 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
 
     def make():
         drawn.append(wanted)
-        return surface_lights(view, pilot.octree, wanted, lambda: clock.begin(Stage.TREE))
+        return surface_lights(view, pilot.lines, wanted, lambda: clock.begin(Stage.TREE))
 
     made = kept.find(view.scene, (view.seed, view.rules.max_depth, view.model.shared), make) if kept else make()
     statistics = {"light_paths": sum(drawn), "lights": {"surface": made.lights.count}}
     if not made.groups:
         return None, statistics
-    return view.light_set(made.groups, pilot.spacing(made.octree, made.lines)), statistics
+    return view.light_set(made.groups, pilot.spacing(made.sampler, made.lines)), statistics
 
 
 # ---------------------- Image ----------------------

@@ -21,9 +21,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import download, select_record, upload, upload_vectors
+from ..core.arrays import download, select_record, upload
 from ..core.loops import recorded_once
 from ..core.meshes import corners_of
+from ..core.sampling import independent_sampler
 from ..lights.emitters import registered_shapes
 from .line_sampling import Lines
 
@@ -40,38 +41,36 @@ _MOST_LAYERS = 1024
 class LineHits:
     """Crossings of lines with surfaces.
 
-    ``ray``: begins shortly before each surface, evaluated; ``position`` (n, 3) float32: crossing of line and surface;
+    ``ray``: begins shortly before each surface; ``position``: crossing of line and surface; both evaluated;
     ``uncertainty`` (n,) float32: uncertainty of ``position`` along the normal.  World units.
     """
 
     ray: mi.Ray3f
-    position: np.ndarray
+    position: mi.Point3f
     uncertainty: np.ndarray
 
     @property
     def count(self) -> int:
-        return len(self.position)
+        return len(self.uncertainty)
 
 
-def hits_of(scene, lines: Lines, scene_size: float, generator) -> LineHits:
+def hits_of(scene, lines: Lines, scene_size: float, seed: int) -> LineHits:
     """Crossings of ``lines`` with surfaces inside the boxes, line by line; ``scene_size``: world units."""
     margin = _UNCERTAINTY * scene_size
-    before = (margin * (1 + generator.random(len(lines.length)))).astype(np.float32)
-    origin, direction = (
-        upload_vectors(mi.Vector3f, x) for x in (lines.origin - before[:, None] * lines.direction, lines.direction)
-    )
-    segments = origin, direction, upload(mi.Float, lines.length + before + np.float32(margin))
+    margin = dr.opaque(mi.Float, margin)
+    before = margin * (1 + independent_sampler(seed, lines.count).next_1d())
+    segments = lines.origin - before * lines.direction, lines.direction, lines.length + before + margin
+    dr.eval(segments)
     # The same kernel counts and records the crossings
-    number = _meet(scene, segments, dr.zeros(mi.UInt32, len(before)), False, _Found.none(1))
+    number = _meet(scene, segments, dr.zeros(mi.UInt32, lines.count), False, _Found.none(1))
     found = _Found.none(int(dr.sum(number)[0]))
     if dr.width(found.line):
         _meet(scene, segments, dr.prefix_reduce(dr.ReduceOp.Add, number), True, found)
     # Uses the position and box of the density
-    row = np.flatnonzero(lines.hold(download(found.line), download(found.position)))
-    found = dr.gather(_Found, found, upload(mi.UInt32, row))
-    ray = mi.Ray3f(found.start, dr.gather(mi.Vector3f, direction, found.line))
+    found = dr.gather(_Found, found, dr.compress(lines.hold(found.line, found.position)))
+    ray = mi.Ray3f(found.start, dr.gather(mi.Vector3f, lines.direction, found.line))
     dr.eval(ray, found)
-    return LineHits(ray, download(found.position), _uncertainty(scene, found, scene_size))
+    return LineHits(ray, found.position, _uncertainty(scene, found, scene_size))
 
 
 @dataclass
@@ -99,15 +98,19 @@ def _uncertainty(scene, found: _Found, scene_size: float) -> np.ndarray:
     """Uncertainty of positions, (n,) float32, if above Mitsuba's offset of rays; 0 elsewhere."""
     position, shape = download(found.position), download(found.shape)
     offset = mi.math.RayEpsilon * (1 + np.abs(position).max(1, initial=0))
-    uncertainty = np.zeros(len(position), np.float32)
-    for index, one in registered_shapes(scene):
+    shapes = dict(registered_shapes(scene))
+    # Shapes of groups are not registered
+    extents = np.zeros(int(max([*shapes, shape.max(initial=0)])) + 1)
+    for index, one in shapes.items():
         # Rectangles that Mitsuba merged have no box
-        extent = max(one.bbox().extents()) if one.bbox().valid() else scene_size
-        row = np.flatnonzero((shape == index) & (_UNCERTAINTY * extent > offset))
-        if len(row):
-            if one.is_mesh():
-                extent = _longest_edges(one, dr.gather(mi.UInt32, found.primitive, upload(mi.UInt32, row)))
-            uncertainty[row] = _UNCERTAINTY * extent
+        extents[index] = max(one.bbox().extents()) if one.bbox().valid() else scene_size
+    uncertainty = (_UNCERTAINTY * extents[shape]).astype(np.float32)
+    large = uncertainty > offset
+    for index in np.unique(shape[large]):
+        if shapes[index].is_mesh():
+            row = np.flatnonzero(large & (shape == index))
+            triangle = dr.gather(mi.UInt32, found.primitive, upload(mi.UInt32, row))
+            uncertainty[row] = _UNCERTAINTY * _longest_edges(shapes[index], triangle)
     return np.where(uncertainty > offset, uncertainty, np.float32(0))
 
 

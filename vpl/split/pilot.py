@@ -9,13 +9,14 @@ from functools import cached_property
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, download, upload
+from ..core.arrays import channel_mean, download, upload, upload_vectors
 from ..core.sampling import derived_seed
 from ..lights.emission import bounding_box
+from .arrival_octree import ArrivalOctree
 from .camera_rays import trace_camera_rays
 from .cost_model import CostModel
 from .gather_vertices import GatherVertices, SecondVertices
-from .line_sampling import ArrivalOctree
+from .line_sampling import LineSampler
 from .path_tracer import Traced
 from .view import Gathering, Stream, View, ViewLights
 
@@ -90,29 +91,30 @@ class Pilot:
         return cls(arrivals, onward, vertices, pixel, radiance, seen, indirect, size, view.scene, seed, view.model)
 
     @cached_property
-    def octree(self) -> ArrivalOctree:
-        """Octree over the arrivals, drawn by their radiance: lights matter where visible and bright.  All passes of a
+    def lines(self) -> LineSampler:
+        """Lines near the arrivals, drawn by their radiance: lights matter where visible and bright.  All passes of a
         render share the octree."""
         arrivals, generator = self.arrivals, np.random.default_rng(self.seed)
         octree = ArrivalOctree(
             arrivals.position, arrivals.normal, arrivals.weight, *_cube_around(self.scene), generator
         )
         octree.choose_by_radiance(arrivals.radiance)
-        return octree
+        return LineSampler(octree)
 
-    def spacing(self, octree: ArrivalOctree, lines: int) -> float:
-        """Typical distance between the lights of ``lines`` lines through ``octree``, where paths arrive, world
+    def spacing(self, sampler: LineSampler, lines: int) -> float:
+        """Typical distance between the lights of ``lines`` lines by ``sampler``, where paths arrive, world
         units."""
-        # Kept lights have the octree of another pilot
-        of_one = self._spacing if octree is vars(self).get("octree") else self._spacing_of(octree)
+        # Kept lights have the lines of another pilot
+        of_one = self._spacing if sampler is vars(self).get("lines") else self._spacing_of(sampler)
         return of_one / lines**0.5
 
     @cached_property
     def _spacing(self) -> float:
-        return self._spacing_of(self.octree)
+        return self._spacing_of(self.lines)
 
-    def _spacing_of(self, octree: ArrivalOctree) -> float:
-        return float(np.median(octree.density(self.arrivals.position, self.arrivals.normal) ** -0.5))
+    def _spacing_of(self, sampler: LineSampler) -> float:
+        position, normal = (upload_vectors(mi.Vector3f, x) for x in (self.arrivals.position, self.arrivals.normal))
+        return float(np.median(download(sampler.density(position, normal)) ** -0.5))
 
     @property
     def brightness(self) -> np.ndarray:

@@ -26,7 +26,7 @@ from ..lights.virtual_lights import VirtualLights
 from .emitters.base import EmitterSampler, Places, irradiance_from_emitters
 from .lattice import Lattice
 from .line_hits import LineHits, hits_of
-from .line_sampling import ArrivalOctree
+from .line_sampling import LineSampler
 from .path_tracer import trace_paths
 from .roulette import OutgoingRadiance
 from .view import FirstEdge, Gathering, PathSettings, State, Stream, View, ViewLights
@@ -39,33 +39,33 @@ _MOST_KEPT = 1 << 21
 
 @dataclass(frozen=True)
 class SurfaceLights:
-    """``lights`` of kind "surface", drawn by ``lines`` lines through ``octree``.
+    """``lights`` of kind "surface", drawn by ``lines`` lines of ``sampler``.
 
     ``groups``: the positive and the negative parts of their intensities with light trees, empty parts left out.
     """
 
     lights: VirtualLights
-    octree: ArrivalOctree
+    sampler: LineSampler
     lines: int
     groups: list[ScatteredGroup]
 
 
-def surface_lights(view: View, octree: ArrivalOctree, count: int, announce_tree: Callable[[], None]) -> SurfaceLights:
+def surface_lights(view: View, sampler: LineSampler, count: int, announce_tree: Callable[[], None]) -> SurfaceLights:
     """The lights at the crossings of ``count`` lines, with trees; calls ``announce_tree`` before building the trees.
 
-    ``octree``: of the arrivals of a pilot.
+    ``sampler``: of lines near the arrivals of a pilot.
     """
     # A path from a light lacks the two edges between camera and light; the expected contribution is unknown, because
     # the path is no camera path
     rules = replace(view.rules, max_depth=view.rules.max_depth - 2, rr_depth=1)
     settings = replace(view, rules=rules, outgoing=OutgoingRadiance.unknown()).settings(ViewLights())
     seed = derived_seed(view.seed, Stream.SURFACE_LIGHTS)
-    lights = _drawn_lights(view.scene, view.emitters, octree, count, settings, seed)
+    lights = _drawn_lights(view.scene, view.emitters, sampler, count, settings, seed)
     parts = _by_sign(lights)
     if parts:
         announce_tree()
     seed = derived_seed(view.seed, Stream.TREE)
-    return SurfaceLights(lights, octree, count, [ScatteredGroup.of(part, seed, sign) for part, sign in parts])
+    return SurfaceLights(lights, sampler, count, [ScatteredGroup.of(part, seed, sign) for part, sign in parts])
 
 
 def _by_sign(lights: VirtualLights) -> list[tuple[VirtualLights, float]]:
@@ -81,20 +81,17 @@ def _by_sign(lights: VirtualLights) -> list[tuple[VirtualLights, float]]:
 
 
 def _drawn_lights(
-    scene, emitters: EmitterSampler, octree: ArrivalOctree, count: int, settings: PathSettings, seed: int
-):
+    scene, emitters: EmitterSampler, sampler: LineSampler, count: int, settings: PathSettings, seed: int
+) -> VirtualLights:
     """The lights at the crossings of ``count`` lines."""
-    generator = np.random.default_rng(seed)
-    hits = hits_of(scene, octree.lines(count, generator), octree.scene_size, generator)
-    lights = _lights_at(scene, emitters, hits, settings, derived_seed(seed, 1))
-    density = count * octree.density(lights.position, lights.direction)
-    with np.errstate(over="ignore"):
-        lights.intensity = (lights.intensity / density[:, None]).astype(np.float32)
-    return lights
+    hits = hits_of(scene, sampler.draw(count, derived_seed(seed, 2)), sampler.scene_size, derived_seed(seed, 4))
+    return _lights_at(scene, emitters, hits, sampler, count, settings, derived_seed(seed, 1))
 
 
-def _lights_at(scene, emitters: EmitterSampler, hits: LineHits, settings: PathSettings, seed: int) -> VirtualLights:
-    """A light at every hit on a surface with a minorant; intensities are minorant × irradiance.
+def _lights_at(
+    scene, emitters: EmitterSampler, hits: LineHits, sampler: LineSampler, lines: int, settings: PathSettings, seed: int
+) -> VirtualLights:
+    """A light at every hit of ``lines`` lines on a surface with a minorant: minorant × irradiance over the density.
 
     Mitsuba's point at a hit may lie beside the line.  The light lies on the line, where the density of lines is known.
     The irradiance is computed at Mitsuba's point, as in ``path``.
@@ -105,12 +102,14 @@ def _lights_at(scene, emitters: EmitterSampler, hits: LineHits, settings: PathSe
     if places.count == 0:
         return VirtualLights.of("surface", [], [], [])
     irradiance, length, group = _irradiance(scene, emitters, places, settings, seed)
-    columns = (places.normal, spectrum_to_rgb(minorant * irradiance), length, group)
-    dr.eval(columns)
-    row = download(hit)
-    position, *columns, group = hits.position[row], *(download(column) for column in columns)
-    lights = VirtualLights.of("surface", position, *columns, facing=download(places.facing))
-    lights.uncertainty, lights.group = hits.uncertainty[row], group
+    position = dr.gather(mi.Point3f, hits.position, hit)
+    sent = spectrum_to_rgb(minorant * irradiance)
+    density = lines * download(sampler.density(position, places.normal))
+    position, normal, sent, length = (download(x) for x in (position, places.normal, sent, length))
+    with np.errstate(over="ignore"):
+        intensity = (sent / density[:, None]).astype(np.float32)
+    lights = VirtualLights.of("surface", position, normal, intensity, length, facing=download(places.facing))
+    lights.uncertainty, lights.group = hits.uncertainty[download(hit)], download(group)
     return lights.select((lights.intensity != 0).any(1))
 
 

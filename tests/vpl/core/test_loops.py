@@ -1,7 +1,7 @@
 """Loops of kernels are recorded once: where there are many shapes and materials, that takes longer than rendering."""
 
+import drjit as dr
 import mitsuba as mi
-import numpy as np
 import pytest
 
 from tests.support.calls import calls_of
@@ -40,9 +40,10 @@ def test_surfaces_along_lines_are_looked_for_once_in_a_kernel():
             calls.append(1)
             return scene.ray_intersect(*arguments, **more)
 
-    origin, direction = np.full((10, 3), [0.1, 0.2, -9], np.float32), np.full((10, 3), [0, 0, 1], np.float32)
-    lines = Lines(origin, direction, np.full(10, 20, np.float32), np.full((10, 3), -10.0), np.full((10, 3), 20.0))
-    assert hits_of(Counted(), lines, 20.0, np.random.default_rng(0)).count == 20
+    origin, direction = dr.repeat(mi.Point3f(0.1, 0.2, -9), 10), dr.repeat(mi.Vector3f(0, 0, 1), 10)
+    low, size = (dr.repeat(mi.Vector3d(x), 10) for x in (-10, 20))
+    lines = Lines(origin, direction, dr.repeat(mi.Float(20), 10), low, size)
+    assert hits_of(Counted(), lines, 20.0, 0).count == 20
     assert len(calls) == 2
 
 

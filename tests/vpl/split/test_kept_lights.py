@@ -22,9 +22,9 @@ def made(monkeypatch):
     """Number of lines of each drawing of lights."""
     original, counts = estimator.surface_lights, []
 
-    def surface_lights(view, octree, count, *more):
+    def surface_lights(view, sampler, count, *more):
         counts.append(count)
-        return original(view, octree, count, *more)
+        return original(view, sampler, count, *more)
 
     monkeypatch.setattr(estimator, "surface_lights", surface_lights)
     return counts

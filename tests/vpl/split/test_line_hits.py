@@ -9,8 +9,9 @@ from tests.support.marks import not_on_cuda
 from tests.support.scenes import wall
 from vpl.core.arrays import download, upload_vectors
 from vpl.lights.emission import bounding_box
+from vpl.split.arrival_octree import ArrivalOctree
 from vpl.split.line_hits import hits_of
-from vpl.split.line_sampling import ArrivalOctree, Lines
+from vpl.split.line_sampling import Lines, LineSampler
 
 
 def tilted(size):
@@ -38,11 +39,12 @@ def hits_on_ground(scene, count=100_000):
     box = bounding_box(scene)
     low, extent = np.array(box.min, float), np.array(box.extents(), float)
     size = 1.001 * extent.max()
-    octree = ArrivalOctree(arrival, normal, np.ones(len(arrival)), low + 0.5 * (extent - size), size, rng)
-    hits = hits_of(scene, octree.lines(count, rng), size, rng)
+    sampler = LineSampler(ArrivalOctree(arrival, normal, np.ones(len(arrival)), low + 0.5 * (extent - size), size, rng))
+    hits = hits_of(scene, sampler.draw(count, 1), size, 2)
     normal = download(scene.ray_intersect(hits.ray).n)
     normal *= -np.sign((normal * download(hits.ray.d)).sum(1, keepdims=True))
-    return hits, normal, count * octree.density(hits.position, normal)
+    density = sampler.density(hits.position, upload_vectors(mi.Vector3f, normal))
+    return hits, normal, count * download(density)
 
 
 @not_on_cuda("OptiX finds hits on a plane of a million units to within 0.2 units")
@@ -51,7 +53,7 @@ def hits_on_ground(scene, count=100_000):
 def test_hits_measure_the_area_of_a_large_ground(shape, size):
     """The sum of 1 / density over the hits on the upper side, the standard error of which is 1% with 400 000 lines."""
     hits, normal, density = hits_on_ground(mi.load_dict({"type": "scene", "ground": GROUNDS[shape](size)}), 400_000)
-    inside = (np.abs(hits.position) < 0.9).all(1) & (normal[:, 1] > 0)
+    inside = (np.abs(download(hits.position)) < 0.9).all(1) & (normal[:, 1] > 0)
     projected = np.where(inside, normal[:, 1] / density, 0)
     assert projected.sum() == pytest.approx(1.8**2, rel=0.02)
     # No hit stands for a large part of the area
@@ -64,10 +66,10 @@ def test_a_large_ground_does_not_hide_what_lies_on_it(shape, size):
     """Shadow rays end above the surface by the uncertainty of a hit."""
     scene = mi.load_dict({"type": "scene", "ground": GROUNDS[shape](size)})
     hits, normal, _ = hits_on_ground(scene, 20_000)
-    place = dr.zeros(mi.Interaction3f, hits.count)
+    place, position = dr.zeros(mi.Interaction3f, hits.count), download(hits.position)
     place.p = upload_vectors(mi.Point3f, np.random.default_rng(1).uniform([-1, 1, -1], [1, 2, 1], (hits.count, 3)))
-    above = upload_vectors(mi.Point3f, hits.position + hits.uncertainty[:, None] * normal)
-    near = (np.abs(hits.position).max(1) < 1) & (normal[:, 1] > 0)
+    above = upload_vectors(mi.Point3f, position + hits.uncertainty[:, None] * normal)
+    near = (np.abs(position).max(1) < 1) & (normal[:, 1] > 0)
     assert near.any() and not (download(scene.ray_test(place.spawn_ray_to(above))) & near).any()
 
 
@@ -77,6 +79,7 @@ def test_a_line_crosses_a_ball_twice(size):
     count, rng = 1000, np.random.default_rng(0)
     origin = rng.uniform(-0.5, 0.5, (count, 3)) * size
     origin[:, 2] = -1.5 * size
-    direction, box = np.tile(np.float32([0, 0, 1]), (count, 1)), np.full((count, 3), 2 * size)
-    lines = Lines(np.float32(origin), direction, np.full(count, 3 * size, np.float32), -box, 2 * box)
-    assert hits_of(scene, lines, 3 * size, rng).count == 2 * count
+    direction, box = dr.repeat(mi.Vector3f(0, 0, 1), count), dr.repeat(mi.Vector3d(2 * size), count)
+    length = dr.repeat(mi.Float(3 * size), count)
+    lines = Lines(upload_vectors(mi.Point3f, origin), direction, length, -box, 2 * box)
+    assert hits_of(scene, lines, 3 * size, 1).count == 2 * count

@@ -13,15 +13,16 @@ from scipy import stats
 
 from tests.support.catalogue import EMITTERS, MATERIALS, one_of, stage
 from tests.support.properties import examples, unit_vectors
-from vpl.core.arrays import upload
+from vpl.core.arrays import download, upload, upload_vectors
 from vpl.direct.emitter_sampling import power_heuristic
 from vpl.lights.light_set import ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.lights.virtual_lights import DeviceLights, VirtualLights
 from vpl.points.surfaces import LambertianSurface
+from vpl.split.arrival_octree import ArrivalOctree
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
 from vpl.split.lattice import Lattice, lattice_multiplier
-from vpl.split.line_sampling import ArrivalOctree
+from vpl.split.line_sampling import LineSampler
 from vpl.split.pixel_clusters import PixelClusters, Receivers
 from vpl.split.pixel_rays import PixelRays
 from vpl.split.view import View
@@ -181,25 +182,34 @@ def cells_on_sphere_and_plane(seed, tilt):
     return ArrivalOctree(position, normal, rng.uniform(0.1, 1, 600), [-2.5] * 3, 5.0, rng)
 
 
+def rays_of(lines):
+    """(Origins, directions, lengths) in double precision."""
+    return tuple(download(x).astype(np.float64) for x in (lines.origin, lines.direction, lines.length))
+
+
+def density_of(sampler, position, normal):
+    return download(sampler.density(*(upload_vectors(mi.Vector3f, np.float32(x)) for x in (position, normal))))
+
+
 def hits_of_sphere(lines, radius=0.8):
     """(position, normal of the hit side) of all hits."""
-    o, d = lines.origin.astype(np.float64), lines.direction.astype(np.float64)
+    o, d, length = rays_of(lines)
     b = (o * d).sum(1)
     disc = b**2 - (o**2).sum(1) + radius**2
     found = []
     for sign in (-1, 1):
         t = -b + sign * np.sqrt(np.maximum(disc, 0))
-        ok = (disc > 0) & (t > 0) & (t < lines.length)
+        ok = (disc > 0) & (t > 0) & (t < length)
         p = (o + t[:, None] * d)[ok]
         found.append((p, -sign * p / radius))
     return tuple(np.concatenate(columns) for columns in zip(*found, strict=True))
 
 
 def hits_of_plane(lines, height=-1.5):
-    o, d = lines.origin.astype(np.float64), lines.direction.astype(np.float64)
+    o, d, length = rays_of(lines)
     t = (height - o[:, 2]) / d[:, 2]
     p = o + t[:, None] * d
-    ok = (t > 0) & (t < lines.length) & (np.abs(p[:, :2]) < 2).all(1)
+    ok = (t > 0) & (t < length) & (np.abs(p[:, :2]) < 2).all(1)
     return p[ok], np.where(d[ok, 2:] < 0, 1.0, -1.0) * [[0, 0, 1]]
 
 
@@ -208,10 +218,11 @@ def hits_of_plane(lines, height=-1.5):
 def test_lines_meet_surfaces_with_the_density_that_is_said(seed, tilt):
     """The mean of 1 / density over hits is the area of each side, in every octant and quadrant."""
     cells, count = cells_on_sphere_and_plane(seed, tilt), 400_000
-    lines = cells.lines(count, np.random.default_rng(seed + 100))
+    sampler = LineSampler(cells)
+    lines = sampler.draw(count, seed + 100)
     for hits, area in ((hits_of_sphere, 4 * np.pi * 0.64 / 8), (hits_of_plane, 16 / 4)):
         position, normal = hits(lines)
-        density = cells.density(position, normal)
+        density = density_of(sampler, position, np.broadcast_to(normal, position.shape))
         assert (density > 0).all()
         outside = (normal * (position if hits is hits_of_sphere else [[0, 0, 1]])).sum(1) > 0
         parts = position[:, 0] > 0, position[:, 1] > 0, (position[:, 2] > 0) & (hits is hits_of_sphere)
@@ -233,11 +244,13 @@ def test_lines_stay_in_the_scene_and_every_side_has_a_density(seed):
     normal = unit_vectors(rng, count)
     cells = ArrivalOctree(position, normal, rng.uniform(0.1, 1, count), [-0.1 * size] * 3, 1.2 * size, rng)
     cells.choose_by(rng.random(len(cells.leaf_weight)) + 1e-3)
-    assert (cells.density(position, normal) > 0).all() and (cells.density(position, -normal) > 0).all()
-    assert np.isfinite(cells.density(position, normal)).all()
-    lines = cells.lines(500, rng)
-    assert np.isfinite(lines.origin).all() and (lines.length >= 0).all()
-    np.testing.assert_allclose(np.linalg.norm(lines.direction, axis=1), 1, atol=1e-5)
+    sampler = LineSampler(cells)
+    for side in (normal, -normal):
+        density = density_of(sampler, position, side)
+        assert (density > 0).all() and np.isfinite(density).all()
+    origin, direction, length = rays_of(sampler.draw(500, seed))
+    assert np.isfinite(origin).all() and (length >= 0).all()
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1, atol=1e-5)
 
 
 # ---------------------- Bounds, lights and clusters ----------------------
