@@ -244,12 +244,12 @@ class Gatherer:
         brightness = np.maximum(traced, 0) + self.expected[slice(*part.pixels)]
         # Of the sum over the samples of a pixel
         allowed = self._errors(rays) * rays.numbers * np.maximum(brightness, self.darkest)
+        precise = dr.float64_array_t(mi.Float)
+        allowed = dr.gather(precise, upload(precise, allowed), clusters.pixel)
         shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, part.first)
         for number, transport in enumerate(self.transports):
             stream = derived_seed(seed, 1, number)
-            shadow_rays += light_clusters(
-                transport, clusters, allowed[clusters.pixel], view.model.largest_cut, stream, lit, sums
-            )
+            shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit, sums)
         clock.stop()
         counts = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}
         return lit, counts | {"later": points.alone}

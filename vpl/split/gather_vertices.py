@@ -14,7 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, download, select_record, upload
+from ..core.arrays import channel_mean, select_record, upload
+from ..core.loops import recorded_once
+from ..core.sampling import independent_sampler
 from .pixel_rays import PixelRays
 
 
@@ -168,19 +170,60 @@ def drawn_later(
     start.
     """
     levels = [channel_mean(dr.abs(x.weight)) for x in (first, later)]
-    dr.eval(levels)
-    of_first, of_later = (np.nan_to_num(download(x).astype(np.float64), posinf=0) for x in levels)
-    begin = rays.first[:-1]
-    sums = np.add.reduceat(of_later, begin)
-    step = (sums + np.add.reduceat(of_first, begin)) / np.array(rays.lit(most))[rays.level]
-    start = np.random.default_rng(seed).random(rays.pixels)
-    number = np.floor(sums / np.where(sums > 0, step, 1) + start).astype(np.int64)
-    pixel = np.repeat(np.arange(rays.pixels), number)
-    rank = np.arange(len(pixel)) - np.repeat(np.cumsum(number) - number, number)
-    cumulative = np.cumsum(of_later)
-    target = (cumulative[begin] - of_later[begin])[pixel] + (rank + 1 - start[pixel]) * step[pixel]
-    ray = np.minimum(np.searchsorted(cumulative, target, side="left"), len(of_later) - 1)
-    # Rounding must not lead to a neighbouring pixel or to a vertex without weight
-    kept = (of_later[ray] > 0) & (rays.pixel_of(ray) == pixel)
-    ray, factor = ray[kept], step[pixel[kept]] / of_later[ray[kept]]
-    return upload(mi.UInt32, ray), upload(mi.Float, factor)
+    levels = [dr.select(dr.isfinite(level), level, 0) for level in levels]
+    start = independent_sampler(seed, rays.pixels).next_1d()
+    dr.eval(levels, start)
+    pixels = rays.device_first, rays.by_level(rays.sizes), rays.by_level(rays.lit(most)), start
+    # The same kernel counts and records the draws
+    number = _draw_systematically(pixels, levels, dr.zeros(mi.UInt32, rays.pixels), False, _Drawn.none(1))
+    drawn = _Drawn.none(int(dr.sum(number)[0]))
+    if dr.width(drawn.ray):
+        _draw_systematically(pixels, levels, dr.prefix_reduce(dr.ReduceOp.Add, number), True, drawn)
+    return drawn.ray, drawn.factor
+
+
+@dataclass
+class _Drawn:
+    """Output arrays of :func:`_draw_systematically`: the ``ray`` and the ``factor`` of the weight for each draw."""
+
+    ray: mi.UInt32
+    factor: mi.Float
+
+    @classmethod
+    def none(cls, count: int) -> _Drawn:
+        """Arrays of ``count`` entries, not written yet."""
+        return cls(dr.zeros(mi.UInt32, count), dr.zeros(mi.Float, count)) if count else cls(mi.UInt32(), mi.Float())
+
+
+@recorded_once
+@dr.syntax
+def _draw_systematically(pixels, levels, place, find: bool, drawn: _Drawn):
+    """Number of draws of the later vertices of each of the ``pixels`` (first ray, rays, lit vertices, random start).
+
+    ``levels``: weights of first and of later vertices.  With ``find``, writes the draws to ``drawn``, for each pixel
+    from the index ``place`` on.
+    """
+    begin, rays, lit, start = pixels
+    of_first, of_later = levels
+    precise, find = dr.float64_array_t(mi.Float), dr.opaque(mi.Bool, find)
+    dr.make_opaque(place, drawn)
+    total, k = dr.zeros(precise, dr.width(begin)), dr.zeros(mi.UInt32, dr.width(begin))
+    while dr.hint(k < rays, exclude=[begin, rays, of_first, of_later]):
+        total += dr.gather(mi.Float, of_first, begin + k) + dr.gather(mi.Float, of_later, begin + k)
+        k += 1
+    step, sum_of_later, number = (
+        total / precise(lit),
+        dr.zeros(precise, dr.width(begin)),
+        dr.zeros(mi.UInt32, dr.width(begin)),
+    )
+    k = dr.zeros(mi.UInt32, dr.width(begin))
+    while dr.hint(k < rays, exclude=[begin, rays, of_later, start, step, place, find, drawn]):
+        level = dr.gather(mi.Float, of_later, begin + k)
+        sum_of_later += level
+        draws = dr.select(step > 0, mi.UInt32(dr.floor(sum_of_later / step + start)), 0)
+        while dr.hint(number < draws, exclude=[begin, k, level, step, place, find, drawn]):
+            dr.scatter(drawn, _Drawn(begin + k, mi.Float(step / level)), place + number, find)
+            number += 1
+        k += 1
+    dr.eval(number, drawn)
+    return number

@@ -14,16 +14,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import add_at, channel_mean, download, upload, upload_vectors
+from ..core.arrays import add_at, channel_mean
+from ..core.loops import recorded_once
 from ..core.sampling import derived_seed, find_interval, independent_sampler, precise_sample, running_sums
-from ..cuts.light_cuts import collect_cuts, limited_cuts, upload_thresholds
+from ..cuts.light_cuts import collect_cuts, limited_cuts
 from ..points.bsdf_proxies import MaterialProxy
 from ..points.surfaces import LambertianSurface, Receiver
 from ..transport.evaluation import Transport, evaluate_pairs
 from .contributions import LayerSums
-from .gather_vertices import LitVertices
+from .gather_vertices import LitVertices, joined
 from .pixel_rays import PixelRays
-from .spatial_cells import FACINGS, facing
+from .spatial_cells import FACINGS, device_facing
 
 
 @dataclass
@@ -33,15 +34,12 @@ class Receivers:
     receiver: Receiver
 
     @classmethod
-    def of(cls, center, extent, axis, cosine) -> Receivers:
-        """From boxes (n, 3) and cones of normals: axes (n, 3), cosines of half-angles (n,)."""
-        count = len(center)
+    def of(cls, center: mi.Point3f, extent: mi.Vector3f, axis: mi.Vector3f, cosine: mi.Float) -> Receivers:
+        """From boxes and cones of normals: axes, cosines of half-angles."""
+        count = dr.width(cosine)
         white, no = mi.Color3f(*(dr.opaque(mi.Float, 1.0, count) for _ in range(3))), mi.Bool(False)
         proxy = MaterialProxy(white, None, None, None, no, no, False, False)
-        center, extent, axis = (
-            upload_vectors(kind, x) for kind, x in ((mi.Point3f, center), (mi.Vector3f, extent), (mi.Vector3f, axis))
-        )
-        return cls(Receiver(center, axis, proxy, extent, upload(mi.Float, cosine)))
+        return cls(Receiver(center, axis, proxy, extent, cosine))
 
     @property
     def count(self) -> int:
@@ -64,42 +62,36 @@ class Receivers:
 class PixelClusters:
     """Clusters of lit vertices (at least one) by pixel and facing; each later vertex is a separate cluster.
 
-    ``camera_rays`` of the pixels.
+    ``first``, ``size``: range of the vertices of each cluster; ``pixel`` of each cluster; ``ray`` of each vertex, in
+    the order of the clusters; ``camera_rays`` of the pixels.
     """
 
     def __init__(self, lit: LitVertices, camera_rays: PixelRays):
-        vertices, rays, alone = lit.vertices, lit.rays, lit.alone
-        # Shape (3, n): NumPy is several times faster
-        position, normal = (np.stack([download(x) for x in vector]) for vector in (vertices.position, vertices.normal))
-        pixel = camera_rays.pixel_of(download(rays)).astype(np.int64)
-        key = pixel * FACINGS + facing(normal.T)
-        key[len(key) - alone :] = (pixel.max() + 1) * FACINGS + np.arange(alone)
-        order = np.argsort(key, kind="stable")
-        position, normal, key = position.take(order, 1), normal.take(order, 1), key[order]
-        first = np.flatnonzero(np.diff(key, prepend=-1))
-        low, high = np.minimum.reduceat(position, first, 1), np.maximum.reduceat(position, first, 1)
-        axis = np.add.reduceat(normal, first, 1)
-        axis /= np.maximum(np.linalg.norm(axis, axis=0), 1e-20)
-        size = np.diff(first, append=len(key))
-        self.cluster = np.repeat(np.arange(len(first)), size)
-        cosine = np.minimum.reduceat((normal * axis.take(self.cluster, 1)).sum(0), first)
-        self.pixel = pixel[order[first]]
-        # Rounded down by 16 units in the last place, so the cone holds every normal
-        box = 0.5 * (low + high), 0.5 * (high - low), axis
-        self.receivers = Receivers.of(*(x.T for x in box), np.maximum(cosine - 2e-6, -1))
-        self.first, self.size = upload(mi.UInt32, first), upload(mi.UInt32, size)
-        along = upload(mi.UInt32, order)
+        vertices, together = lit.vertices, lit.count - lit.alone
+        pixel = camera_rays.places(lit.rays).pixel
+        first, size, order = _by_pixel_and_facing(vertices.normal, pixel, together, camera_rays.pixels)
+        if lit.alone:
+            last = dr.arange(mi.UInt32, lit.alone) + dr.opaque(mi.UInt32, together)
+            first, size = joined(first, last), joined(size, dr.opaque(mi.UInt32, 1, lit.alone))
+            order = joined(order, last)
+        self.first, self.size = first, size
+        at = [dr.gather(type(x), x, order) for x in (vertices.position, vertices.flat, vertices.normal, vertices.depth)]
         self.ray, self._weight = (
-            dr.gather(mi.UInt32, rays, along),
-            dr.gather(mi.UnpolarizedSpectrum, vertices.weight, along),
+            dr.gather(mi.UInt32, lit.rays, order),
+            dr.gather(mi.UnpolarizedSpectrum, vertices.weight, order),
         )
-        at = [dr.gather(type(x), x, along) for x in (vertices.position, vertices.flat, vertices.normal, vertices.depth)]
         self._level = channel_mean(dr.abs(self._weight))
-        self.cumulative = running_sums(self._level)
-        sums = download(self.cumulative)
-        self.weight = sums[first + size] - sums[first]
-        dr.eval(at, self.ray, self._weight, self._level)
+        self.pixel = dr.gather(mi.UInt32, pixel, dr.gather(mi.UInt32, order, self.first))
+        dr.eval(at, self.ray, self._weight, self._level, self.first, self.size, self.pixel)
         self._vertices = at
+        self.receivers = Receivers.of(*_bounds(at[0], at[2], self.first, self.size))
+        self.cumulative = running_sums(self._level)
+
+    @property
+    def weight(self):
+        """Sum of the weights of each cluster, double precision."""
+        first = dr.gather(type(self.cumulative), self.cumulative, self.first)
+        return dr.gather(type(self.cumulative), self.cumulative, self.first + self.size) - first
 
     @property
     def count(self) -> int:
@@ -125,19 +117,77 @@ class PixelClusters:
         )
 
 
+def _by_pixel_and_facing(normal: mi.Normal3f, pixel: mi.UInt32, count: int, pixels: int):
+    """Groups of the first ``count`` vertices, whose ``pixel`` ascends, by pixel and facing: (first and size of each
+    group, the vertices in the order of the groups), evaluated."""
+    if count == 0:
+        return mi.UInt32(), mi.UInt32(), mi.UInt32()
+    facing, vertex = device_facing(normal), dr.arange(mi.UInt32, count)
+    of_pixel, of_key = dr.zeros(mi.UInt32, pixels), dr.zeros(mi.UInt32, pixels * FACINGS)
+    own, toward = dr.gather(mi.UInt32, pixel, vertex), dr.gather(mi.UInt32, facing, vertex)
+    add_at(of_pixel, dr.opaque(mi.UInt32, 1, count), own)
+    add_at(of_key, dr.opaque(mi.UInt32, 1, count), own * FACINGS + toward)
+    dr.eval(facing, of_pixel, of_key)
+    begin, first = (dr.prefix_reduce(dr.ReduceOp.Add, number) for number in (of_pixel, of_key))
+    order = _vertices_by_key(facing, begin, of_pixel, first, dr.zeros(mi.UInt32, count))
+    used = dr.compress(of_key > 0)
+    first, size = (dr.gather(mi.UInt32, x, used) for x in (first, of_key))
+    dr.eval(first, size)
+    return first, size, order
+
+
+@recorded_once
+@dr.syntax
+def _vertices_by_key(facing, begin, number, first, order):
+    """Write the vertices of each pixel and facing to ``order``, from ``first`` on.  A pixel has ``number`` vertices,
+    from ``begin`` on."""
+    key = dr.arange(mi.UInt32, dr.width(first))
+    pixel, wanted, place, k = key // FACINGS, key % FACINGS, mi.UInt32(first), dr.zeros(mi.UInt32, dr.width(first))
+    start, count = dr.gather(mi.UInt32, begin, pixel), dr.gather(mi.UInt32, number, pixel)
+    while dr.hint(k < count, exclude=[facing, start, count, wanted, order]):
+        found = dr.gather(mi.UInt32, facing, start + k) == wanted
+        dr.scatter(order, start + k, place, found)
+        place += dr.select(found, mi.UInt32(1), 0)
+        k += 1
+    dr.eval(place, order)
+    return order
+
+
+@recorded_once
+@dr.syntax
+def _bounds(position, normal, first, size):
+    """Box and cone of normals of each range of vertices: (centre, half of the extent, axis, cosine), evaluated."""
+    low, high = mi.Point3f(dr.inf), mi.Point3f(-dr.inf)
+    axis, k = mi.Vector3f(0), dr.zeros(mi.UInt32, dr.width(first))
+    while dr.hint(k < size, exclude=[position, normal, first, size]):
+        point = dr.gather(mi.Point3f, position, first + k)
+        low, high = dr.minimum(low, point), dr.maximum(high, point)
+        axis += mi.Vector3f(dr.gather(mi.Normal3f, normal, first + k))
+        k += 1
+    axis /= dr.maximum(dr.norm(axis), 1e-20)
+    cosine, k = mi.Float(1), dr.zeros(mi.UInt32, dr.width(first))
+    while dr.hint(k < size, exclude=[normal, first, size, axis]):
+        cosine = dr.minimum(cosine, dr.dot(axis, dr.gather(mi.Normal3f, normal, first + k)))
+        k += 1
+    # Rounded down by 16 units in the last place, so the cone holds every normal
+    box = 0.5 * (low + high), 0.5 * (high - low), axis, dr.maximum(cosine - 2e-6, -1)
+    dr.eval(box)
+    return box
+
+
 def light_clusters(
-    transport: Transport, clusters: PixelClusters, allowed: np.ndarray, max_cut: int, seed: int, result,
-    sums: LayerSums | None,
+    transport: Transport, clusters: PixelClusters, allowed, max_cut: int, seed: int, result, sums: LayerSums | None,
 ) -> int:  # fmt: skip
     """Add the light of virtual lights at the clusters to ``result``, per camera ray; returns the number of shadow rays.
 
-    ``allowed`` (clusters,): largest bound of a pair, as a contribution to the sum over the samples of the pixel;
-    ``sums`` by layer.  A light of a node is drawn in proportion to intensity, so the drawn lights of a group have the
-    expectation of the lights of the group.
+    ``allowed``, for each cluster in double precision: largest bound of a pair, as a contribution to the sum over the
+    samples of the pixel; ``sums`` by layer.  A light of a node is drawn in proportion to intensity, so the drawn lights
+    of a group have the expectation of the lights of the group.
     """
-    with np.errstate(over="ignore"):  # a cluster without weight may have any error
-        allowed = allowed / np.maximum(clusters.weight, np.finfo(np.float64).tiny)
-    threshold, sizes, _ = limited_cuts(transport.lights, clusters.receivers, upload_thresholds(allowed), max_cut)
+    # A cluster without weight may have any error
+    threshold = mi.Float(allowed / dr.maximum(clusters.weight, np.finfo(np.float64).tiny))
+    dr.eval(threshold)
+    threshold, sizes, _ = limited_cuts(transport.lights, clusters.receivers, threshold, max_cut)
     rays = 0
     for number, chunk in enumerate(collect_cuts(transport.lights, clusters.receivers, threshold, sizes)):
         sampler = independent_sampler(derived_seed(seed, number), dr.width(chunk.rows))

@@ -6,6 +6,7 @@ a power of two, so that all pixels with a number share a lattice, see :mod:`vpl.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -107,6 +108,15 @@ class PixelRays:
         same fraction of larger and smaller numbers, and at least one."""
         kept = min(most, self.mean)
         return [max(round(size * kept / self.mean), 1) for size in self.sizes]
+
+    def by_level(self, values: Sequence[int]) -> mi.UInt32:
+        """The value of each pixel: ``values[i]`` for pixels with ``sizes[i]`` rays."""
+        return upload(mi.UInt32, np.array(values)[self.level])
+
+    @property
+    def device_first(self) -> mi.UInt32:
+        """First ray of each pixel."""
+        return self._device_rows[0]
 
     def part(self, first: int, last: int) -> PixelRays:
         """The pixels from ``first`` up to, and without, ``last``."""

@@ -285,7 +285,9 @@ def test_bounds_are_above_what_lights_of_surfaces_contribute(seed):
     cosine1 = np.maximum((around[0][:, None] * to_light).sum(2), 0)
     cosine2 = np.maximum(-(around[1][None] * to_light).sum(2), 0)
     true = (cosine1 * cosine2 / (d2 + c**2 * cosine1 * cosine2) * intensity).max()
-    receivers = Receivers.of(*(x[None] for x in (center[0], extent[0], axes[0])), cosines[:1])
+    kinds = mi.Point3f, mi.Vector3f, mi.Vector3f
+    box = (upload_vectors(kind, x[:1]) for kind, x in zip(kinds, (center, extent, axes), strict=True))
+    receivers = Receivers.of(*box, upload(mi.Float, cosines[:1]))
     node = SimpleNamespace(
         center=points(center[1:]), extent=mi.Vector3f(points(extent[1:])), axis=mi.Vector3f(points(axes[1:])),
         cosine=upload(mi.Float, cosines[1:]), intensity=mi.Color3f(intensity),
@@ -372,7 +374,7 @@ def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
     rays = PixelRays.uniform(count // samples, samples)
     clusters = PixelClusters(LitVertices(vertices, dr.arange(mi.UInt32, count), 0), rays)
     first, size = np.array(clusters.first), np.array(clusters.size)
-    assert size.sum() == count and (clusters.pixel[clusters.cluster] == np.array(clusters.ray) // samples).all()
+    assert size.sum() == count and (np.repeat(clusters.pixel, size) == np.array(clusters.ray) // samples).all()
     draws = 20_000
     for cluster in range(0, clusters.count, 31):
         members = np.array(clusters.ray)[first[cluster] : first[cluster] + size[cluster]]
