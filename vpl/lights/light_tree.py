@@ -45,6 +45,8 @@ from .clustering import (
 
 # Factor of the squared angular term of the metric: a quarter of the scene's diagonal, squared
 ANGULAR_WEIGHT = 1 / 16
+# Neighbours along the curve, to either side, that may become the partner of a cluster
+WINDOW = 16
 # Columns of LightTree.records, and their number
 BOX_MIN, BOX_MAX, CONE_AXIS, CONE_COS = slice(0, 3), slice(3, 6), slice(6, 9), 9
 INTENSITY, FLUX, ESCAPE, REPRESENTATIVE = 10, slice(11, 14), 14, 15
@@ -81,7 +83,7 @@ class LightTree:
         return self.records.view(np.uint32)[:, REPRESENTATIVE]
 
 
-def build_light_tree(position, direction, flux, rng, window=16, angular_weight=ANGULAR_WEIGHT) -> LightTree:
+def build_light_tree(position, direction, flux, rng, window=WINDOW, angular_weight=ANGULAR_WEIGHT) -> LightTree:
     """Cluster lights into a binary tree by the method of the module's docstring.
 
     position: (n, 3) float32, world units; None for lights at infinity, which are clustered by direction alone.

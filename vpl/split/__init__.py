@@ -29,10 +29,11 @@ The terms of the estimator:
 
 The lights and the decisions:
 
-- ``pilot``: a few whole paths, the relative variance, the brightness of the image nearby, the octree of the lines
+- ``pilot``: a few whole paths, the relative variance, the brightness of the image nearby, the sampler of the lines
 - ``cost_model``: every constant of the decisions, with unit and evidence
 - ``plan``: whether lights pay, the number of lights, and the fineness of the clusters
-- ``line_sampling``: random lines with a known density on surfaces, drawn near the arrivals of camera paths
+- ``arrival_octree``: boxes around the arrivals of camera paths
+- ``line_sampling``: random lines through the boxes, with a known density on surfaces
 - ``line_hits``: crossings of random lines with surfaces, each counted once
 - ``surface_lights``: a virtual light at each crossing of a line with a surface; kept lights
 - ``emitter_lights``: virtual lights representing many emitters

@@ -31,11 +31,17 @@ class CostModel:
     # ---------------------- Pilot ----------------------
     pilot_rays: int = _constant(1 << 15, "camera rays", "Largest size of a pilot.", _SENSITIVITY)
     pilot_share: float = _constant(
-        1 / 16,
+        1 / 48,
         "1 / camera ray",
-        "Rays of a pilot for each camera ray of the image, at most: a pilot is traced up to five times.",
-        "benchmarks/manylights.py --parts cost",
+        "Rays of a pilot for each camera ray of the image: a pilot is traced up to five times.",
+        "renders of 2.5 and 10 s, denoised, nine scenes (decisions.md)",
         most=1,
+    )
+    small_pilot_rays: int = _constant(
+        1 << 12, "camera rays", "Pilots of fewer rays have a larger share of the rays of the image.", _SENSITIVITY
+    )
+    small_pilot_share: float = _constant(
+        1 / 16, "1 / camera ray", "This share.", "benchmarks/manylights.py --parts cost", most=1
     )
     learned_cost: float = _constant(
         1.15,
@@ -212,6 +218,11 @@ class CostModel:
     roulette_prior: float = _constant(
         4.0, "vertices", "Vertices of average radiance that each cell has besides its own.", _SENSITIVITY
     )
+
+    def pilot_size(self, rays: int) -> int:
+        """Number of camera rays of a pilot for an image of so many ``rays``."""
+        small = min(self.small_pilot_rays, int(self.small_pilot_share * rays))
+        return min(max(int(self.pilot_share * rays), small), self.pilot_rays)
 
     def without_denoiser(self) -> CostModel:
         """The model of images that are not denoised: all variance has the same weight."""

@@ -143,7 +143,7 @@ class Pilot:
 
 def pilot_lanes(view: View) -> np.ndarray:
     """Indices (n,) of the camera rays of a pilot: pairs over the whole image."""
-    return view.pairs(min(view.model.pilot_rays, int(view.model.pilot_share * view.learning_count)))
+    return view.pairs(view.model.pilot_size(view.learning_count))
 
 
 def mean_radiance(radiance) -> np.ndarray:
@@ -193,10 +193,16 @@ def relative_variance(values: np.ndarray, brightness: np.ndarray, model: CostMod
 
     Leaves out the largest errors and adds a constant to the brightness, as the error of the comparison does.
     """
+    error = np.sort(relative_errors(values, brightness, model))
+    return float(np.mean(error[: len(error) - int(model.trimmed * len(error))])) if len(error) else 0.0
+
+
+def relative_errors(values: np.ndarray, brightness: np.ndarray, model: CostModel) -> np.ndarray:
+    """Estimates (n // 2,) of the variance of a path over the squared ``brightness`` (n,), one from each pair of the
+    ``values`` (n,)."""
     count = len(values) // 2
     first, second = values[: 2 * count].astype(np.float64).reshape(-1, 2).T
-    error = np.sort(0.5 * (first - second) ** 2 / error_scale(brightness, model)[: 2 * count : 2] ** 2)
-    return float(np.mean(error[: count - int(model.trimmed * count)])) if count else 0.0
+    return 0.5 * (first - second) ** 2 / error_scale(brightness, model)[: 2 * count : 2] ** 2
 
 
 def error_scale(brightness: np.ndarray, model: CostModel) -> np.ndarray:

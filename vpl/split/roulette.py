@@ -101,11 +101,15 @@ def best_multiple(
     ``expected`` (n,): expected contributions with m = 1 of the paths with a second vertex; ``brought`` (n,): actual
     contributions, both relative to the image; ``edges`` (n,): edges beyond the second vertex; ``paths``: total number
     of paths; ``variance``: relative variance of a path without rule 2.
+
+    The largest increases of the variance are left out, as the largest errors are left out of ``variance``.  Otherwise a
+    single path decides where pilots are small.
     """
     best, least = np.inf, model.roulette_gain * variance * (model.first_edges + edges.sum() / paths)
+    kept = max(len(brought) - int(model.trimmed * paths), 0)
     for multiple in _MULTIPLES:
         survival = np.clip(multiple * expected, model.least_survival, 1)
-        of_multiple = variance + np.sum(brought**2 * (1 / survival - 1)) / paths
+        of_multiple = variance + np.sum(np.sort(brought**2 * (1 / survival - 1))[:kept]) / paths
         product = of_multiple * (model.first_edges + np.sum(edges * survival) / paths)
         if product < least:
             best, least = multiple, product

@@ -16,9 +16,10 @@ from ..core.arrays import upload
 from ..core.sampling import derived_seed
 from ..lights.light_set import LightSet
 from .camera_rays import CameraRays
+from .cost_model import CostModel
 from .emitters.base import EmitterSampler
 from .emitters.cell_choice import learning_rays
-from .pilot import Pilot, mean_radiance, pilot_lanes, relative_variance
+from .pilot import Pilot, mean_radiance, pilot_lanes, relative_errors
 from .plan import Evidence, Option
 from .view import Gathering, Stream, View, ViewLights
 
@@ -78,18 +79,28 @@ def learning_pilot(view: View) -> tuple[Pilot, bool]:
     (pilot, whether the sampler keeps what it learned).
 
     The sampler forgets if the second pilot has the greater variance × cost: small shadows and gloss can mislead the
-    sampler.  Emission that is seen directly does not count: no sampler of emitters changes its variance.
+    sampler.  Emission that is seen directly does not count: no sampler of emitters changes its variance.  If the
+    difference is within the standard error, as it may be in small pilots, the sampler keeps what it learned, because
+    learning pays in most scenes.
     """
     pilot = Pilot.trace(view, ViewLights())
     rays, seed = learning_rays(view.learning_count), derived_seed(view.seed, Stream.LEARNING)
     if not view.emitters.learn(*pilot.vertices, rays, seed):
         return pilot, False
     again = Pilot.trace(view, ViewLights())
-    before, after = (relative_variance(x.radiance - x.seen, pilot.brightness, view.model) for x in (pilot, again))
-    if view.model.learned_cost * after < before:
-        return again, True
-    view.emitters.forget()
-    return pilot, False
+    before, after = (relative_errors(x.radiance - x.seen, pilot.brightness, view.model) for x in (pilot, again))
+    if is_certain_rise(before, view.model.learned_cost * after, view.model):
+        view.emitters.forget()
+        return pilot, False
+    return again, True
+
+
+def is_certain_rise(before: np.ndarray, after: np.ndarray, model: CostModel) -> bool:
+    """Whether the mean of ``after`` (n,) exceeds that of ``before`` (n,) by more than a standard error, without the
+    pairs that hold the largest values."""
+    kept = np.argsort(np.maximum(before, after))[: len(before) - int(model.trimmed * len(before))]
+    rise = after[kept] - before[kept]
+    return len(rise) > 1 and bool(rise.mean() > rise.std(ddof=1) / len(rise) ** 0.5)
 
 
 def evidence_of(view: View, pilot: Pilot) -> Evidence:
