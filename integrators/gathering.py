@@ -118,7 +118,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         raise NotImplementedError
 
     def check_scene(self, scene):
-        """Raise ValueError for a scene with a participating medium, or without a finite size: CUDA's rays miss it."""
+        """Raise ValueError for a scene with a participating medium, or of infinite size, which rays miss on CUDA."""
         refuse_media(scene)
         bounding_sphere(scene)
 

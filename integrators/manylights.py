@@ -256,7 +256,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
         """The integrator ``prb`` with the same paths, and the sensor, which both are reserved for this thread.
 
         Raises RuntimeError in a variant without derivatives and while another thread renders with the same sensor,
-        ValueError for a participating medium and for layers.
+        ValueError for a scene that is not supported and for layers.
         """
         if "_ad_" not in mi.variant():
             raise RuntimeError(

@@ -15,5 +15,5 @@ def stress(*values):
 
 
 def not_on_cuda(reason):
-    """Mark of a test that OptiX, or the rounding of CUDA, fails with no fault of this project."""
+    """Skip a test on CUDA, where it fails by hits of OptiX or by rounding."""
     return pytest.mark.skipif(VARIANT.startswith("cuda"), reason=reason)

@@ -17,7 +17,7 @@ def interleave(cells: np.ndarray) -> np.ndarray:
 
 
 def interleaved(columns):
-    """The same for columns of three unsigned 64-bit integers, by NumPy or Dr.Jit."""
+    """The same for three columns of unsigned 64-bit integers, of NumPy or Dr.Jit."""
     x, y, z = (_spread(bits) for bits in columns)
     return x | (y << 1) | (z << 2)
 

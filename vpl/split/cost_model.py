@@ -45,7 +45,7 @@ class CostModel:
         most=1,
     )
     small_pilot: int = _constant(
-        1 << 12, "camera rays", "Below this size, pilots have the larger share.", "2.5 s: 4096 as good as 8192"
+        1 << 12, "camera rays", "Up to this size, pilots have the larger share.", "2.5 s: 4096 as good as 8192"
     )
     learned_cost: float = _constant(
         1.15,

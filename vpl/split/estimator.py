@@ -135,7 +135,7 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
 
     def make():
         drawn.append(wanted)
-        return surface_lights(view, pilot.lines, wanted, lambda: clock.begin(Stage.TREE))
+        return surface_lights(view, pilot.line_sampler, wanted, lambda: clock.begin(Stage.TREE))
 
     made = kept.find(view.scene, (view.seed, view.rules.max_depth, view.model.shared), make) if kept else make()
     statistics = {"light_paths": sum(drawn), "lights": {"surface": made.lights.count}}

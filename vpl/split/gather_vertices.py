@@ -16,7 +16,7 @@ import numpy as np
 
 from ..core.arrays import channel_mean, select_record, upload
 from ..core.loops import recorded_once
-from ..core.sampling import independent_sampler
+from ..core.sampling import independent_sampler, precise_sample
 from .pixel_rays import PixelRays
 
 
@@ -127,8 +127,8 @@ class Gathered:
 class LitVertices:
     """Gather vertices that virtual lights light.
 
-    ``vertices``: weights divided by the lit fraction; ``rays``: the camera ray of each vertex, UInt32; ``alone``:
-    number of later vertices, at the end; each later vertex is a cluster.
+    ``vertices``: first vertices by ascending ray, then later vertices; weights divided by the lit fraction; ``rays``:
+    the camera ray of each vertex, UInt32; ``alone``: number of later vertices; each later vertex is a cluster.
     """
 
     vertices: GatherVertices
@@ -171,7 +171,7 @@ def drawn_later(
     """
     levels = [channel_mean(dr.abs(x.weight)) for x in (first, later)]
     levels = [dr.select(dr.isfinite(level), level, 0) for level in levels]
-    start = independent_sampler(seed, rays.pixels).next_1d()
+    start = precise_sample(independent_sampler(seed, rays.pixels))
     dr.eval(levels, start)
     pixels = rays.device_first, rays.by_level(rays.sizes), rays.by_level(rays.lit(most)), start
     # The same kernel counts and records the draws
@@ -192,7 +192,7 @@ class _Drawn:
     @classmethod
     def none(cls, count: int) -> _Drawn:
         """Arrays of ``count`` entries, not written yet."""
-        return cls(dr.zeros(mi.UInt32, count), dr.zeros(mi.Float, count)) if count else cls(mi.UInt32(), mi.Float())
+        return cls(dr.zeros(mi.UInt32, count), dr.zeros(mi.Float, count))
 
 
 @recorded_once
@@ -209,7 +209,8 @@ def _draw_systematically(pixels, levels, place, find: bool, drawn: _Drawn):
     dr.make_opaque(place, drawn)
     total, k = dr.zeros(precise, dr.width(begin)), dr.zeros(mi.UInt32, dr.width(begin))
     while dr.hint(k < rays, exclude=[begin, rays, of_first, of_later]):
-        total += dr.gather(mi.Float, of_first, begin + k) + dr.gather(mi.Float, of_later, begin + k)
+        total += dr.gather(mi.Float, of_first, begin + k)
+        total += dr.gather(mi.Float, of_later, begin + k)
         k += 1
     step, sum_of_later, number = (
         total / precise(lit),

@@ -56,8 +56,7 @@ class LineHits:
 
 def hits_of(scene, lines: Lines, scene_size: float, seed: int) -> LineHits:
     """Crossings of ``lines`` with surfaces inside the boxes, line by line; ``scene_size``: world units."""
-    margin = _UNCERTAINTY * scene_size
-    margin = dr.opaque(mi.Float, margin)
+    margin = dr.opaque(mi.Float, _UNCERTAINTY * scene_size)
     before = margin * (1 + independent_sampler(seed, lines.count).next_1d())
     segments = lines.origin - before * lines.direction, lines.direction, lines.length + before + margin
     dr.eval(segments)

@@ -91,7 +91,7 @@ class Pilot:
         return cls(arrivals, onward, vertices, pixel, radiance, seen, indirect, size, view.scene, seed, view.model)
 
     @cached_property
-    def lines(self) -> LineSampler:
+    def line_sampler(self) -> LineSampler:
         """Lines near the arrivals, drawn by their radiance: lights matter where visible and bright.  All passes of a
         render share the octree."""
         arrivals, generator = self.arrivals, np.random.default_rng(self.seed)
@@ -105,12 +105,12 @@ class Pilot:
         """Typical distance between the lights of ``lines`` lines by ``sampler``, where paths arrive, world
         units."""
         # Kept lights have the lines of another pilot
-        of_one = self._spacing if sampler is vars(self).get("lines") else self._spacing_of(sampler)
+        of_one = self._spacing if sampler is vars(self).get("line_sampler") else self._spacing_of(sampler)
         return of_one / lines**0.5
 
     @cached_property
     def _spacing(self) -> float:
-        return self._spacing_of(self.lines)
+        return self._spacing_of(self.line_sampler)
 
     def _spacing_of(self, sampler: LineSampler) -> float:
         position, normal = (upload_vectors(mi.Vector3f, x) for x in (self.arrivals.position, self.arrivals.normal))

@@ -123,11 +123,12 @@ def _by_pixel_and_facing(normal: mi.Normal3f, pixel: mi.UInt32, count: int, pixe
     if count == 0:
         return mi.UInt32(), mi.UInt32(), mi.UInt32()
     facing, vertex = device_facing(normal), dr.arange(mi.UInt32, count)
+    dr.eval(pixel, facing)
     of_pixel, of_key = dr.zeros(mi.UInt32, pixels), dr.zeros(mi.UInt32, pixels * FACINGS)
     own, toward = dr.gather(mi.UInt32, pixel, vertex), dr.gather(mi.UInt32, facing, vertex)
     add_at(of_pixel, dr.opaque(mi.UInt32, 1, count), own)
     add_at(of_key, dr.opaque(mi.UInt32, 1, count), own * FACINGS + toward)
-    dr.eval(facing, of_pixel, of_key)
+    dr.eval(of_pixel, of_key)
     begin, first = (dr.prefix_reduce(dr.ReduceOp.Add, number) for number in (of_pixel, of_key))
     order = _vertices_by_key(facing, begin, of_pixel, first, dr.zeros(mi.UInt32, count))
     used = dr.compress(of_key > 0)

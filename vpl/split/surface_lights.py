@@ -104,6 +104,7 @@ def _lights_at(
     irradiance, length, group = _irradiance(scene, emitters, places, settings, seed)
     position = dr.gather(mi.Point3f, hits.position, hit)
     sent = spectrum_to_rgb(minorant * irradiance)
+    dr.eval(position, sent, length, group)
     density = lines * download(sampler.density(position, places.normal))
     position, normal, sent, length = (download(x) for x in (position, places.normal, sent, length))
     with np.errstate(over="ignore"):

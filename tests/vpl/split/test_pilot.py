@@ -5,6 +5,7 @@ import pytest
 
 from vpl.split.cost_model import CostModel
 from vpl.split.pilot import means_of_others, pixel_means, relative_variance
+from vpl.split.start import is_certain_rise
 
 MODEL = CostModel()
 
@@ -101,3 +102,24 @@ def test_values_that_cancel_give_means_that_are_numbers():
     values = np.array([1.0, -1.0, 1e-200, -1e-200])
     for means in both_means(values, np.arange(4), 2, 4):
         assert np.all(np.isfinite(means))
+
+
+@pytest.mark.parametrize(
+    ("rays", "size"), [(0, 0), (1600, 100), (1 << 16, 1 << 12), (36 << 13, 1 << 13), (10**8, 1 << 15)]
+)
+def test_sizes_of_pilots(rays, size):
+    assert MODEL.pilot_size(rays) == size
+    raw = MODEL.without_denoiser().pilot_size(rays)
+    assert raw == min(rays // 16, 1 << 15) >= size
+
+
+def test_a_rise_is_certain_beyond_its_standard_error():
+    rng = np.random.default_rng(0)
+    before = rng.exponential(size=10_000)
+    other = rng.exponential(size=10_000)
+    assert is_certain_rise(before, 1.2 * other, MODEL) and not is_certain_rise(before, 0.8 * other, MODEL)
+    few = slice(0, 20)
+    assert not is_certain_rise(before[few], 0.9 * other[few], MODEL)
+    # A single pair does not decide
+    other[3] = 1e6
+    assert not is_certain_rise(before, 0.8 * other, MODEL)

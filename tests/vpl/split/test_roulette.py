@@ -27,6 +27,12 @@ def test_paths_end_where_they_bring_little_and_cost_much():
     assert best_multiple(np.ones(10_000), rare, edges, 10_000, 1.0, MODEL) == np.inf
 
 
+def test_a_single_path_does_not_decide():
+    brought, edges = np.full(10_000, 0.01), np.full(10_000, 5)
+    brought[7] = 1e3
+    assert best_multiple(np.full(10_000, 0.01), brought, edges, 10_000, 1.0, MODEL) < np.inf
+
+
 def test_those_that_bring_more_are_followed():
     """Half of the paths carry all radiance: the rest may end."""
     bright = np.arange(10_000) % 2 == 0

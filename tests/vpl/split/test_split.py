@@ -25,6 +25,7 @@ from vpl.split.lattice import Lattice, lattice_multiplier
 from vpl.split.line_sampling import LineSampler
 from vpl.split.pixel_clusters import PixelClusters, Receivers
 from vpl.split.pixel_rays import PixelRays
+from vpl.split.spatial_cells import FACINGS, facing
 from vpl.split.view import View
 from vpl.transport.bounds import contribution_bound
 from vpl.transport.carried_share import carried_geometry_term, carried_share
@@ -383,6 +384,31 @@ def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
         )  # fmt: skip
         assert set(np.unique(np.array(ray))) == set(members)
         np.testing.assert_allclose(np.array(value).mean(1), weight[members].sum(0), rtol=2e-3)
+
+
+@pytest.mark.parametrize("alone", [0, 7, 40])
+def test_clusters_hold_their_vertices(alone):
+    """The first vertices by pixel and facing; each of the last ones is a cluster."""
+    rng, count, samples = np.random.default_rng(alone), 40, 8
+    together, normal = count - alone, unit_vectors(rng, count).astype(np.float64)
+    place = rng.normal(size=(count, 3))
+    normals, white = mi.Normal3f(points(normal)), mi.Color3f(points(np.ones((count, 3))))
+    vertices = GatherVertices(points(place), normals, normals, white, dr.full(mi.UInt32, 1, count))
+    rays = np.concatenate([np.sort(rng.integers(0, 80, together)), np.sort(rng.integers(0, 80, alone))])
+    clusters = PixelClusters(LitVertices(vertices, upload(mi.UInt32, rays), alone), PixelRays.uniform(10, samples))
+    keys = np.unique((rays // samples * FACINGS + facing(normal))[:together])
+    first, size, pixel = (np.array(x) for x in (clusters.first, clusters.size, clusters.pixel))
+    assert list(pixel[: len(keys)]) == list(keys // FACINGS) and clusters.count == len(keys) + alone
+    assert size.sum() == count and (size[len(size) - alone :] == 1).all() and (np.diff(first) == size[:-1]).all()
+    ray, receiver = np.array(clusters.ray), clusters.receivers.receiver
+    assert sorted(ray) == sorted(rays)
+    low, high = (np.array(receiver.position + sign * receiver.extent).T for sign in (-1, 1))
+    inside, around = np.array(clusters._vertices[0]).T, np.array(clusters._vertices[2]).T
+    of = np.repeat(np.arange(clusters.count), size)
+    assert (ray // samples == pixel[of]).all()
+    assert (inside >= low[of] - 1e-6).all() and (inside <= high[of] + 1e-6).all()
+    cosine = (around * np.array(receiver.normal).T[of]).sum(1)
+    assert (cosine >= np.array(receiver.normal_cosine)[of]).all()
 
 
 def test_later_vertices_are_drawn_by_weight_and_stand_for_all_of_them():
