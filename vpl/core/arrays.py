@@ -40,7 +40,7 @@ def upload(array_type, values):
 
 def upload_vectors(vector_type, rows):
     """Copy the rows (n, k) of a NumPy array to vectors of k entries (e.g. ``mi.Point3f``) by :func:`upload`."""
-    return vector_type(*(upload(mi.Float, column) for column in rows.T))
+    return vector_type(*(upload(dr.value_t(vector_type), column) for column in rows.T))
 
 
 def download(values):

@@ -91,6 +91,17 @@ def running_sums(values):
 
 
 @dr.syntax
+def last_at_most(values, first, last, limit):
+    """Last of the ascending ``values`` from ``first`` to ``last`` - 1 that is at most ``limit``, else the first."""
+    low, high = mi.UInt32(first), mi.UInt32(last)
+    while dr.hint(high > low + 1, exclude=[values, limit]):
+        middle = (low + high) >> 1
+        below = dr.gather(type(values), values, middle) <= limit
+        low = dr.select(below, middle, low)
+        high = dr.select(below, high, middle)
+    return low
+
+
 def find_interval(cumulative, first, last, sample):
     """Interval, first .. last - 1, of ``cumulative[first] ... cumulative[last]`` that contains a uniform number.
 
@@ -100,13 +111,7 @@ def find_interval(cumulative, first, last, sample):
     precise = type(cumulative)
     start = dr.gather(precise, cumulative, first)
     target = start + precise(sample) * (dr.gather(precise, cumulative, last) - start)
-    low, high = mi.UInt32(first), mi.UInt32(last)
-    while dr.hint(high > low + 1, exclude=[cumulative]):
-        middle = (low + high) >> 1
-        below = dr.gather(precise, cumulative, middle) <= target
-        low = dr.select(below, middle, low)
-        high = dr.select(below, high, middle)
-    return low
+    return last_at_most(cumulative, first, last, target)
 
 
 def rounded_shares(share: np.ndarray, length: np.ndarray) -> np.ndarray:
@@ -165,7 +170,7 @@ class RowChoice:
         """Sample the place of a member of each row by a uniform number in [0, 1)."""
         guide = row * self._guides + mi.UInt32(number * mi.Float(self._guides))
         low, high = dr.gather(mi.Vector2u, self._bounds, guide, active)
-        return self._search(low, high, number)
+        return last_at_most(self._before, low, high, number)
 
     def probability(self, place, active=True):
         """Probability of the members at these places (0 where not active)."""
@@ -177,16 +182,6 @@ class RowChoice:
         before = dr.gather(mi.Float, self._before, place, active)
         rest = (number - before) / self.probability(place, active)
         return dr.clip(rest, 0, dr.one_minus_epsilon(mi.Float))
-
-    @dr.syntax
-    def _search(self, low, high, number):
-        table = self._before
-        while dr.hint(high > low + 1, exclude=[table]):
-            middle = (low + high) >> 1
-            below = dr.gather(mi.Float, table, middle) <= number
-            low = dr.select(below, middle, low)
-            high = dr.select(below, high, middle)
-        return low
 
 
 class Choice:

@@ -228,6 +228,10 @@ class CostModel:
         small = min(self.small_pilot, int(self.large_pilot_share * rays))
         return min(max(int(self.pilot_share * rays), small), self.pilot_rays)
 
+    def left_out(self, errors: int) -> int:
+        """How many of so many squared ``errors``, the largest, a relative variance leaves out."""
+        return int(self.trimmed * errors)
+
     def without_denoiser(self) -> CostModel:
         """The model of images that are not denoised: all variance has the same weight."""
         return replace(self, shared=1.0, denoised_power=1.0, pilot_share=self.large_pilot_share)

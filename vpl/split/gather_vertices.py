@@ -212,12 +212,8 @@ def _draw_systematically(pixels, levels, place, find: bool, drawn: _Drawn):
         total += dr.gather(mi.Float, of_first, begin + k)
         total += dr.gather(mi.Float, of_later, begin + k)
         k += 1
-    step, sum_of_later, number = (
-        total / precise(lit),
-        dr.zeros(precise, dr.width(begin)),
-        dr.zeros(mi.UInt32, dr.width(begin)),
-    )
-    k = dr.zeros(mi.UInt32, dr.width(begin))
+    step, sum_of_later = total / precise(lit), dr.zeros(precise, dr.width(begin))
+    number, k = (dr.zeros(mi.UInt32, dr.width(begin)) for _ in range(2))
     while dr.hint(k < rays, exclude=[begin, rays, of_later, start, step, place, find, drawn]):
         level = dr.gather(mi.Float, of_later, begin + k)
         sum_of_later += level

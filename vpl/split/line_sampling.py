@@ -22,21 +22,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import upload
+from ..core.arrays import upload, upload_vectors
 from ..core.morton import interleaved
-from ..core.sampling import find_interval, independent_sampler, precise_sample
+from ..core.sampling import find_interval, independent_sampler, last_at_most, precise_sample
 from .arrival_octree import LEVELS, SCENE_SHARE, ArrivalOctree
-
-
-def _precise(kind):
-    """The double precision type of a Dr.Jit array type."""
-    return dr.float64_array_t(kind)
-
-
-def _upload_rows(rows: np.ndarray):
-    """Rows (n, 3) as vectors in double precision."""
-    kind = _precise(mi.Vector3f)
-    return kind(*(upload(_precise(mi.Float), column) for column in rows.T))
 
 
 @dataclass
@@ -71,11 +60,11 @@ class LineSampler:
         low = [*(part.low for part in parts), octree.scene_low[None]]
         size = [*(part.size for part in parts), np.full((1, 3), octree.scene_size)]
         turn = [*(part.turn for part in parts), np.zeros((1, 3))]
-        self._low, self._size, self._turn = (_upload_rows(np.concatenate(x)) for x in (low, size, turn))
+        self._low, self._size, self._turn = (upload_vectors(mi.Vector3d, np.concatenate(x)) for x in (low, size, turn))
         chance = np.concatenate([*(part.chance for part in parts), [SCENE_SHARE]])
-        self._cumulative = upload(_precise(mi.Float), np.concatenate([[0.0], np.cumsum(chance)]))
+        self._cumulative = upload(mi.Float64, np.concatenate([[0.0], np.cumsum(chance)]))
         self._last = len(chance)
-        self._per_area = upload(_precise(mi.Float), np.concatenate([part.chance / part.surface for part in parts]))
+        self._per_area = upload(mi.Float64, np.concatenate([part.chance / part.surface for part in parts]))
         self._anywhere = SCENE_SHARE / (6 * octree.scene_size**2)
         self._number = upload(mi.UInt64, np.concatenate([part.number for part in parts]))
         self._root = octree.low, octree.size
@@ -85,7 +74,7 @@ class LineSampler:
         """Draw ``count`` random lines, stratified over the boxes."""
         sampler = independent_sampler(seed, count)
         lane = dr.arange(mi.UInt32, count)
-        sample = (_precise(mi.Float)(lane) + sampler.next_1d()) / dr.opaque(_precise(mi.Float), float(count))
+        sample = (mi.Float64(lane) + sampler.next_1d()) / dr.opaque(mi.Float64, float(count))
         row = find_interval(
             self._cumulative, dr.zeros(mi.UInt32, count), dr.opaque(mi.UInt32, self._last, count), sample
         )
@@ -101,12 +90,12 @@ class LineSampler:
 
     def density(self, position: mi.Point3f, normal: mi.Vector3f):
         """Expected hits per area of a line, on the side of surfaces with a ``normal``: double precision, evaluated."""
-        place, (low, size) = _precise(mi.Point3f)(position), self._root
-        low = _precise(mi.Point3f)(*(dr.opaque(_precise(mi.Float), float(x)) for x in low))
-        cell = dr.floor((place - low) * dr.opaque(_precise(mi.Float), 2.0**LEVELS / size))
+        place, (low, size) = mi.Point3d(position), self._root
+        low = mi.Point3d(*(dr.opaque(mi.Float64, float(x)) for x in low))
+        cell = dr.floor((place - low) * dr.opaque(mi.Float64, 2.0**LEVELS / size))
         cell = dr.clip(cell, 0, 2.0**LEVELS - 1)
         finest = interleaved([mi.UInt64(x) for x in cell]) + 8**LEVELS
-        found = _density_at(self, finest, place, normal) + dr.opaque(_precise(mi.Float), self._anywhere)
+        found = _density_at(self, finest, place, normal) + dr.opaque(mi.Float64, self._anywhere)
         dr.eval(found)
         return found
 
@@ -138,29 +127,17 @@ def _levels(parts) -> _Levels:
 @dr.syntax
 def _density_at(sampler: LineSampler, finest, place, normal):
     """Density through the leaf and the parent that hold each ``place``, whose finest node has the number ``finest``."""
-    levels, total = sampler._levels, dr.zeros(_precise(mi.Float), dr.width(place))
-    normal, k = _precise(mi.Vector3f)(normal), dr.zeros(mi.UInt32, dr.width(place))
+    levels, total = sampler._levels, dr.zeros(mi.Float64, dr.width(place))
+    normal, k = mi.Vector3d(normal), dr.zeros(mi.UInt32, dr.width(place))
     while dr.hint(k < levels.count, exclude=[sampler, levels, finest, place, normal]):
         low, high = dr.gather(mi.UInt32, levels.first, k), dr.gather(mi.UInt32, levels.last, k)
         number = finest >> dr.gather(mi.UInt64, levels.below, k)
-        row = _last_at_most(sampler._number, low, high, number)
+        row = last_at_most(sampler._number, low, high, number)
         box, size, turn = (dr.gather(type(x), x, row) for x in (sampler._low, sampler._size, sampler._turn))
         held = (dr.gather(mi.UInt64, sampler._number, row) == number) & _inside(place, box, size)
         total += dr.select(held, dr.gather(type(total), sampler._per_area, row) * (1 + dr.dot(normal, turn)), 0)
         k += 1
     return total
-
-
-@dr.syntax
-def _last_at_most(values, first, last, limit):
-    """Last of the ascending ``values`` from ``first`` to ``last`` - 1 that is at most ``limit``, else the first."""
-    low, high = mi.UInt32(first), mi.UInt32(last)
-    while dr.hint(high > low + 1, exclude=[values, limit]):
-        middle = (low + high) >> 1
-        below = dr.gather(type(values), values, middle) <= limit
-        low = dr.select(below, middle, low)
-        high = dr.select(below, high, middle)
-    return low
 
 
 def _inside(position, low, size) -> mi.Bool:

@@ -194,7 +194,7 @@ def relative_variance(values: np.ndarray, brightness: np.ndarray, model: CostMod
     Leaves out the largest errors and adds a constant to the brightness, as the error of the comparison does.
     """
     error = np.sort(relative_errors(values, brightness, model))
-    return float(np.mean(error[: len(error) - int(model.trimmed * len(error))])) if len(error) else 0.0
+    return float(np.mean(error[: len(error) - model.left_out(len(error))])) if len(error) else 0.0
 
 
 def relative_errors(values: np.ndarray, brightness: np.ndarray, model: CostModel) -> np.ndarray:

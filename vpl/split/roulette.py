@@ -106,7 +106,7 @@ def best_multiple(
     single path decides where pilots are small.  Of fewer than 1000 paths, none is left out.
     """
     best, least = np.inf, model.roulette_gain * variance * (model.first_edges + edges.sum() / paths)
-    kept = max(len(brought) - int(model.trimmed * paths), 0)
+    kept = max(len(brought) - model.left_out(paths), 0)
     for multiple in _MULTIPLES:
         survival = np.clip(multiple * expected, model.least_survival, 1)
         of_multiple = variance + np.sum(np.sort(brought**2 * (1 / survival - 1))[:kept]) / paths

@@ -98,7 +98,7 @@ def learning_pilot(view: View) -> tuple[Pilot, bool]:
 def is_certain_rise(before: np.ndarray, after: np.ndarray, model: CostModel) -> bool:
     """Whether the mean of ``after`` (n,) exceeds that of ``before`` (n,) by more than a standard error, without the
     pairs that hold the largest values."""
-    kept = np.argsort(np.maximum(before, after))[: len(before) - int(model.trimmed * len(before))]
+    kept = np.argsort(np.maximum(before, after))[: len(before) - model.left_out(len(before))]
     rise = after[kept] - before[kept]
     return len(rise) > 1 and bool(rise.mean() > rise.std(ddof=1) / len(rise) ** 0.5)
 
