@@ -68,7 +68,7 @@ def test_what_a_cut_came_out_shorter_than_counted_is_part_of_none():
     """Counted rows of nodes without values are 0, like the rows of the first cut; every third is missing."""
     rows, offset, length = ([0, 0, 0, 1, 0, 2, 2, 0], [0, 3, 5, 7], [2, 1, 2, 0])
     columns = (upload(mi.UInt32, np.array(x)) for x in (offset, length, rows))
-    chunk = CutChunk(None, None, None, *columns, nodes=None, visits=None)
+    chunk = CutChunk(None, 0, None, None, *columns, nodes=None, visits=None)
     assert download(chunk.written).tolist() == [True, True, False, True, False, True, True, False]
 
 

@@ -39,6 +39,19 @@ def precise_sample(sampler):
     return precise(sampler.next_1d()) + precise(sampler.next_1d()) * 2.0**-_SAMPLE_BITS
 
 
+def pair_samples(seed: int, first, second) -> tuple[mi.Float64, mi.Float64]:
+    """Two uniform double-precision numbers of 32 bits for each pair of indices (UInt32), by Mitsuba's hash.
+
+    The numbers of a pair depend on its indices and not on its lane.  A ray that passes exactly between two shapes meets
+    either of them, because Mitsuba loads shapes in an order that changes with the process.  If this adds a pair, the
+    numbers of other pairs remain.
+    """
+    precise = dr.float64_array_t(mi.Float)
+    own, key = mi.sample_tea_32(first, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)
+    numbers = mi.sample_tea_32(own, second ^ key, HASH_ROUNDS)
+    return tuple(precise(number) * 2.0**-32 for number in numbers)
+
+
 def stratified(sampler, count: int, first: int, total: int):
     """One uniform number in each of the strata first .. first + count - 1 out of ``total`` equal strata of [0, 1)."""
     lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)

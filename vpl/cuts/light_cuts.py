@@ -170,7 +170,7 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
 
 @dataclass
 class CutChunk:
-    """Part of the cuts of a batch in one group of lights.
+    """Part of the cuts of a batch in one group of lights, ``number`` of the set.
 
     ``batch``: points of this part; ``points``: their rows in the whole batch; ``rows`` (in ``batch``), ``nodes``:
     entries of the cuts, point by point; ``offset``, ``length``: range of each point's entries; ``visits``: number of
@@ -178,6 +178,7 @@ class CutChunk:
     """
 
     group: LightGroup
+    number: int
     batch: Batch
     points: mi.UInt32
     offset: mi.UInt32
@@ -196,7 +197,7 @@ class CutChunk:
 
 def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
     """Yield the cuts of a batch as evaluated :class:`CutChunk` of bounded size."""
-    for group, group_count in zip(lights.groups, sizes.count, strict=True):
+    for number, (group, group_count) in enumerate(zip(lights.groups, sizes.count, strict=True)):
         count = download(group_count).astype(np.int64)
         for first, last in chunks(count, _PAIRS_PER_CHUNK):
             total = int(count[first:last].sum())
@@ -210,7 +211,7 @@ def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
             rows, nodes, written, visits = _collect_nodes(
                 group, part, chosen, lights.smallest_distance, offset, length, total
             )
-            yield CutChunk(group, part, points, offset, written, rows, nodes, visits)
+            yield CutChunk(group, number, part, points, offset, written, rows, nodes, visits)
 
 
 def evaluate_cuts(

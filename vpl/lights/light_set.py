@@ -211,6 +211,10 @@ class ScatteredGroup(LightGroup):
             upload(mi.UInt32, tree.leaf_order), running_sums(upload(mi.Float, intensity[tree.leaf_order])), sign=sign,
         )  # fmt: skip
 
+    def first_light(self, nodes):
+        """Index of the first light of each node: nodes of a cut differ in it, and similar trees have equal ones."""
+        return dr.gather(mi.UInt32, self.order, dr.gather(mi.UInt32, self.first, nodes))
+
     def draw(self, nodes, sample):
         """Draw a light of each node by intensity with a uniform number: (lights, scale factors)."""
         first, last = dr.gather(mi.UInt32, self.first, nodes), dr.gather(mi.UInt32, self.last, nodes)

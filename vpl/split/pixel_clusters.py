@@ -16,7 +16,7 @@ import numpy as np
 
 from ..core.arrays import add_at, channel_mean
 from ..core.loops import recorded_once
-from ..core.sampling import derived_seed, find_interval, independent_sampler, precise_sample, running_sums
+from ..core.sampling import derived_seed, find_interval, pair_samples, running_sums
 from ..cuts.light_cuts import collect_cuts, limited_cuts
 from ..points.bsdf_proxies import MaterialProxy
 from ..points.surfaces import LambertianSurface, Receiver
@@ -190,11 +190,13 @@ def light_clusters(
     dr.eval(threshold)
     threshold, sizes, _ = limited_cuts(transport.lights, clusters.receivers, threshold, max_cut)
     rays = 0
-    for number, chunk in enumerate(collect_cuts(transport.lights, clusters.receivers, threshold, sizes)):
-        sampler = independent_sampler(derived_seed(seed, number), dr.width(chunk.rows))
+    for chunk in collect_cuts(transport.lights, clusters.receivers, threshold, sizes):
         cluster = dr.gather(mi.UInt32, chunk.points, chunk.rows)
-        ray, surface, weight = clusters.draw(cluster, precise_sample(sampler))
-        light, scale = chunk.group.draw(chunk.nodes, precise_sample(sampler))
+        of_vertex, of_light = pair_samples(
+            derived_seed(seed, chunk.number), cluster, chunk.group.first_light(chunk.nodes)
+        )
+        ray, surface, weight = clusters.draw(cluster, of_vertex)
+        light, scale = chunk.group.draw(chunk.nodes, of_light)
         value, traced = evaluate_pairs(transport, chunk.group, surface, light, scale)
         value = mi.UnpolarizedSpectrum(value) * weight * dr.opaque(mi.Float, chunk.group.sign)
         value = dr.select(chunk.written & dr.all(dr.isfinite(value)), value, 0)

@@ -9,7 +9,7 @@ from scipy import stats
 from tests.support.rendering import render
 from tests.support.scenes import area_light, sensor, wall
 from vpl.core.arrays import download, upload
-from vpl.core.sampling import Choice, RowChoice, SpreadSamples, independent_sampler, precise_sample
+from vpl.core.sampling import Choice, RowChoice, SpreadSamples, independent_sampler, pair_samples, precise_sample
 
 SEQUENCES, MEMBERS = 2000, 64
 
@@ -102,6 +102,22 @@ def test_members_of_rows_are_drawn_with_exactly_the_claimed_probability(lengths)
     assert np.array_equal(choice.pmf > 0, share > 0)
     assert np.abs(choice.pmf - share).max() < 1e-5
     assert np.array_equal(np.bincount(row, choice.pmf), np.ones(len(lengths)))
+
+
+def test_numbers_of_pairs_are_uniform_uncorrelated_and_independent_of_the_lane(variant):
+    first, second = (x.ravel().astype(np.uint32) for x in np.mgrid[1000:1300, 0:300])
+    numbers = [download(x) for x in pair_samples(5, *(upload(mi.UInt32, x) for x in (first, second)))]
+    later = slice(len(first) // 2, None)
+    again = pair_samples(5, *(upload(mi.UInt32, x[later]) for x in (first, second)))
+    other = pair_samples(6, *(upload(mi.UInt32, x) for x in (first, second)))
+    for one, same in zip(numbers, again, strict=True):
+        assert one.min() >= 0 and one.max() < 1 and stats.kstest(one, "uniform").pvalue > 1e-4
+        assert np.array_equal(one[later], download(same))
+    # Neighbours along either index, the two numbers of a pair, and two seeds
+    grid = numbers[0].reshape(300, 300)
+    near = [(grid[1:], grid[:-1]), (grid[:, 1:], grid[:, :-1]), tuple(numbers), (numbers[0], download(other[0]))]
+    for one, two in near:
+        assert abs(np.corrcoef(one.ravel(), two.ravel())[0, 1]) < 5 / np.sqrt(one.size)
 
 
 def test_precise_numbers_have_bits_below_those_of_the_sampler(variant):
