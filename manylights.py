@@ -109,10 +109,12 @@ def parse(arguments):
     add("--error", type=positive(float), metavar="FRACTION",
         help="end when 95%% of the pixels have at most this relative standard error, such as 0.02, estimated from the "
              "variance between passes")  # fmt: skip
-    add("--denoise", action="store_true", help="denoise by Open Image Denoise (pip install 'manylights[denoise]')")
+    add("--denoise", action="store_true",
+        help="denoise by Open Image Denoise at twice the resolution, with a multiple of four samples per pixel (pip "
+             "install 'manylights[denoise]')")  # fmt: skip
     add("--denoise-quality", choices=QUALITIES,
-        help=f"with --denoise: network, from best to quickest (default: {QUALITIES[0]}; with --time the network that "
-             "leaves the least error, because a quick one leaves time for samples)")  # fmt: skip
+        help="with --denoise: network, from best to quickest (default: the network that leaves the least error, as a "
+             "quick one leaves time for samples)")  # fmt: skip
     add("--layers", type=layer_names, default=(), metavar="NAMES",
         help=f"layers of EXR files, separated by commas: {', '.join(FEATURES)}, of the first surface that is neither "
              f"mirror nor glass, as the denoiser gets them; {', '.join(LENGTHS)}, the light of paths with one, two, "

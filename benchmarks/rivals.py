@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks import scenes
+from comparison.fine_film import fine_film
 from comparison.render import render
 from vpl.split import estimator
 
@@ -60,35 +61,38 @@ def trimmed_variance(images: list, scale: np.ndarray, trimmed: float = TRIMMED) 
 
 class Rival:
     """Passes of one integrator with one sampler on one scene, of about ``seconds`` each; ``light_paths``: factor on the
-    chosen number; ``more``: properties of ``manylights``.  ``pass_seconds``: of a pass; ``count`` of them in an image.
+    chosen number; ``more``: properties of ``manylights``; ``parts``: of the film, see :mod:`comparison.fine_film`.
+    ``spp``: samples of a pixel of the film; ``pass_seconds``: of a pass; ``count`` of them in an image.
     """
 
-    count = 1
+    count = parts = 1
 
     def __init__(
-        self, name: str, scene, kind: str, sampler: str, width: int, seconds: float, light_paths: float = 1, **more
-    ):
+        self, name: str, scene, kind: str, sampler: str, width: int, seconds: float, light_paths: float = 1,
+        parts: int = 1, **more
+    ):  # fmt: skip
+        self.parts, width = parts, parts * width
         self.kind, self.sampler, self.images, self.seconds, self.light_paths = kind, sampler, [], [], light_paths
         self.scene, self.sensor = scene, SAMPLERS.index(sampler)
         more = more if kind == "manylights" else {}
         self.integrator = mi.load_dict({"type": kind, "max_depth": DEPTH, **more})
         # Two sizes separate the cost of samples from the fixed cost of a pass
         most = int((LARGEST_PASS / (width * scenes.height(name, width))) ** 0.5)
-        side, times = min(8, most), []
-        for self.spp in (16, 16, side**2, side**2):
+        few, side, times = 16 // parts**2, min(8 // parts, most), []
+        for self.spp in (few, few, side**2, side**2):
             times.append(self.render(0)[1])
-        each = max(times[-1] - times[1], 0.1 * times[-1]) / max(side**2 - 16, 1)
+        each = max(times[-1] - times[1], 0.1 * times[-1]) / max(side**2 - few, 1)
         wanted = side**2 + (seconds - times[-1]) / each
         if sampler == "multijitter":
             # Mitsuba rounds the samples of this sampler to squares
-            self.spp = min(max(round(max(wanted, 16) ** 0.5), 4), most) ** 2
+            self.spp = min(max(round(max(wanted, few) ** 0.5), round(few**0.5)), most) ** 2
         else:
-            self.spp = min(max(round(wanted), 16), most**2)
+            self.spp = min(max(round(wanted), few), most**2)
         self.pass_seconds = self.render(0)[1]
 
     def render(self, seed: int):
-        """Render: (image, float64; seconds)."""
-        with light_paths_times(self.light_paths):
+        """Render: (image in the resolution of the film, float64; seconds)."""
+        with light_paths_times(self.light_paths), fine_film(self.scene.sensors()[self.sensor], self.parts):
             image, seconds = scenes.timed(
                 lambda: mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=self.spp, seed=seed)
             )

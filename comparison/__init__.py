@@ -11,6 +11,7 @@
 `occasional`    files written periodically
 `cluster/`      passes and runs on several processes or machines
 `denoising`     Open Image Denoise with albedo and normal
+`fine_film`     films of twice the resolution for images that will be denoised
 `sample_density`
                 more samples where the denoiser leaves noise
 `features`      albedo, normal and depth, for the denoiser and as layers of images

@@ -16,6 +16,8 @@ import numpy as np
 from vpl.core.garbage import garbage_kept
 from vpl.core.sampling import derived_seed, independent_sampler
 
+from .fine_film import fine_film
+
 # Fewest and most samples per pixel. 144 instead of 16: denoised error 4, 6 and 10% less in images of 4, 16 and 64
 # samples, both without a filter (decisions.md)
 FEATURE_SPP = 16, 128
@@ -63,21 +65,21 @@ class Layers:
         return np.concatenate((image, self.planes), axis=-1)
 
 
-def features_of(scene, sensor, seed=0, spp=None, time_limit=None):
+def features_of(scene, sensor, seed=0, spp=None, time_limit=None, parts=1):
     """Return (the features of an image, a dict as of `auxiliary_features`; samples per pixel). `sensor`: a `mi.Sensor`;
-    `seed`, `spp`, `time_limit`: of the image, None if unlimited."""
+    `seed`, `spp`, `time_limit`: of the image, None if unlimited; `parts`: see `auxiliary_features`."""
     fewest, most = FEATURE_SPP
     wanted = most if spp is None else min(max(PER_SAMPLE * spp, fewest), most)
     if time_limit is None:
-        return auxiliary_features(scene, sensor, wanted, seed)
+        return auxiliary_features(scene, sensor, wanted, seed, parts)
     # The first samples tell the time of the others; compilation counts, because people wait for it
     begin = time.perf_counter()
-    first = auxiliary_features(scene, sensor, fewest, seed)
+    first = auxiliary_features(scene, sensor, fewest, seed, parts)
     spent = time.perf_counter() - begin
     possible = min(FEATURE_SHARE * time_limit / spent * fewest, most if spp is None else wanted - fewest)
     if possible < fewest:
         return first
-    return _mean_of([first, auxiliary_features(scene, sensor, int(possible), derived_seed(seed, 1))])
+    return _mean_of([first, auxiliary_features(scene, sensor, int(possible), derived_seed(seed, 1), parts)])
 
 
 def _mean_of(renders):
@@ -88,11 +90,12 @@ def _mean_of(renders):
     return {name: total / whole for name, total in sums.items()}, whole
 
 
-def auxiliary_features(scene, sensor, spp, seed):
+def auxiliary_features(scene, sensor, spp, seed, parts=1):
     """Render "albedo", "normal" and "depth", a dict of (height, width, channels) float32, of the first surfaces that
     are neither mirror nor glass, with the film's filter and about `spp` samples per pixel; `sensor` is a `mi.Sensor`.
-    The samples are stratified if the sensor's sampler is `independent`. Return the dict and the samples per pixel:
-    `spp` rounded down to a multiple of 16, at least 16.
+    The samples are stratified if the sensor's sampler is `independent`. `parts`: in the resolution of a fine film
+    (fine_film.py), with its filter. Return the dict and the samples per pixel: `spp` rounded down to a multiple of 16,
+    at least 16.
 
     Albedo, 0 to 1: directional albedo, estimated by one BSDF sample, times the throughput of mirrors and glass before
     the surface, plus emission. Normal: shading normal in world space, turned towards the viewer. Depth: length of the
@@ -103,11 +106,16 @@ def auxiliary_features(scene, sensor, spp, seed):
     several = spp // large if large * pixels <= FEATURE_WAVEFRONT else 0
     sizes = [large] * several + [small] * ((spp - several * large) // small)
     # One after the other: large images take much memory
-    return _mean_of((_rendered(scene, sensor, each, (seed, part)), each) for part, each in enumerate(sizes or [small]))
+    with fine_film(sensor, parts):
+        return _mean_of(
+            (_rendered(scene, sensor, each // parts**2, (seed, part)), each)
+            for part, each in enumerate(sizes or [small])
+        )
 
 
 def _rendered(scene, sensor, spp, key):
-    """Render the features of `auxiliary_features` at once; `key`: integers that make the seed."""
+    """Render the features of `auxiliary_features` at once, with `spp` samples per pixel of the sensor's film; `key`:
+    integers that make the seed."""
     seed = int(np.random.SeedSequence((FEATURE_SEED, *key)).generate_state(1)[0])
     # The module belongs to the variant
     from integrators.camera_samples import stratified

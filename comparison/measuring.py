@@ -71,7 +71,8 @@ def _render_cold(progressive, job):
     spp, largest = job.pass_spp or first, job.pass_spp or progressive.largest_pass
     least, expected = {}, 0.0  # seconds: minimum by size, and expectation for the next pass
     while (left := job.budget - progressive.seconds) > expected / 2:
-        seconds, is_first = progressive.render(spp).seconds, spp not in least
+        one, is_first = progressive.render(spp), spp not in least
+        spp, seconds = one.spp, one.seconds
         least[spp] = min(seconds, least.get(spp, seconds))
         if is_first:  # may include compilation; repeat it
             expected = min(least[spp], 2 * least.get(spp // 2, 0.0))
@@ -123,14 +124,16 @@ def _samples_of_a_pass(progressive, budget, seeds):
     largest = progressive.largest_pass
     if largest < WARM_SPP:
         return 1, 0.0
-    first = progressive.render(1, next(seeds)).seconds
-    if first > budget / 2:
-        return 1, 0.0
-    for spp in (WARM_SPP, WARM_SPP + 1):
+    one = progressive.render(1, next(seeds))
+    if one.seconds > budget / 2:
+        return one.spp, 0.0
+    # A fine film has more than one sample for a pixel
+    few = WARM_SPP * one.spp
+    for spp in (few, few + 1):
         progressive.render(spp, next(seeds))  # compiles
-    more = progressive.render(WARM_SPP, next(seeds)).seconds - first
-    each = max(more, 0.01 * first) / (WARM_SPP - 1)
-    start = max(first - each, 0)
+    more = progressive.render(few, next(seeds))
+    each = max(more.seconds - one.seconds, 0.01 * one.seconds) / (more.spp - one.spp)
+    start = max(one.seconds - one.spp * each, 0)
     affordable = START_SHARE * budget / start if start > 0 else PASSES_IN_BUDGET
     seconds = budget / np.clip(int(affordable), 1, PASSES_IN_BUDGET)  # per pass
     spp = int(np.clip((seconds - start) / each, 1, largest))

@@ -23,8 +23,6 @@ it may take all of the remaining time; beyond this size, half. A pass that deter
 
 import math
 
-from vpl.split.pixel_rays import MULTIPLE
-
 from .rendering import largest_pass
 from .sample_density import LEAST_SAMPLES
 
@@ -51,18 +49,19 @@ class PassSizes:
     None. `fixed`: size of all passes except the last, or None. `many`: at least eight passes of similar sizes, for an
     estimate of the error. `in_parts`: whether passes are rendered in parts.
     `accepts`: whether the sampler keeps a number of samples per pixel. `probes`: whether the second pass determines the
-    samples of the pixels in later passes."""
+    samples of the pixels in later passes; its samples are then a multiple of `multiple`. `least`: minimum size."""
 
     def __init__(
         self, pixels, spp=None, time=None, fixed=None, many=False, in_parts=False, accepts=lambda spp: True,
-        probes=False,
+        probes=False, multiple=1, least=1,
     ):  # fmt: skip
         self._spp, self._time, self._fixed, self._many, self._in_parts = spp, time, fixed, many, in_parts
         self._any_size = in_parts and not many and not fixed  # after the first pass, not only powers of two
         self._accepts, self._probes = accepts, probes and self._any_size
         self.is_probe = False  # whether the last pass that was asked for determines the samples of pixels
-        self._largest = _power_of_two(largest_pass(pixels, in_parts))
-        self._least = USUAL if USUAL * pixels <= FIRST_SAMPLES else 1
+        self._minimum, self._multiple, self._least_probe = least, multiple, max(LEAST_SAMPLES, multiple)
+        self._largest = max(_power_of_two(largest_pass(pixels, in_parts)), least)
+        self._least = max(USUAL if USUAL * pixels <= FIRST_SAMPLES else 1, least)
         self._current, self._seconds, self._asked = fixed or self._least, {}, None
         self._known = {}  # size -> seconds of the last pass; not of the first pass, which is slower
         self._starts = {}  # size -> seconds to start the last pass, of passes that report them
@@ -86,11 +85,11 @@ class PassSizes:
         self._dearer = DIFFERENT if self.is_probe else 1.0
         self.is_probe = self._probes and len(passes) == 1
         size = self._size(passes, done, elapsed)
-        if self.is_probe and size < LEAST_SAMPLES:
+        if self.is_probe and size < self._least_probe:
             # Too few for the halves of a pass: a pass of the usual size
             self.is_probe = False
             size = self._size(passes, done, elapsed)
-        self._asked = size - size % MULTIPLE if self.is_probe else size
+        self._asked = size - size % self._multiple if self.is_probe else size
         return self._asked or "time"
 
     def _size(self, passes, done, elapsed):
@@ -104,7 +103,7 @@ class PassSizes:
 
     def _of_the_rest(self, size, left):
         """Return the size of the next pass, about `size` samples, with `left` samples until the limit."""
-        if self.is_probe and PROBE * left >= LEAST_SAMPLES:
+        if self.is_probe and PROBE * left >= self._least_probe:
             return min(size, self._kept(int(PROBE * left)))
         # No pass would follow
         self.is_probe = False
@@ -133,7 +132,7 @@ class PassSizes:
             return
         wanted, line = self._wanted(), self._in_parts and self._line()
         if repeated and seconds > LONGEST * wanted:
-            self._current = max(1, _power_of_two(self._current * wanted / seconds))
+            self._current = max(self._minimum, _power_of_two(self._current * wanted / seconds))
             return
         grown = self._grown(seconds, wanted, repeated, line)
         grown = min(grown, self._largest, _power_of_two(max(1, done / PARTS)) if self._many else self._largest)

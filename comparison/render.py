@@ -88,8 +88,9 @@ def render(
     seconds, compilation included; `spp`, samples per pixel. The default is the scene's samples per pixel. There
     is at least one pass. The log has a warning if `spp` or `time` ends a render above its `error`. `seed`: of the first
     pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py), by
-    the network "high", "balanced" or "fast", or, if True, by the one that suits the `time`; an integrator given by name
-    is then created with its property `denoised`, if it has one. `manylights` with this property gives more samples to
+    the network "high", "balanced" or "fast", or, if True, by the one that suits the `time` or the samples, and, where
+    time and memory allow, at twice the resolution, with a multiple of four samples; an integrator given by name is then
+    created with its property `denoised`, if it has one. `manylights` with this property gives more samples to
     pixels where the denoiser leaves noise (sample_density.py), unless there is an `error`.
     `progress`: called after each pass with the cost and the image so far; integrators of this project also call it at
     the start of each stage of a pass, with None for the image. If it returns False, no other pass begins; an exception
@@ -124,14 +125,17 @@ def render(
     if error is None and time is None and spp is None:
         spp = scene.sensors()[sensor].sampler().sample_count()
     begin = clock.perf_counter()
-    denoiser = Denoiser(scene, sensor, seed, spp, time, quality) if denoise else None
+    # The passes of a checkpoint have the resolution that does not depend on times
+    parts = checkpoint.parts if checkpoint else None
+    denoiser = Denoiser(scene, sensor, seed, spp, time, quality, parts) if denoise else None
     planes = layers_of(layers, scene, sensor, denoiser, seed=seed, spp=spp, time_limit=time)
     # The error is that of the raw image, which equal numbers of samples suit best
-    progressive = Progressive(scene, seed, sensor, integrator, denoiser.denoise if denoiser and not error else None)
+    chooses = denoiser.denoise if denoiser and not error else None
+    progressive = Progressive(scene, seed, sensor, integrator, chooses, denoiser.parts if denoiser else 1)
     reserved = denoiser.expected_seconds if denoiser else 0.0
     sizes = PassSizes(
         progressive.pixels, spp, time and time - reserved, pass_spp, error is not None, progressive.in_parts,
-        progressive.accepts, progressive.differs,
+        progressive.accepts, progressive.differs, progressive.probe_multiple, progressive.parts**2,
     )  # fmt: skip
     ending = Ending(spp, time and time - reserved, error, reserved)
     if checkpoint:
@@ -152,7 +156,7 @@ def layers_of(names, scene, sensor, denoiser, **limits):
     if not names:
         return None
     if denoiser:
-        return Layers.of(names, denoiser.features, denoiser.feature_spp)
+        return Layers.of(names, denoiser.merged_features, denoiser.feature_spp)
     return Layers.of(names, *features_of(scene, scene.sensors()[sensor], **limits))
 
 
@@ -313,7 +317,8 @@ class _Render:
             self._ending.goal.warn_if_missed(self._error, self._ended_by)
         image, took = self._image(), self._took()
         if denoiser:
-            image, took.raw = denoiser.denoise(image, took.channels), image
+            one, took.raw = self.progressive, image
+            image = self._complete(denoiser.denoise_fine(np.float32(one.fine_image), one.channels))
             took.denoise_seconds, took.denoiser = denoiser.seconds, denoiser.description
             took.seconds = self._elapsed()
         return image, took
@@ -322,7 +327,10 @@ class _Render:
         return clock.perf_counter() - self._begin
 
     def _image(self):
-        image = np.float32(self.progressive.image)
+        return self._complete(np.float32(self.progressive.image))
+
+    def _complete(self, image):
+        """Return an image (height, width, channels) with the layers, as a tensor."""
         return mi.TensorXf(self._layers.added_to(image) if self._layers else image)
 
     def _took(self):

@@ -11,9 +11,11 @@ import numpy as np
 from vpl.core.compilation import compilation_measured
 from vpl.core.garbage import garbage_kept
 from vpl.core.stages import Stage
-from vpl.split.pixel_rays import HALF, MULTIPLE
+from vpl.split.film_cells import HALF
+from vpl.split.pixel_rays import MULTIPLE
 
 from .convergence import ErrorEstimate
+from .fine_film import fine_film, merged
 from .images import colour
 from .sample_density import LEAST_SAMPLES, SampleDensity
 
@@ -103,23 +105,27 @@ class PassImage:
     half: np.ndarray | None = None
 
 
-def render_pass(scene, sensor, integrator, spp, seed, first=None, shared=None, density=None, half=False):
+def render_pass(
+    scene, sensor, integrator, spp, seed, first=None, shared=None, density=None, half=False, parts=1
+):  # fmt: skip
     """Render a pass of `spp` samples per pixel, which stratified samplers round up; return a `PassImage`.
 
     `sensor`: an index. `first`: (samples per pixel, seed) of the first pass of the render, by default this pass, which
     then measures compilation; the start that passes of `manylights` share depends on it. `shared`: the `SharedStart` of
     the render. `density`, `half`: samples of each pixel over `spp`, and whether to return an image of every second
-    sample; see `ManyLightsIntegrator.pass_of`.
+    sample; see `PassRenderer.pass_of`. `parts`: the image is that of a fine film (fine_film.py), whose pixels have
+    equal numbers of samples, so that `spp` is rounded up.
     """
     sensor, begin = scene.sensors()[sensor], time.perf_counter()
     shared = shared or SharedStart()
-    sharing = _sharing(scene, sensor, integrator, (spp, seed), first or (spp, seed), shared, density, half)
-    # Later passes compile little, and measuring takes time
-    with compilation_measured() if first is None else nullcontext() as compilation, sharing:
-        spp = _render(scene, sensor, integrator, spp, seed)
-    seconds = time.perf_counter() - begin
-    # The film, as the image of `mi.render` lacks names, and channels of nested integrators
-    bitmap = sensor.film().bitmap()
+    with fine_film(sensor, parts):
+        sharing = _sharing(scene, sensor, integrator, (spp, seed), first or (spp, seed), shared, density, half, parts)
+        # Later passes compile little, and measuring takes time
+        with compilation_measured() if first is None else nullcontext() as compilation, sharing:
+            spp = _render(scene, sensor, integrator, spp, seed, parts)
+        seconds = time.perf_counter() - begin
+        # The film, as the image of `mi.render` lacks names, and channels of nested integrators
+        bitmap = sensor.film().bitmap()
     channels = [entry.name for entry in bitmap.struct_()]
     planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
     statistics = dict(getattr(integrator, "statistics", None) or {})
@@ -131,13 +137,13 @@ def render_pass(scene, sensor, integrator, spp, seed, first=None, shared=None, d
     return PassImage(planes[..., rest], [channels[index] for index in rest], taken, of_half)
 
 
-def _render(scene, sensor, integrator, spp, seed):
+def _render(scene, sensor, integrator, spp, seed, parts):
     """Render to the film of a sensor; return the samples per pixel, as the sampler rounds them."""
     # Set before the render, as integrators such as `prb` clone the sampler
-    with _sample_count(sensor.sampler(), spp) as spp, garbage_kept():
-        dr.eval(mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp))
+    with _sample_count(sensor.sampler(), -(-spp // parts**2)) as of_film, garbage_kept():
+        dr.eval(mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=of_film))
         dr.sync_thread()
-        return spp
+        return of_film * parts**2
 
 
 @dataclass
@@ -149,7 +155,7 @@ class SharedStart:
 
 
 @contextmanager
-def _sharing(scene, sensor, integrator, this, first, shared, density, half):
+def _sharing(scene, sensor, integrator, this, first, shared, density, half, parts):
     """Let the pass `this`, (samples per pixel, seed), use the start of the pass `first`, if the integrator shares it.
 
     Makes the start if the first pass was rendered elsewhere, so that an image is the same on any number of workers.
@@ -157,22 +163,23 @@ def _sharing(scene, sensor, integrator, this, first, shared, density, half):
     if not hasattr(integrator, "pass_of"):
         yield
         return
-    with integrator.pass_of(shared, this == first, density, half) as is_missing:
+    with integrator.pass_of(shared, this == first, density, half, parts) as is_missing:
         if is_missing:
             with integrator.only_start():
-                _render(scene, sensor, integrator, *first)
+                _render(scene, sensor, integrator, *first, parts)
         yield
 
 
 class Passes:
     """Running average of the passes of a render by their weights (`Pass.weight`).
 
-    The average depends only on the passes and their order. `channels`: names of the channels ("R", "G", "B", AOVs),
-    empty before the first pass; `passes`: a list of `Pass`; `estimate`: the `ErrorEstimate` of the passes.
+    The average depends only on the passes and their order. `parts`, `filter`: of the film that passes are rendered
+    with, see fine_film.py. `channels`: names of the channels ("R", "G", "B", AOVs), empty before the first pass;
+    `passes`: a list of `Pass`; `estimate`: the `ErrorEstimate` of the passes.
     """
 
-    def __init__(self, seed):
-        self.seed = seed
+    def __init__(self, seed, parts=1, filter=None):
+        self.seed, self.parts, self.filter = seed, parts, filter
         self.restart()
 
     def restart(self):
@@ -185,7 +192,7 @@ class Passes:
         planes, one = image.planes.astype(np.float64), image.taken
         self.channels = image.channels
         self.sum = self.sum + one.weight * planes
-        self.estimate.add(_shown(planes, self.channels), one.weight)
+        self.estimate.add(_shown(self.merged(planes), self.channels), one.weight)
         self.passes.append(one)
         return one
 
@@ -213,24 +220,33 @@ class Passes:
         return sum(one.seconds for one in self.passes)
 
     @property
+    def fine_image(self):
+        """The average in the resolution of the film, (height, width, channels) float64."""
+        return self.sum / sum(one.weight for one in self.passes)
+
+    @property
     def image(self):
         """The average, (height, width, channels) float64."""
-        return self.sum / sum(one.weight for one in self.passes)
+        return self.merged(self.fine_image)
+
+    def merged(self, planes):
+        """Return the image in the resolution of the sensor's film, from that in the resolution of the passes."""
+        return merged(planes, self.parts, self.filter)
 
 
 class Progressive(Passes):
     """Running average of passes in this process. `integrator` is by default the scene's; `denoise`: see
-    `SampleDensity`, for an image that will be denoised."""
+    `SampleDensity`, for an image that will be denoised; `parts`: see fine_film.py."""
 
-    def __init__(self, scene, seed, sensor=0, integrator=None, denoise=None):
+    def __init__(self, scene, seed, sensor=0, integrator=None, denoise=None, parts=1):
         self._scene, self._sensor, self._denoise = scene, sensor, denoise
         self.integrator = integrator or scene.integrator()
-        super().__init__(seed)
+        super().__init__(seed, parts, scene.sensors()[sensor].film().rfilter())
 
     def restart(self):
         """Remove all passes and what they share."""
         super().restart()
-        self._shared, self.density = SharedStart(), SampleDensity(self._denoise)
+        self._shared, self.density = SharedStart(), SampleDensity(self._denoise, self.parts)
 
     def render(self, spp, seed=None, accept=lambda: True, is_probe=False):
         """Render and add a pass of `spp` samples per pixel; return the `Pass`.
@@ -243,22 +259,30 @@ class Progressive(Passes):
         first = (self.passes[0].spp, self.passes[0].seed) if self.passes else None
         sensor = self._scene.sensors()[self._sensor]
         density = self.density.of_pass(self.integrator, sensor, spp)
-        half = is_probe and self.density.suits(self.integrator, sensor, spp)
+        half = is_probe and spp % self.probe_multiple == 0 and self.density.suits(self.integrator, sensor)
         image = render_pass(
-            self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density, half
+            self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density, half, self.parts
         )  # fmt: skip
         if not accept():
             return None
         if half:
-            self.density.learn(image.planes, image.half, image.channels)
+            self.density.learn(*(self.merged(one) for one in (image.planes, image.half)), image.channels)
         return self.add(image)
+
+    @property
+    def probe_multiple(self):
+        """The samples per pixel of which a pass that determines the samples of the pixels has a multiple: halves of the
+        samples of pixels of the film."""
+        return max(MULTIPLE, 2 * self.parts**2)
 
     def accepts(self, spp):
         """Return whether the sampler keeps a number of samples per pixel, which some samplers round up, and whether
         pixels may have the different numbers of samples that the render has determined."""
-        with _sample_count(self._scene.sensors()[self._sensor].sampler(), spp) as rounded:
-            is_multiple = spp % MULTIPLE == 0 or spp < MULTIPLE or self.density.relative is None
-            return rounded == spp and is_multiple
+        cells = self.parts**2
+        multiple = MULTIPLE * cells
+        with _sample_count(self._scene.sensors()[self._sensor].sampler(), -(-spp // cells)) as rounded:
+            is_multiple = spp % multiple == 0 or spp < multiple or self.density.relative is None
+            return cells * rounded == spp and is_multiple
 
     @property
     def seconds(self):
@@ -269,7 +293,7 @@ class Progressive(Passes):
     def differs(self):
         """Whether pixels may have different numbers of samples after the second pass."""
         suits = self.density.suits(self.integrator, self._scene.sensors()[self._sensor])
-        return suits and self.largest_pass >= LEAST_SAMPLES
+        return suits and self.largest_pass >= max(LEAST_SAMPLES, MULTIPLE * self.parts**2)
 
     @property
     def decisions(self):

@@ -28,18 +28,22 @@ SMOOTHED = 2  # times that differences are averaged over 5 × 5 pixels: as by a 
 
 class SampleDensity:
     """Samples of the pixels of a render's passes. `denoise`: function from an image (height, width, channels), the
-    names of its channels and the quality "fast" to the denoised image; None for equal numbers in all passes.
+    names of its channels and the quality "fast" to the denoised image; None for equal numbers in all passes. `parts`:
+    of the film, see fine_film.py.
 
     `relative` (height, width): samples of a pixel over the mean, None before a pass determined them; `seconds` that the
     decision took.
     """
 
-    def __init__(self, denoise=None):
-        self._denoise, self.relative, self.seconds = denoise, None, 0.0
+    def __init__(self, denoise=None, parts=1):
+        self._denoise, self._parts, self.relative, self.seconds = denoise, parts, None, 0.0
 
-    def suits(self, integrator, sensor, spp=MULTIPLE):
-        """Return whether the pixels of a pass may have different numbers of samples, `spp` in the mean."""
-        return self._denoise is not None and getattr(integrator, "may_differ", lambda *_: False)(sensor, spp)
+    def suits(self, integrator, sensor, spp=None):
+        """Return whether the pixels of a pass may have different numbers of samples, `spp` in the mean, by default as
+        few as possible."""
+        spp = spp or MULTIPLE * self._parts**2
+        differs = getattr(integrator, "may_differ", lambda *_: False)
+        return self._denoise is not None and differs(sensor, spp, self._parts)
 
     def of_pass(self, integrator, sensor, spp):
         """Return samples over their mean for the pixels of a pass, None for equal numbers."""

@@ -136,9 +136,11 @@ def render(job):
     parameters, scene = file.integrator[1], file.load(job.threads)
     load_seconds = time.perf_counter() - begin
 
+    denoiser = _denoiser(scene, job) if job.denoised_output else None
     # Pixels may have different numbers of samples, which the denoiser decides, if the render ends by time
-    decides = job.denoised_output and job.budget and hasattr(scene.integrator(), "may_differ")
-    progressive = Progressive(scene, job.seed, denoise=_denoiser(scene, job).denoise if decides else None)
+    decides = denoiser and job.budget and hasattr(scene.integrator(), "may_differ")
+    parts = denoiser.parts if denoiser else 1
+    progressive = Progressive(scene, job.seed, denoise=denoiser.denoise if decides else None, parts=parts)
     cold = measure(progressive, job)
     passes, spp, pixels = progressive.passes, progressive.spp, progressive.pixels
     warm = [one.seconds for one in passes[1 if job.cold else 0 :]]
@@ -164,24 +166,24 @@ def render(job):
     described = {key: result[key] for key in ("parameters", "spp", "passes", "seconds")}
     described |= {"integrator": job.integrator, "scene": job.scene, "seed": job.seed, **versions()}
     images.write_exr(job.output, progressive.image, progressive.channels, described | {"run": job.run or ""})
-    result |= _denoise(job, scene, progressive, described)
+    result |= _denoise(job, scene, progressive, denoiser, described)
     return result | {"vpl_output": _render_vpl(job, passes, described) if job.vpl_folder else None}
 
 
-def _denoiser(scene, job, spp=None):
-    """Return the `Denoiser` for the image of a job with `spp` samples per pixel."""
-    return Denoiser(scene, seed=job.seed, spp=None if job.budget else spp, time_limit=job.budget)
+def _denoiser(scene, job, parts=None):
+    """Return the `Denoiser` for the image of a job; `parts`: of its film, if known."""
+    return Denoiser(scene, seed=job.seed, spp=None if job.budget else job.spp, time_limit=job.budget, parts=parts)
 
 
-def _denoise(job, scene, progressive, described):
-    """Write the denoised image if requested; return its times."""
-    if not job.denoised_output:
+def _denoise(job, scene, progressive, denoiser, described):
+    """Write the image denoised by a `denoiser`, if requested; return the times of this and of another denoiser."""
+    if not denoiser:
         return {"denoise_seconds": None, "cold_denoise_seconds": None}
     seconds = []
-    for _ in range(2):
-        denoiser = _denoiser(scene, job, progressive.spp)
-        image = denoiser.denoise(progressive.image, progressive.channels)
-        seconds.append(denoiser.seconds)
+    for one in (denoiser, _denoiser(scene, job, denoiser.parts)):
+        begin = time.perf_counter()
+        image = one.denoise_fine(progressive.fine_image, progressive.channels)
+        seconds.append(one.start_seconds + time.perf_counter() - begin)
     described = described | {"run": job.run or "", "denoise_seconds": seconds[1]} | denoiser.description
     images.write_exr(job.denoised_output, image, progressive.channels, described)
     return {"denoise_seconds": seconds[1], "cold_denoise_seconds": seconds[0]}

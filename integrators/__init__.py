@@ -50,7 +50,7 @@ def _register(_old: str | None, variant: str) -> None:
     """Register the plugins for ``variant``: reload their modules, because the base class belongs to the variant."""
     if variant in VARIANTS:
         check_backend(variant)
-    for name in ("gathering", "camera_samples", "bands", "common", "direct", *PLUGINS):
+    for name in ("gathering", "camera_samples", "longer_renders", "bands", "common", "direct", *PLUGINS):
         full_name = f"{__name__}.{name}"
         if full_name in sys.modules:
             importlib.reload(sys.modules[full_name])

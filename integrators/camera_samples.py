@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.sampling import derived_seed
+from vpl.split.film_cells import FilmCells
 from vpl.split.lattice import Lattice
 from vpl.split.pixel_rays import MULTIPLE, PixelRays, RayNumbers
 
@@ -30,13 +31,13 @@ class LatticeSampler(mi.Sampler):
     """Camera samples from rank-1 lattices over the samples of a pixel; see :mod:`vpl.split.lattice`.
 
     Each call of ``next_1d`` or ``next_2d`` takes a lattice in an independent random order.  The numbers are for camera
-    rays and not for symbolic loops.  ``pixels``: of the film, borders included; ``width`` of the film; ``rays``: the
-    :class:`PixelRays` of a render in one pass, None for equal numbers of rays.
+    rays and not for symbolic loops.  ``pixels``: of the film, borders included; ``cells``: the :class:`FilmCells` of a
+    render in one pass, if rays are not in the order of the film, else None.
     """
 
     def __init__(self):
         super().__init__(mi.Properties("lattice"))
-        self.pixels, self.width, self._seed, self._pass = 1, 1, 0, 0
+        self.pixels, self._seed, self._pass = 1, 0, 0
         self.end()
 
     @property
@@ -58,7 +59,7 @@ class LatticeSampler(mi.Sampler):
 
     def end(self):
         """Forget the last render, and free its memory."""
-        self.rays = self._lattice = self._offset = None
+        self.cells = self._lattice = self._in_cells = self._offset = None
 
     def next_1d(self, active=True):
         """A uniform number for each lane."""
@@ -66,31 +67,29 @@ class LatticeSampler(mi.Sampler):
 
     def next_2d(self, active=True):
         """A point of the unit square for each lane."""
-        point = self._next()[1]
-        # Mitsuba takes the place in the pixel first, and assumes equal numbers of rays
-        return point + self._offset if self.rays and self._calls == 1 else point
+        # Mitsuba takes the place in the pixel first, and assumes its own order
+        if self.cells and self._calls == 0:
+            return self._next(self._in_cells)[1] + self._offset
+        return self._next()[1]
 
     def _begin(self):
         lanes = self.wavefront_size()
         each, lane, self._calls = lanes // self.pixels, dr.arange(mi.UInt32, lanes), 0
-        if self.rays:
-            places, sizes = self.rays.places(lane), self.rays.sizes
-            here, there = (self._position(pixel) for pixel in (lane // dr.opaque(mi.UInt32, each), places.pixel))
-            self._offset = there - here
+        if self.cells:
+            places, sizes = self.cells.rays.places(lane), self.cells.rays.sizes
+            in_cells = self.cells.places(lane)
+            self._in_cells = Lattice(in_cells, self.cells.sizes, self._seed)
+            here = self.cells.position(lane // dr.opaque(mi.UInt32, each))
+            self._offset = self.cells.position(in_cells.pixel) - here
         else:
             places, sizes = RayNumbers.of_lanes(lane, each), (self.sample_count(),)
             # The passes of a render share the lattice of a pixel
             places = replace(places, number=places.number + dr.opaque(mi.UInt32, self._pass * each))
         self._lattice = Lattice(places, sizes, self._seed)
 
-    def _position(self, pixel):
-        """Position of a pixel in the film."""
-        width = dr.opaque(mi.UInt32, self.width)
-        return mi.Point2f(pixel % width, pixel // width)
-
-    def _next(self):
+    def _next(self, lattice: Lattice | None = None):
         self._calls += 1
-        return self._lattice.at(dr.opaque(mi.UInt32, self._calls))
+        return (lattice or self._lattice).at(dr.opaque(mi.UInt32, self._calls))
 
 
 class StratifiedSensor(mi.Sensor):
@@ -109,24 +108,16 @@ class StratifiedSensor(mi.Sensor):
         properties["shutter_open"], properties["shutter_close"] = 0.0, 1.0
         super().__init__(properties)
 
-    def becomes(self, sensor, spp: int, density: np.ndarray | None = None) -> None:
-        """Stand for ``sensor`` with ``spp`` samples of a pixel, which differ in proportion to a ``density`` (height,
-        width) if there is one; None: for no sensor."""
+    def becomes(self, sensor, spp: int, cells: FilmCells | None = None) -> None:
+        """Stand for ``sensor`` with ``spp`` samples of a pixel of the film, and the rays of ``cells`` if there are any;
+        None: for no sensor."""
         self._sensor, self.m_film, sampler = sensor, sensor.film() if sensor else self._idle, self.sampler()
         sampler.end()
         if sensor is None:
             return
-        film = sensor.film()
-        size = np.array(film.crop_size(), np.int64) + (2 * film.rfilter().border_size() if film.sample_border() else 0)
         self.m_needs_sample_3 = sensor.needs_aperture_sample()
         sampler.set_sample_count(spp)
-        sampler.pixels, sampler.width = int(np.prod(size)), int(size[0])
-        if density is None:
-            return
-        shape = tuple(size[::-1].tolist())
-        if density.shape != shape:
-            raise ValueError(f"density must have the shape of the film, {shape}, got {density.shape}")
-        sampler.rays = PixelRays.by_density(density, spp)
+        sampler.pixels, sampler.cells = int(np.prod(film_size(sensor.film()))), cells
 
     def to_string(self):
         """The other sensor."""
@@ -158,23 +149,56 @@ def is_replaced(sensor) -> bool:
     return is_usual and sensor.get_medium() is None
 
 
-def may_differ(sensor, spp: int) -> bool:
-    """Whether pixels may have different numbers of samples, ``spp`` in the mean.
+def film_size(film) -> np.ndarray:
+    """Width and height of the pixels that a film samples, (2,) int64, borders included."""
+    border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+    return np.array(film.crop_size(), np.int64) + border
+
+
+def may_differ(sensor, spp: int, parts: int = 1) -> bool:
+    """Whether the pixels of an image may have different numbers of samples, ``spp`` in the mean.
+
+    ``parts``: the image has a film of ``parts``² pixels for each pixel, with a box filter, instead of the film of the
+    ``sensor``.
+    """
+    return has_free_order(sensor, parts > 1) and spp % (MULTIPLE * parts**2) == 0
+
+
+def has_free_order(sensor, has_box: bool = False) -> bool:
+    """Whether rays may have another order than the film, and pixels different numbers of rays.
 
     Only with a box filter, which has no weights: Mitsuba divides the sum of weighted samples by the sum of weights, so
-    pixels with many samples would count more than their neighbours.
+    pixels with many samples would count more than their neighbours.  ``has_box``: the film will have a box filter.
     """
     film = sensor.film()
-    return is_replaced(sensor) and film.rfilter().is_box_filter() and not film.sample_border() and spp % MULTIPLE == 0
+    return is_replaced(sensor) and (has_box or (film.rfilter().is_box_filter() and not film.sample_border()))
+
+
+def cells_of(film, spp: int, parts: int, density: np.ndarray | None = None) -> FilmCells | None:
+    """Cells of a ``film`` with ``parts``² pixels for each pixel of the image and ``spp`` samples for each pixel of the
+    film; None if rays have the order of the film.
+
+    ``density`` (height, width): samples of the image's pixels over their mean, about; None: equal numbers.  Raises
+    ValueError for a density of another shape.
+    """
+    if parts == 1 and density is None:
+        return None
+    width, height = (film_size(film) // parts).tolist()
+    samples = spp * parts**2
+    if density is None:
+        return FilmCells(PixelRays.uniform(width * height, samples), parts, width)
+    if density.shape != (height, width):
+        raise ValueError(f"density must have the shape of the image, {(height, width)}, got {density.shape}")
+    return FilmCells(PixelRays.by_density(density, samples), parts, width)
 
 
 @contextmanager
-def stratified(sensor, spp: int, density: np.ndarray | None = None):
+def stratified(sensor, spp: int, density: np.ndarray | None = None, parts: int = 1):
     """Within the block, a sensor for ``sensor`` with stratified samples if its sampler is ``independent``.
 
     Yields ``sensor`` itself with another sampler, for a batch of sensors, and within a participating medium.  ``spp``:
-    samples of a pixel; 0: as many as the sampler has; ``density`` (height, width): the samples of a pixel over their
-    mean, about, where :func:`may_differ`; None: equal numbers.
+    samples of a pixel of the film; 0: as many as the sampler has; ``density``, ``parts``: see :func:`cells_of`, for
+    films with a box filter.
     """
     if not is_replaced(sensor):
         yield sensor
@@ -186,7 +210,8 @@ def stratified(sensor, spp: int, density: np.ndarray | None = None):
     except IndexError:
         lent = StratifiedSensor()
     try:
-        lent.becomes(sensor, spp or sampler.sample_count(), density)
+        spp = spp or sampler.sample_count()
+        lent.becomes(sensor, spp, cells_of(sensor.film(), spp, parts, density))
         yield lent
     finally:
         lent.becomes(None, 0)

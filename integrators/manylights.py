@@ -19,15 +19,16 @@ from vpl.split.cost_model import CostModel
 from vpl.split.emitters import emitter_sampler
 from vpl.split.emitters.cell_choice import learning_rays
 from vpl.split.estimator import estimate
-from vpl.split.pixel_rays import HALF, PixelRays
+from vpl.split.film_cells import HALF, FilmCells
+from vpl.split.pixel_rays import PixelRays
 from vpl.split.roulette import OutgoingRadiance
 from vpl.split.start import Start, make_start
 from vpl.split.surface_lights import KeptLights
 from vpl.split.view import PathRules, Stream, View
 
-from .camera_samples import LatticeSampler, may_differ, stratified
-from .gathering import GatheringIntegrator
+from .camera_samples import LatticeSampler, stratified
 from .knobs import Boolean, Groups, Words
+from .longer_renders import PassRenderer
 from .manual import manual_page
 
 # Samples of a pixel by which the pilot and its learning are sized where passes share them: a usual size of a pass
@@ -41,7 +42,7 @@ _RESERVED = (*LENGTHS, OTHER, "albedo", "normal", "depth", *"RGBAXYZ")
 
 
 @manual_page
-class ManyLightsIntegrator(GatheringIntegrator):
+class ManyLightsIntegrator(PassRenderer):
     r"""
     .. _integrator-manylights:
 
@@ -118,9 +119,9 @@ class ManyLightsIntegrator(GatheringIntegrator):
     - Numbers of samples: with ``denoised``, the passes of ``manylights.render`` from the third on give a pixel from a
       quarter to four times the mean number of samples.  Two halves of the second pass are denoised apart, and show
       where noise remains.  Passes depend on earlier passes only and have a common weight for all pixels, so the mean of
-      the image is unchanged.  The film needs a box filter, and the sensor the samples of this plugin.  Images that end
-      by ``error``, passes of a given size, images by several workers and images above a million pixels have equal
-      numbers.
+      the image is unchanged.  The sensor needs the samples of this plugin, and a film in the resolution of the image
+      a box filter.  Images that end by ``error``, passes of a given size, images by several workers and images above
+      half a million pixels (a million in their own resolution) have equal numbers.
     - Masks: the image is that of ``prb``.  ``path`` (Mitsuba 3.9.1) shows black for samples whose path ends after it
       passed only masks, so it is too dark where nothing is behind a mask.  With ``hide_emitters``, ``path`` hides an
       environment behind a mask, which ``manylights`` shows.  Alpha is that of ``path``.
@@ -192,47 +193,6 @@ class ManyLightsIntegrator(GatheringIntegrator):
                 "do not follow changes of ids"
             )
         self.cost_model, self._kept = cost_model or CostModel(), KeptLights()
-        self._shared, self._makes_start, self._only_starts = None, False, False
-        self._density, self._has_half = None, False
-
-    @contextmanager
-    def pass_of(self, shared, is_first: bool, density=None, half: bool = False):
-        """Within the block, a render is a pass of a longer render and uses the start that its passes share.
-
-        ``shared``: object with an attribute ``start``, None until the first pass is rendered.  The start depends on the
-        first pass alone: where it is missing and this is not the first pass, yields True, and the caller has to render
-        the first pass within :meth:`only_start`.  ``density`` (height, width): samples of each pixel over their mean,
-        about; None for equal numbers.  ``half``: whether the image has the mean of every second sample as channels of
-        the layer :data:`vpl.split.pixel_rays.HALF`, with an even number of samples.  Both need :meth:`may_differ`, and
-        exclude each other.
-        """
-        if half and density is not None:
-            raise ValueError("half must be False where pixels have different numbers of samples, by a density")
-        with exclusive(integrator=self):
-            self._shared, self._makes_start, self._density, self._has_half = shared, is_first, density, half
-            try:
-                yield shared.start is None and not is_first
-            finally:
-                self._shared, self._makes_start, self._density, self._has_half = None, False, None, False
-
-    def may_differ(self, sensor, spp: int) -> bool:
-        """Whether the pixels of a pass of an image for denoising may have different numbers of samples, ``spp`` in the
-        mean."""
-        in_one = spp <= self.samples_per_pass
-        return self.denoised and self.stratified and in_one and may_differ(sensor, spp)
-
-    @contextmanager
-    def only_start(self):
-        """Within the block, a render makes the start of its pass and no image."""
-        of_pass = self._density, self._has_half
-        self._makes_start = self._only_starts = True
-        # The start belongs to the first pass, whose pixels have equal numbers of samples
-        self._density, self._has_half = None, False
-        try:
-            yield
-        finally:
-            self._makes_start = self._only_starts = False
-            self._density, self._has_half = of_pass
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
         """Derivative of the image, by ``prb``: a tensor of the shape of the image, see :meth:`_adjoint` for errors.
@@ -274,7 +234,7 @@ class ManyLightsIntegrator(GatheringIntegrator):
     def aov_names(self):
         """Names of the channels of layers."""
         channels = "Y" if mi.is_monochromatic else "RGB"
-        layers = [*self._layer_names, *([HALF] if self._has_half else [])]
+        layers = [*self._layer_names, *([HALF] if self._pass.half else [])]
         return [f"{layer}.{channel}" for layer in layers for channel in channels]
 
     @property
@@ -285,7 +245,8 @@ class ManyLightsIntegrator(GatheringIntegrator):
     def _render(self, scene, sensor, seed, spp, develop, evaluate):
         if self._layer_names:
             _require_unit_weight(sensor)
-        with stratified(sensor, spp, self._density) if self.stratified else nullcontext(sensor) as chosen:
+        density, parts = self._pass.density, self.parts_of(sensor, spp)
+        with stratified(sensor, spp, density, parts) if self.stratified else nullcontext(sensor) as chosen:
             return super()._render(scene, chosen, seed, spp, develop, evaluate)
 
     def _sample(self, scene, sampler, ray, active):
@@ -294,16 +255,17 @@ class ManyLightsIntegrator(GatheringIntegrator):
                 "manylights: layers are not rendered below a wrapper such as aov or moment, which names channels in "
                 "another order (Mitsuba 3.9.1)"
             )
-        clock, shared = Clock(Stage.SCENE), self._shared
+        clock, shared = Clock(Stage.SCENE), self._pass.shared
         known = shared.start if shared else None
-        if shared and known is None and not self._makes_start:
+        if shared and known is None and not self._pass.makes_start:
             raise RuntimeError("the start of the first pass is missing: render the first pass before later ones")
-        view = self._view(scene, sampler, ray, active, known)
+        cells = self._cells(scene, sampler, dr.width(ray))
+        view = self._view(scene, sampler, ray, active, cells, known)
         clock.begin(Stage.PILOT)
         start = known or make_start(view, self.virtual_lights)
         if shared:
             shared.start = start
-        if self._only_starts:
+        if not self._pass.makes_image:
             none = [dr.zeros(mi.Float, view.count) for _ in self.aov_names()]
             return dr.zeros(mi.Spectrum, view.count), dr.zeros(mi.Bool, view.count), none
         kept = self._kept if self.keep_lights else None
@@ -314,32 +276,36 @@ class ManyLightsIntegrator(GatheringIntegrator):
         if shared and not found.decision.plan.gathers:
             self.statistics["growth"] = [(times, found.decision.growth(times)) for times in _LARGER]
         channels = [channel for name in self._layer_names for channel in found.layers[name]]
-        if view.rays.differ:
-            channels = [view.rays.evenly(channel) for channel in channels]
-            valid = view.rays.evenly_masked(found.valid, derived_seed(view.seed, Stream.ALPHA))
-            return mi.Spectrum(view.rays.evenly(found.radiance)), valid, channels
-        if self._has_half:
-            number = view.rays.places(dr.arange(mi.UInt32, view.count)).number
+        if self._pass.half:
+            number = cells.places(dr.arange(mi.UInt32, view.count)).number
             channels += list(dr.select((number & 1) == 1, 2 * found.radiance, 0))
-        return mi.Spectrum(found.radiance), found.valid, channels
+        if cells.is_plain:
+            return mi.Spectrum(found.radiance), found.valid, channels
+        channels = [cells.evenly(channel) for channel in channels]
+        valid = cells.evenly_masked(found.valid, derived_seed(view.seed, Stream.ALPHA))
+        return mi.Spectrum(cells.evenly(found.radiance)), valid, channels
 
-    def _view(self, scene, sampler, ray, active, known: Start | None) -> View:
+    def _cells(self, scene, sampler, count: int) -> FilmCells:
+        """The cells of the film for ``count`` camera rays."""
+        if isinstance(sampler, LatticeSampler) and sampler.cells:
+            return sampler.cells
+        grid = self.pixel_grid(scene, sampler)
+        return FilmCells(PixelRays.uniform(-(-count // grid.samples), grid.samples), 1, grid.width)
+
+    def _view(self, scene, sampler, ray, active, cells: FilmCells, known: Start | None) -> View:
         number = dr.detach(sampler.next_1d())
         bits = dr.reinterpret_array(mi.UInt32, number)
         # Renders with different numbers of samples share kept lights
         seed = sampler.pass_seed if isinstance(sampler, LatticeSampler) else int(bits[0])
-        grid, count = self.pixel_grid(scene, sampler), dr.width(ray)
+        count, pixels = dr.width(ray), cells.rays.pixels
         dr.make_opaque(ray, active)
-        pixels = -(-count // grid.samples)
-        own = sampler.rays if isinstance(sampler, LatticeSampler) else None
-        rays = own or PixelRays.uniform(pixels, grid.samples)
         # A shared start serves larger passes, too
-        learning = max(count, _SHARED_SAMPLES * pixels) if self._shared else count
+        learning = max(count, _SHARED_SAMPLES * pixels) if self._pass.shared else count
         groups = EmitterGroups(scene, self.light_groups) if self.light_groups and not known else None
         emitters = known.emitters if known else emitter_sampler(scene, learning_rays(learning), groups)
         return View(
             scene, emitters, Perturbed(scene), PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray,
-            active, grid.width, rays, seed, dr.opaque(mi.Float, 1.0, pixels), OutgoingRadiance.unknown(),
+            active, cells.width, cells.rays, seed, dr.opaque(mi.Float, 1.0, pixels), OutgoingRadiance.unknown(),
             learning, self.cost_model if self.denoised else self.cost_model.without_denoiser(),
             Layers(bool(self.layers), emitters.groups),
         )  # fmt: skip

@@ -41,11 +41,18 @@ def test_denoised_image_is_closer_to_the_reference(exact, integrator):
     assert 0 < took.denoise_seconds < took.seconds
 
 
-def test_the_raw_image_is_the_one_without_denoising():
-    scene = cornell().load()
-    np.testing.assert_allclose(
-        manylights.render(scene, spp=4, denoise=True)[1].raw.numpy(), manylights.render(scene, spp=4)[0].numpy()
+@pytest.mark.parametrize("integrator", ["path", "manylights"])
+def test_the_raw_image_has_the_mean_and_the_noise_of_one_without_denoising(exact, integrator):
+    scene, plugin = cornell(64).load(), mi.load_dict({"type": integrator, "max_depth": 6})
+    raw, plain = (
+        [render_image(seed) for seed in range(4)]
+        for render_image in (
+            lambda seed: manylights.render(scene, plugin, spp=16, seed=seed, denoise=True)[1].raw.numpy(),
+            lambda seed: manylights.render(scene, plugin, spp=16, seed=seed)[0].numpy(),
+        )
     )
+    assert np.mean(raw) == pytest.approx(np.mean(plain), rel=0.02)
+    assert squared_error(np.array(raw), exact) == pytest.approx(squared_error(np.array(plain), exact), rel=0.25)
 
 
 @pytest.mark.parametrize("denoise", [True, False])
@@ -62,7 +69,7 @@ def test_a_plugin_by_name_is_balanced_for_the_denoiser_and_an_object_keeps_its_p
 def test_a_quality_chooses_the_network():
     scene, plugin = cornell(32).load(), mi.load_dict({"type": "path", "max_depth": 3})
     high, fast, usual = (
-        manylights.render(scene, plugin, spp=2, denoise=one)[0].numpy() for one in ("high", "fast", True)
+        manylights.render(scene, plugin, spp=64, denoise=one)[0].numpy() for one in ("high", "fast", True)
     )
     np.testing.assert_array_equal(high, usual)
     assert 0 < np.abs(high - fast).mean() < 0.3 * high.mean()
@@ -108,8 +115,9 @@ def test_denoised_exr_is_beside_the_raw_one(tmp_path):
     raw, _, _ = images.read_exr(tmp_path / "a.exr")
     denoised, _, metadata = images.read_exr(tmp_path / "a.denoised.exr")
     assert command("-o", tmp_path / "b.exr") == 0
-    np.testing.assert_array_equal(raw, images.read_exr(tmp_path / "b.exr")[0])
+    assert raw.shape == images.read_exr(tmp_path / "b.exr")[0].shape
     assert raw.shape == denoised.shape and np.abs(raw - denoised).max() > 0.01
+    assert metadata["denoise_resolution"] == 2
     assert 0 < metadata["denoise_seconds"] < metadata["render_seconds"]
     assert "denoised" not in images.read_exr(tmp_path / "b.exr")[2]["parameters"]
 
@@ -168,8 +176,8 @@ def test_albedo_and_normal_take_a_small_part_of_a_time_limit(time_limit, samples
     assert Denoiser(cornell(16).load(), time_limit=time_limit).feature_spp == samples
 
 
-@pytest.mark.parametrize("size", [1, 40, 300])
-def test_the_time_of_the_denoiser_is_expected_from_a_tile(size, monkeypatch):
+@pytest.mark.parametrize(("size", "parts"), [(1, 1), (40, 1), (300, 1), (1, 2), (40, 2), (150, 2)])
+def test_the_time_of_the_denoiser_is_expected_from_a_tile(size, parts, monkeypatch):
     """A made-up denoiser needs 10 microseconds for a pixel after the first call, which takes longer."""
     scene, widths = cornell(size).load(), []
 
@@ -179,8 +187,8 @@ def test_the_time_of_the_denoiser_is_expected_from_a_tile(size, monkeypatch):
         return 1e-5 * widths[-1] ** 2 + (1.0 if len(widths) == 1 else 0.0)
 
     monkeypatch.setattr(Denoiser, "_seconds_of", seconds_of)
-    assert Denoiser(scene).expected_seconds == pytest.approx(1e-5 * size**2)
-    assert widths == [min(size, 64)] * 3
+    assert Denoiser(scene, parts=parts).expected_seconds == pytest.approx(1e-5 * (parts * size) ** 2)
+    assert widths == [min(parts * size, 64)] * 3
 
 
 def test_tiles_become_larger_where_the_denoiser_is_fast(monkeypatch):
@@ -188,8 +196,19 @@ def test_tiles_become_larger_where_the_denoiser_is_fast(monkeypatch):
     monkeypatch.setattr(
         Denoiser, "_seconds_of", lambda self, inputs, quality: widths.append(len(inputs["color"])) or 1e-9
     )
-    assert Denoiser(scene).expected_seconds == 1e-9
+    assert Denoiser(scene, parts=1).expected_seconds == 1e-9
     assert widths == [64, 64, 128, 256, 300, 300]
+
+
+def made_up_networks(monkeypatch, share):
+    """Networks of which the best one takes a `share` of 1000 seconds for the 40 × 40 pixels of an image."""
+    times = {"high": 1.0, "balanced": 0.45, "fast": 0.24}
+
+    def seconds_of(self, inputs, quality):
+        return times[quality] * share * 1000 * self.parts**2 * inputs["color"][..., 0].size / (40 * self.parts) ** 2
+
+    monkeypatch.setattr(Denoiser, "_seconds_of", seconds_of)
+    return {name: time * share * 1000 for name, time in times.items()}
 
 
 @pytest.mark.parametrize(
@@ -197,13 +216,35 @@ def test_tiles_become_larger_where_the_denoiser_is_fast(monkeypatch):
     [(0.1, "high"), (0.3, "high"), (0.5, "balanced"), (0.95, "fast"), (2.0, "fast"), (50.0, "fast")],
 )
 def test_the_network_suits_the_time(share, chosen, monkeypatch):
-    """Made-up networks, of which the best takes a `share` of the time limit."""
-    times = {"high": 1.0, "balanced": 0.45, "fast": 0.24}
-    monkeypatch.setattr(Denoiser, "_seconds_of", lambda self, inputs, quality: times[quality] * share * 1000)
+    times = made_up_networks(monkeypatch, share)
+    found = Denoiser(cornell(40).load(), time_limit=1000, parts=1)
+    assert found.quality == chosen and found.expected_seconds == pytest.approx(times[chosen])
+    assert Denoiser(cornell(40).load(), time_limit=1000, quality="high", parts=1).quality == "high"
+    assert Denoiser(cornell(40).load(), parts=1).quality == "high"
+
+
+@pytest.mark.parametrize(
+    ("share", "parts", "chosen"),
+    [
+        (0.01, 2, "high"),
+        (0.05, 2, "high"),
+        (0.1, 2, "balanced"),
+        (0.2, 2, "fast"),
+        (0.3, 2, "fast"),
+        (0.37, 1, "balanced"),
+    ],
+)
+def test_the_resolution_suits_the_time(share, parts, chosen, monkeypatch):
+    made_up_networks(monkeypatch, share)
     found = Denoiser(cornell(40).load(), time_limit=1000)
-    assert found.quality == chosen and found.expected_seconds == pytest.approx(times[chosen] * share * 1000)
-    assert Denoiser(cornell(40).load(), time_limit=1000, quality="high").quality == "high"
-    assert Denoiser(cornell(40).load()).quality == "high"
+    assert (found.parts, found.quality) == (parts, chosen)
+    assert found.description["denoise_resolution"] == parts
+
+
+@pytest.mark.parametrize(("spp", "chosen"), [(4, "fast"), (16, "balanced"), (64, "high"), (None, "high")])
+def test_the_network_at_twice_the_resolution_suits_the_samples(spp, chosen):
+    assert Denoiser(cornell(16).load(), spp=spp).quality == chosen
+    assert Denoiser(cornell(16).load(), spp=spp, quality="high").quality == "high"
 
 
 def test_the_smallest_image_in_the_shortest_time():

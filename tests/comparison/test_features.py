@@ -157,7 +157,7 @@ def test_layers_are_in_every_image_of_a_render():
             seen.append((image.shape[-1], took.channels[3:]))
 
     scene = cornell(16).load()
-    _, took = manylights.render(scene, "path", spp=4, pass_spp=2, layers=["normal"], denoise=True, progress=progress)
+    _, took = manylights.render(scene, "path", spp=8, pass_spp=4, layers=["normal"], denoise=True, progress=progress)
     assert seen == [(6, ["normal.X", "normal.Y", "normal.Z"])] * 2
     assert took.raw.shape == (16, 16, 6)
 

@@ -14,7 +14,7 @@ class Recorded(rendering.Progressive):
         self.restart()
 
     pixels, integrator = property(lambda self: self._pixels), None
-    _denoise, differs = None, False
+    _denoise, differs, parts = None, False, 1
 
     def render(self, spp, seed=None, is_probe=False):
         self.asked.append((spp, seed is not None))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import manylights
-from comparison import rendering
+from comparison import fine_film, rendering
 from comparison.checkpoint import Checkpoint
 from comparison.pass_sizes import PASS_SECONDS, PROBE, PassSizes
 from comparison.sample_density import LEAST_SAMPLES, SampleDensity
@@ -79,7 +79,7 @@ def passes_of(monkeypatch, scene, integrator, **limits):
     seen, before = [], rendering.render_pass
 
     def spied(*arguments):
-        *_, density, half = arguments
+        *_, density, half, _ = arguments
         seen.append((density is not None, half))
         return before(*arguments)
 
@@ -92,12 +92,12 @@ EQUAL, HALVES, OWN = (False, False), (False, True), (True, False)
 
 
 def test_passes_of_images_for_denoising_have_numbers_of_their_own(monkeypatch):
-    found = passes_of(monkeypatch, cornell().load(), "manylights", spp=64, denoise=True)
+    found = passes_of(monkeypatch, cornell().load(), "manylights", spp=60, denoise=True)
     assert found[:2] == [EQUAL, HALVES] and set(found[2:]) == {OWN}
 
 
-@pytest.mark.parametrize("spp", [61, 62, 63])
-def test_only_a_remainder_below_four_samples_has_equal_numbers(monkeypatch, spp):
+@pytest.mark.parametrize("spp", [61, 62, 64, 72])
+def test_only_a_remainder_below_sixteen_samples_has_equal_numbers(monkeypatch, spp):
     found = passes_of(monkeypatch, cornell().load(), "manylights", spp=spp, denoise=True)
     assert found[:2] == [EQUAL, HALVES] and set(found[2:-1]) == {OWN} and found[-1] == EQUAL
 
@@ -117,9 +117,11 @@ def test_other_passes_have_equal_numbers(monkeypatch, integrator, limits):
     assert set(passes_of(monkeypatch, cornell().load(), integrator, **limits)) == {EQUAL}
 
 
-def test_films_with_another_filter_have_equal_numbers(monkeypatch):
+def test_films_with_another_filter_have_equal_numbers_in_their_own_resolution(monkeypatch):
     scene = closed_box({"lamp": area_light()}, 16)
     scene["sensor"]["film"]["rfilter"] = {"type": "gaussian"}
+    assert OWN in passes_of(monkeypatch, mi.load_dict(scene), "manylights", spp=64, denoise=True)
+    monkeypatch.setattr(fine_film, "LARGEST", 1000)
     assert set(passes_of(monkeypatch, mi.load_dict(scene), "manylights", spp=64, denoise=True)) == {EQUAL}
 
 
@@ -131,12 +133,14 @@ def test_images_with_few_samples_in_a_pass_have_equal_numbers(monkeypatch):
     assert not progressive.differs
 
 
-def test_any_size_is_accepted_before_numbers_are_determined():
+@pytest.mark.parametrize(("parts", "before", "after"), [(1, 1, [1, 2, 3, 4, 8, 12, 16]), (2, 4, [4, 8, 12, 16, 32])])
+def test_any_size_is_accepted_before_numbers_are_determined(parts, before, after):
     plugin = mi.load_dict({"type": "manylights", "denoised": True})
-    progressive = rendering.Progressive(cornell().load(), 0, integrator=plugin, denoise=print)
-    assert all(progressive.accepts(spp) for spp in range(1, 20))
+    progressive = rendering.Progressive(cornell().load(), 0, integrator=plugin, denoise=print, parts=parts)
+    sizes = range(1, 10 * before)
+    assert [spp for spp in sizes if progressive.accepts(spp)] == list(sizes[before - 1 :: before])
     progressive.density.relative = np.ones((16, 16))
-    assert [spp for spp in range(1, 20) if progressive.accepts(spp)] == [1, 2, 3, 4, 8, 12, 16]
+    assert [spp for spp in range(1, after[-1] + 3) if progressive.accepts(spp)] == after
 
 
 def test_the_error_of_different_numbers_is_unknown():
@@ -202,11 +206,13 @@ def test_a_pass_that_determines_numbers_is_short(time):
     assert sum(one.seconds for one in passes) <= time + PASS_SECONDS / 4
 
 
+@pytest.mark.parametrize("multiple", [4, 8])
 @pytest.mark.parametrize("spp", [16, 64, 256])
-def test_a_pass_that_determines_numbers_has_a_quarter_of_the_samples_that_are_left(spp):
-    passes, ended_by = made_up_passes(256 * 128, 0.05, 0.004, 0.3, spp=spp, in_parts=True, probes=True)
+def test_a_pass_that_determines_numbers_has_a_quarter_of_the_samples_that_are_left(spp, multiple):
+    limits = {"spp": spp, "in_parts": True, "probes": True, "multiple": multiple}
+    passes, ended_by = made_up_passes(256 * 128, 0.05, 0.004, 0.3, **limits)
     assert ended_by == "spp" and sum(one.spp for one in passes) == spp
-    expected = int(PROBE * (spp - 4)) // 4 * 4
+    expected = int(PROBE * (spp - 4)) // multiple * multiple
     assert passes[1].spp == (expected if expected >= LEAST_SAMPLES else spp - 4)
 
 

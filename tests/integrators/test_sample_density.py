@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from comparison.fine_film import fine_film, merged
 from comparison.rendering import SharedStart, render_pass
 from tests.support.rendering import plugin_with_model
 from tests.support.scenes import area_light, closed_box, image, sensor, wall
@@ -54,11 +55,14 @@ def plugin(lights=True, **more):
     return mi.load_dict({"type": "manylights", "denoised": True, "max_depth": 4, "virtual_lights": lights} | more)
 
 
-def render(scene, integrator, density=None, seed=0, spp=SPP, half=False):
-    """A first pass of a render: an array (height, width, channels)."""
-    with integrator.pass_of(SharedStart(), True, density, half) as is_missing:
+def render(scene, integrator, density=None, seed=0, spp=SPP, half=False, parts=1):
+    """A first pass of a render: an array (height, width, channels), in the resolution of the image."""
+    camera = scene.sensors()[0]
+    filter = camera.film().rfilter()
+    with integrator.pass_of(SharedStart(), True, density, half, parts) as is_missing, fine_film(camera, parts):
         assert not is_missing
-        return np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed), np.float64)
+        found = mi.render(scene, sensor=camera, integrator=integrator, spp=spp // parts**2, seed=seed)
+        return merged(np.array(found, np.float64), parts, filter)
 
 
 def by_pixel(planes):
@@ -103,12 +107,13 @@ def test_a_constant_density_gives_the_image_of_equal_numbers(lights):
     assert np.abs(found - render(scene, integrator, DENSITY, 5)).max() > 1e-3
 
 
+@pytest.mark.parametrize("parts", [1, 2])
 @with_and_without_lights
-def test_the_mean_of_every_pixel_is_that_of_equal_numbers(lights):
+def test_the_mean_of_every_pixel_is_that_of_equal_numbers(lights, parts):
     scene, integrator = room(), plugin(lights)
 
     def pair(seed):
-        found = render(scene, integrator, DENSITY, seed)
+        found = render(scene, integrator, DENSITY, seed, parts=parts)
         assert (integrator.statistics.get("light_paths", 0) > 0) == lights
         return found, render(scene, integrator, None, 1000 + seed)
 
@@ -248,6 +253,62 @@ def test_halves_are_of_every_second_sample():
     assert np.median(of_half / of_whole) > 1.5
 
 
+@pytest.mark.parametrize("film", [{}, {"rfilter": {"type": "gaussian"}}], ids=["box", "gaussian"])
+@with_and_without_lights
+def test_the_mean_of_every_pixel_of_a_fine_film_is_that_of_a_usual_one(lights, film):
+    scene, integrator = room(FILM | film), plugin(lights)
+
+    def pair(seed):
+        found = render(scene, integrator, None, seed, parts=2)
+        assert (integrator.statistics.get("light_paths", 0) > 0) == lights
+        return found, render(scene, integrator, None, 1000 + seed)
+
+    # Walls are smooth, so that the steps of the filter do not matter
+    assert_same_mean_of_pixels(pair)
+
+
+def test_a_fine_film_shows_the_parts_of_pixels():
+    """A picture whose texels are smaller than pixels, where nothing but camera samples is random."""
+    scene, integrator = pictures(), plugin(max_depth=1)
+    camera = scene.sensors()[0]
+    with fine_film(camera, 2):
+        expected = np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=4096, seed=1))
+        with integrator.pass_of(SharedStart(), True, parts=2):
+            found = np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=1024, seed=2))
+    assert found.shape == (2 * HEIGHT, 2 * WIDTH, 3)
+    np.testing.assert_allclose(found, expected, atol=0.02 * expected.max())
+    merged_image = render(scene, integrator, None, 2, 4096, parts=2)
+    np.testing.assert_allclose(merged_image, found.reshape(HEIGHT, 2, WIDTH, 2, 3).mean((1, 3)), rtol=1e-5)
+
+
+@pytest.mark.parametrize("spp", [4, 20, 64])
+def test_a_fine_film_has_the_decisions_of_the_usual_one(spp):
+    scene, integrator, plans = room(), plugin(), []
+    for parts in (1, 2):
+        render(scene, integrator, None, 3, spp, parts=parts)
+        plans.append([integrator.statistics[key] for key in ("light_paths", "clusters", "gather_points")])
+    assert plans[1] == pytest.approx(plans[0], rel=0.1)
+
+
+@with_and_without_lights
+def test_halves_of_a_fine_film_have_the_mean_of_the_image(lights):
+    scene, integrator = room(), plugin(lights)
+
+    def pair(seed):
+        found = render(scene, integrator, None, seed, half=True, parts=2)
+        return found[..., 3:], found[..., :3]
+
+    assert_same_mean_of_pixels(pair)
+
+
+@pytest.mark.parametrize("more", [{"stratified": False}, {"samples_per_pass": 2}], ids=str)
+def test_a_fine_film_counts_as_an_image_where_samples_have_the_order_of_the_film(more):
+    scene, integrator = room(), plugin(**more)
+    assert_same_mean_of_pixels(
+        lambda seed: (render(scene, integrator, None, seed, parts=2), render(scene, integrator, None, 1000 + seed))
+    )
+
+
 # ---------------------- Where numbers may differ ----------------------
 
 
@@ -280,6 +341,13 @@ def test_numbers_may_not_differ_with(case):
     assert not plugin(**more).may_differ(described(film, camera), 16)
 
 
+def test_numbers_may_differ_on_a_fine_film_for_any_filter():
+    film = {"rfilter": {"type": "gaussian"}}
+    assert all(plugin().may_differ(described(film), spp, 2) for spp in (16, 32, 80))
+    assert not any(plugin().may_differ(described(film), spp, 2) for spp in (4, 8, 24))
+    assert not plugin(samples_per_pass=4).may_differ(described(film), 32, 2)
+
+
 @pytest.mark.parametrize("spp", [1, 2, 6, 15, 17])
 def test_numbers_may_not_differ_without_a_quarter_of_the_samples(spp):
     assert not plugin().may_differ(described(), spp)
@@ -295,7 +363,7 @@ def test_numbers_may_not_differ_between_the_sensors_of_a_batch():
 def test_a_density_of_another_shape_is_refused(density):
     with pytest.raises(RuntimeError) as raised:
         render(room(), plugin(), density)
-    assert "density must have the shape of the film" in str(raised.value.__cause__ or raised.value)
+    assert "density must have the shape of the image" in str(raised.value.__cause__ or raised.value)
 
 
 def test_a_density_with_halves_is_refused():

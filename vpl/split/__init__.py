@@ -23,6 +23,7 @@ The terms of the estimator:
 - ``gather_vertices``: vertices where virtual lights are added, the choice of lit vertices, and both normalisations
 - ``pixel_clusters``: a light cut for the vertices of a pixel with similar normals
 - ``pixel_rays``: numbers of camera rays of pixels, which may differ
+- ``film_cells``: the rays of the pixels of a film that is finer than the image
 - ``lattice``: stratified random numbers for the samples of a pixel
 - ``emitters``: emitter samplers for next-event estimation
 - ``spatial_cells``: cubes of space by facing, for values learned by place

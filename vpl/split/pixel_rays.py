@@ -14,13 +14,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import add_at, upload
+from ..core.arrays import upload
 
 # Numbers of rays over the mean number: from a quarter to four times. With more levels up and down the denoised error is
 # the same within 1% (kitchen, staircase2)
 _LEVELS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
-# Name of the channels of an image with the mean of every second ray
-HALF = "every second"
 # Of the mean number: the least number of rays is an integer
 MULTIPLE = 4
 
@@ -136,31 +134,6 @@ class PixelRays:
         first, level = (dr.gather(mi.UInt32, row, pixel) for row in self._device_rows)
         return RayNumbers(pixel, lane - first, level)
 
-    def evenly(self, values):
-        """Mean of the ``values`` of each pixel's rays, for as many rays as if all pixels had the mean number.
-
-        Mitsuba adds up samples with a box filter as if pixels had equal numbers of rays.
-        """
-        channels, even = [], self._even_places.pixel
-        for channel in values if dr.depth_v(values) > 1 else [values]:
-            total = dr.zeros(mi.Float, self.pixels)
-            add_at(total, channel, self._device_pixels)
-            channels.append(dr.gather(mi.Float, total / self._device_numbers, even))
-        return type(values)(*channels)
-
-    @property
-    def _even_places(self) -> RayNumbers:
-        """Places of the rays if all pixels had the mean number."""
-        return RayNumbers.of_lanes(dr.arange(mi.UInt32, self.count), self.mean)
-
-    def evenly_masked(self, mask: mi.Bool, seed: int) -> mi.Bool:
-        """As :meth:`evenly`, for a ``mask``: a multiple of 1 / mean number for each pixel, with the mean fraction."""
-        fraction = self.evenly(dr.select(mask, mi.Float(1), mi.Float(0)))
-        places = self._even_places
-        # A random number for each pixel, so that rounding has no preference
-        rounding = mi.sample_tea_float32(places.pixel, dr.opaque(mi.UInt32, seed))
-        return rounding < fraction * self.mean - mi.Float(places.number)
-
     @cached_property
     def _pixels(self) -> np.ndarray:
         """Pixel of each ray, (count,) uint32."""
@@ -169,10 +142,6 @@ class PixelRays:
     @cached_property
     def _device_pixels(self) -> mi.UInt32:
         return upload(mi.UInt32, self._pixels)
-
-    @cached_property
-    def _device_numbers(self) -> mi.Float:
-        return upload(mi.Float, self.numbers)
 
     @cached_property
     def _device_rows(self) -> tuple[mi.UInt32, mi.UInt32]:

@@ -167,38 +167,6 @@ def test_as_large_a_fraction_of_all_pixels_is_lit(most):
     assert rays.lit(most)[rays.sizes.index(16)] == kept
 
 
-# ---------------------- Means of pixels ----------------------
-
-
-@layouts
-def test_even_values_are_the_means_of_pixels(layout):
-    rays = LAYOUTS[layout]()
-    pixel = places_one_by_one(rays)[:, 0]
-    values = np.random.default_rng(1).normal(size=(3, rays.count))
-    expected = [np.repeat(np.bincount(pixel, x) / np.bincount(pixel), rays.mean) for x in values]
-    found = rays.evenly(mi.Color3f(*(upload(mi.Float, x) for x in values)))
-    assert isinstance(found, mi.Color3f)
-    np.testing.assert_allclose(np.array(found), expected, atol=1e-5)
-    single = rays.evenly(upload(mi.Float, values[0]))
-    assert isinstance(single, mi.Float)
-    np.testing.assert_allclose(np.array(single), expected[0], atol=1e-5)
-
-
-def test_even_masks_have_the_fractions_of_pixels():
-    rays = usual_rays()
-    pixel = places_one_by_one(rays)[:, 0]
-    rng = np.random.default_rng(2)
-    # Some pixels are covered fully, and some not at all
-    mask = rng.random(rays.count) < np.clip(rng.uniform(-0.5, 1.5, rays.pixels), 0, 1)[pixel]
-    even = np.array(rays.evenly_masked(mi.Bool(mask), 3)).reshape(rays.pixels, rays.mean)
-    fraction = np.bincount(pixel, mask) / rays.numbers
-    assert (fraction == 0).any() and (fraction == 1).any()
-    assert np.abs(even.mean(1) - fraction).max() < 1 / rays.mean
-    # Without rounding where the fraction is a multiple of 1 / mean
-    exact = rays.numbers <= rays.mean
-    assert (even.mean(1) == fraction)[exact].all()
-
-
 # ---------------------- Lattices ----------------------
 
 

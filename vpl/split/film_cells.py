@@ -1,0 +1,129 @@
+"""Cells of a film: the pixels of an image, or parts of them if the film is finer than the image.
+
+A denoiser leaves less error at twice the resolution (:mod:`comparison.fine_film`).  Lights, cuts and numbers of rays
+are those of the pixels of the image, and the cells divide the rays of a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import add_at
+from .pixel_rays import PixelRays, RayNumbers
+
+# Name of the channels of an image with the mean of every second ray of a cell
+HALF = "every second"
+
+
+@dataclass(frozen=True)
+class FilmCells:
+    """Cells of the film that the camera rays of pixels belong to.
+
+    ``rays`` of the pixels: a pixel has a multiple of ``parts``² rays; ``parts``: cells along each side of a pixel;
+    ``width`` of the image in pixels.  The cells of the film follow each other in rows.
+    """
+
+    rays: PixelRays
+    parts: int
+    width: int
+
+    @property
+    def count(self) -> int:
+        """Number of cells."""
+        return self.rays.pixels * self.parts**2
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The different numbers of rays of a cell, ascending."""
+        return tuple(size // self.parts**2 for size in self.rays.sizes)
+
+    @property
+    def mean(self) -> int:
+        """Mean number of rays of a cell."""
+        return self.rays.mean // self.parts**2
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the rays of a cell are side by side, and as many as those of other cells."""
+        return self.parts == 1 and not self.rays.differ
+
+    def places(self, lane: mi.UInt32) -> RayNumbers:
+        """Places of the rays ``lane`` (UInt32) in cells: ``pixel`` is the cell.
+
+        Successive rays of a pixel belong to different cells, and those of a pair to neighbours of every kind.
+        """
+        places = self.rays.places(lane)
+        if self.parts == 1:
+            return places
+        parts, cells = (dr.opaque(mi.UInt32, number) for number in (self.parts, self.parts**2))
+        part = (places.number + places.pixel) % cells
+        width = dr.opaque(mi.UInt32, self.width)
+        row = places.pixel // width * parts + part // parts
+        column = places.pixel % width * parts + part % parts
+        return RayNumbers(row * (width * parts) + column, places.number // cells, places.level)
+
+    def position(self, cell: mi.UInt32) -> mi.Point2f:
+        """Position of a cell in the film, in cells."""
+        width = dr.opaque(mi.UInt32, self.width * self.parts)
+        return mi.Point2f(cell % width, cell // width)
+
+    def evenly(self, values):
+        """The ``values`` of the rays for cells with the mean number of rays, side by side: those of the rays in another
+        order, or, where pixels have different numbers, the means of the cells.
+
+        Mitsuba adds up samples with a box filter as if pixels had equal numbers of rays.
+        """
+        if not self.rays.differ:
+            return dr.gather(type(values), values, self._ray)
+        channels = []
+        for channel in values if dr.depth_v(values) > 1 else [values]:
+            total = dr.zeros(mi.Float, self.count)
+            add_at(total, channel, self._places.pixel)
+            channels.append(dr.gather(mi.Float, total / self._numbers, self._even_places.pixel))
+        return type(values)(*channels)
+
+    def evenly_masked(self, mask: mi.Bool, seed: int) -> mi.Bool:
+        """As :meth:`evenly`, for a ``mask``: a multiple of 1 / mean number for each cell, with the mean fraction."""
+        if not self.rays.differ:
+            return dr.gather(mi.Bool, mask, self._ray)
+        fraction = self.evenly(dr.select(mask, mi.Float(1), mi.Float(0)))
+        places = self._even_places
+        # A random number for each cell, so that rounding has no preference
+        rounding = mi.sample_tea_float32(places.pixel, dr.opaque(mi.UInt32, seed))
+        return rounding < fraction * self.mean - mi.Float(places.number)
+
+    @property
+    def _even_places(self) -> RayNumbers:
+        """Places of the rays in the cells if all cells had the mean number, side by side."""
+        return RayNumbers.of_lanes(dr.arange(mi.UInt32, self.rays.count), self.mean)
+
+    @cached_property
+    def _places(self) -> RayNumbers:
+        """Places of all rays in the cells, evaluated."""
+        places = self.places(dr.arange(mi.UInt32, self.rays.count))
+        dr.eval(places)
+        return places
+
+    @cached_property
+    def _ray(self) -> mi.UInt32:
+        """The ray at each of the even places, for equal numbers of rays: the inverse of :meth:`places`, evaluated."""
+        parts, cells, width = (dr.opaque(mi.UInt32, x) for x in (self.parts, self.parts**2, self.width))
+        row, column = self._even_places.pixel // (width * parts), self._even_places.pixel % (width * parts)
+        pixel = row // parts * width + column // parts
+        part = row % parts * parts + column % parts
+        first = (part + cells - pixel % cells) % cells
+        ray = pixel * dr.opaque(mi.UInt32, self.rays.mean) + self._even_places.number * cells + first
+        dr.eval(ray)
+        return ray
+
+    @cached_property
+    def _numbers(self) -> mi.Float:
+        """Number of rays of each cell."""
+        numbers = dr.zeros(mi.Float, self.count)
+        add_at(numbers, dr.opaque(mi.Float, 1, self.rays.count), self._places.pixel)
+        dr.eval(numbers)
+        return numbers
