@@ -218,3 +218,15 @@ def test_shapes_of_no_size_do_no_harm(name, shape):
 @pytest.mark.parametrize("shape", DEGENERATE)
 def test_shapes_of_no_size_do_no_harm_in_any_plugin(name, shape):
     assert_renders_well(lit({"bad": DEGENERATE[shape]()}), name)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect", "vpl"])
+def test_a_lamp_whose_area_overflows_is_dropped_and_counted(name):
+    """Its extent does not overflow."""
+    matrix = np.array([[1, 0, 3e4, 0], [0, 6e14, 0, 0], [-3e4, 0, 1, 0], [0, 0, 0, 1.0]])
+    lamp = {"type": "rectangle", "to_world": mi.ScalarTransform4f(matrix)}
+    lamp["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
+    integrator = mi.load_dict(plugin(name, max_depth=2))
+    assert np.isfinite(render(mi.load_dict(lit(bad=lamp)), integrator, 2)).all()
+    assert integrator.statistics["dropped"] == 1

@@ -192,11 +192,12 @@ def _read_areas(scene, group_of: Callable) -> tuple[AreaEmitters, int, list]:
         groups.append(group_of(emitter))
         spheres.append(shape if shape.class_name() == "Sphere" else None)
     radiance = np.array(radiances, np.float32).reshape(-1, 3)
-    bad = ~usable(radiance).all(1)
-    radiance[bad] = 0
     shape_index = np.array(indices, np.uint32)
     by_index = dict(emitting)
     area, shapes = _surface_areas(scene, shape_index, [by_index[index] for index in indices])
+    # The square of an area overflows before the extent of a scene does
+    bad = ~(usable(radiance).all(1) & usable(area))
+    radiance[bad], area[bad] = 0, 0
     rows = SphereRows(spheres) if any(spheres) else None
     group = np.array(groups, np.uint32)
     return AreaEmitters(shape_index, radiance, area, group, textured, shapes, rows), int(bad.sum()), unusual
