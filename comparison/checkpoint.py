@@ -34,12 +34,10 @@ def file_of(image):
 
 class Checkpoint:
     """Checkpoint file of a render, which continues from it if `resume`. `made_by`: everything that the image depends on
-    except the number and sizes of passes, a dict for JSON. The checkpoint of another render is refused. `parts`: of the
-    film of the passes, see fine_film.py."""
+    except the number and sizes of passes, a dict for JSON. The checkpoint of another render is refused."""
 
-    def __init__(self, path, made_by, resume=True, parts=1):
-        self.path, self._resume, self.parts = Path(path), resume, parts
-        self._made_by = made_by | {"resolution": parts}
+    def __init__(self, path, made_by, resume=True):
+        self.path, self._made_by, self._resume = Path(path), made_by, resume
         self._passes, self._kept, self._saved = None, None, None
         self._writer = OccasionalWriter("The checkpoint", CHECKPOINT_SECONDS)
 

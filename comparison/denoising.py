@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from .features import features_of
-from .fine_film import may_be_finer, merged, usual_parts
+from .fine_film import merged
 from .images import colour
 from .scene_files import known_parameters
 
@@ -70,19 +70,23 @@ class Denoiser:
     `spp`, `time_limit`: samples per pixel and seconds of the image, None if unlimited; they limit the samples of the
     `features`, a dict as of `auxiliary_features`. `feature_spp`: samples per pixel of the features. `seconds`: time
     spent so far, of which `start_seconds` in the constructor, which renders the features. `expected_seconds`: estimated
-    time of a call of `denoise_fine`. `parts`: of the film of the images, see fine_film.py; by default 2 if the film can
-    be finer, but 1 if the fastest network would then take more than a third of the `time_limit`. `quality`: one of
-    `QUALITIES`; by default the one that leaves the least error, as the time that it saves is for samples. With `parts`
-    of 1 and no time limit it is the best one.
+    time of a call of `denoise_fine`. `parts`: of the film of the images, see fine_film.py; becomes 1 if the network
+    `quality`, or else the fastest one, would take more than a third of the `time_limit`. `quality`: one of `QUALITIES`;
+    by default the one that leaves the least error, as the time that it saves is for samples. With `parts` of 1 and no
+    time limit it is the best one.
     """
 
-    def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None, parts=None):
+    def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None, parts=1):
         self._oidn, begin = import_oidn(), time.perf_counter()
         self._networks = {name: getattr(self._oidn.Quality, name.capitalize()) for name in QUALITIES}
         self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
         one = scene.sensors()[sensor]
         self._filter, self._size = one.film().rfilter(), np.array(one.film().crop_size(), np.int64)
-        self.parts = parts or self._usual_parts(one, spp, time_limit)
+        self.parts = parts
+        if parts > 1 and time_limit is not None:
+            # The time of a network is that of its tiles at the resolution of `parts`
+            is_quick = self._expected(quality or QUALITIES[-1]) <= FINE_SHARE * time_limit
+            self.parts = parts if is_quick else 1
         self.features, self.feature_spp = features_of(scene, one, seed, spp, time_limit, self.parts)
         self.quality = quality or self._usual_quality(spp, time_limit)
         self.expected_seconds = self._expected(self.quality)
@@ -129,13 +133,6 @@ class Denoiser:
         planes[..., where] = filtered if len(where) == 3 else filtered.mean(axis=-1, keepdims=True)
         self.seconds += time.perf_counter() - begin
         return type(image)(planes) if isinstance(image, mi.TensorXf) else planes
-
-    def _usual_parts(self, sensor, spp, time_limit):
-        """Return the usual `parts`."""
-        self.parts = usual_parts(may_be_finer(sensor), int(np.prod(self._size)), spp)
-        if time_limit is None or self.parts == 1:
-            return self.parts
-        return self.parts if self._expected(QUALITIES[-1]) <= FINE_SHARE * time_limit else 1
 
     def _usual_quality(self, spp, time_limit):
         """Return the quality that leaves the least error for `spp` samples and the time of the denoiser."""

@@ -5,50 +5,61 @@ errors of the denoiser itself: with equal samples, denoised errors are a quarter
 The film has a box filter, whose noise the denoiser recognises; the filter of the scene's film follows afterwards.
 """
 
+import re
 from contextlib import contextmanager
 
 import mitsuba as mi
 import numpy as np
 
+from vpl.core.arrays import upload
+from vpl.core.exclusive import exclusive
+
 LARGEST = 2**23  # pixels of a fine film: a pass has a sample for each, which bounds memory. 1920 × 1080 have 2^22.98
-_POINTS = 16  # per fine pixel, of the mean of a filter
 PARTS = 2  # pixels of a fine film along each side of a pixel. With 4: 0.9 to 1.06 times the error, four times as long
+_POINTS = 16  # per fine pixel, of the mean of a filter
 
 
-def may_be_finer(sensor):
-    """Return whether a `mi.Sensor` can have a fine film. Not a batch of sensors, which divides its film between them,
-    and no film that is unknown, or has samples beyond its border."""
+def usual_parts(sensor, integrator, spp):
+    """Return the pixels of the film along each side of a pixel, for an image by a `mi.Sensor` with `spp` samples per
+    pixel, None if unlimited: pixels of the film have a sample at least."""
     film = sensor.film()
-    return film.class_name() == "HDRFilm" and not film.sample_border() and sensor.class_name() != "BatchSensor"
+    pixels = PARTS**2 * int(np.prod(np.array(film.crop_size(), np.int64)))
+    is_usual = film.class_name() == "HDRFilm" and not film.sample_border()
+    # A batch of sensors divides its film between them
+    is_possible = is_usual and sensor.class_name() != "BatchSensor" and pixels <= LARGEST
+    return PARTS if is_possible and _suits(integrator) and (spp is None or spp >= PARTS**2) else 1
 
 
-def usual_parts(is_possible, pixels, spp):
-    """Return the pixels of the film along each side of a pixel, for an image of `pixels` with `spp` samples per pixel,
-    None if unlimited: pixels of the film have a sample at least. `is_possible`: the result of `may_be_finer`."""
-    is_enough = spp is None or spp >= PARTS**2
-    return PARTS if is_possible and is_enough and PARTS**2 * pixels <= LARGEST else 1
+def _suits(integrator):
+    """Return whether an integrator gains by a fine film: not one that splats light, whose sensor knows its resolution,
+    nor plugins of this project that share work between the samples of a pixel."""
+    return getattr(integrator, "suits_fine_film", isinstance(integrator, mi.SamplingIntegrator))
 
 
 @contextmanager
 def fine_film(sensor, parts):
     """Within the block, a `mi.Sensor` has a film with `parts`² pixels for each of its film, and a box filter, if
-    `parts` is more than one. Samples per pixel are then those of the fine pixels."""
-    film = sensor.film()
-    if parts > 1:
-        sensor.m_film = _refined(film, parts)
-    try:
+    `parts` is more than one. Samples per pixel are then those of the fine pixels. Raises RuntimeError if another thread
+    uses the sensor."""
+    if parts == 1:
         yield
-    finally:
-        sensor.m_film = film
+        return
+    with exclusive(sensor=sensor):
+        film = sensor.film()
+        sensor.m_film = _refined(film, parts)
+        try:
+            yield
+        finally:
+            sensor.m_film = film
 
 
 def _refined(film, parts):
     """Return a film with `parts`² pixels for each of a `film`."""
-    film.prepare([])
     (width, height), (crop_width, crop_height), (x, y) = (
         [parts * int(number) for number in pair] for pair in (film.size(), film.crop_size(), film.crop_offset())
     )
-    form = str(film.bitmap().pixel_format()).rpartition(".")[2].lower()
+    # A bitmap would tell the format, too, but replace the image of the film
+    form = re.search(r"pixel_format = (\w+)", str(film)).group(1)
     return mi.load_dict({
         "type": "hdrfilm", "width": width, "height": height, "crop_width": crop_width, "crop_height": crop_height,
         "crop_offset_x": x, "crop_offset_y": y, "component_format": "float32", "rfilter": {"type": "box"},
@@ -64,7 +75,7 @@ def merged(image, parts, filter):
         return image
     first, weights = _weights(filter, parts)
     for axis in (0, 1):
-        image = _merged_along(image, axis, parts, first, weights)
+        image = np.moveaxis(_merged_rows(np.moveaxis(image, axis, 0), parts, first, weights), 0, axis)
     return image
 
 
@@ -75,21 +86,24 @@ def _weights(filter, parts):
     beyond = int(np.ceil((filter.radius() - 0.5) * parts)) + 1
     # Mean of the filter over each fine pixel
     place = (np.arange(-beyond * _POINTS, (parts + beyond) * _POINTS) + 0.5) / (_POINTS * parts) - 0.5
-    values = np.array([filter.eval(float(x))[0] if abs(x) < filter.radius() else 0.0 for x in place])
+    values = np.array(filter.eval(upload(mi.Float, place))) * (np.abs(place) < filter.radius())
     means = values.reshape(-1, _POINTS).mean(axis=1)
     # Two means over fine pixels widen the filter. To second order, this takes it back
-    return -beyond, means - np.convolve(means, (1, -2, 1), mode="same") / 12
+    weights = means - np.convolve(means, (1, -2, 1), mode="same") / 12
+    # Around bright pixels, negative weights would make dark ones negative
+    return -beyond, weights if values.min() < 0 else np.maximum(weights, 0)
 
 
-def _merged_along(image, axis, parts, first, weights):
-    """Return the weighted means of the fine pixels along an axis, for every pixel."""
-    fine = np.moveaxis(image, axis, 0)
-    count = len(fine) // parts
-    total, whole = np.zeros((count, *fine.shape[1:])), np.zeros(count)
+def _merged_rows(fine, parts, first, weights):
+    """Return the weighted means of the rows (n, ...) of fine pixels, for every row of pixels."""
+    count, last = len(fine) // parts, first + len(weights)
+    padding = [(max(-first, 0), max(last - parts, 0)), *[(0, 0)] * (fine.ndim - 1)]
+    rows = np.pad(fine, padding)
+    exists = np.pad(np.ones(len(fine)), padding[0])
+    total, whole = np.zeros((count, *fine.shape[1:]), fine.dtype), np.zeros(count)
     for number, weight in enumerate(weights):
-        row = parts * np.arange(count) + first + number
-        inside = np.flatnonzero((row >= 0) & (row < len(fine)))
-        total[inside] += weight * fine[row[inside]]
-        whole[inside] += weight
-    total /= whole.reshape(-1, *[1] * (fine.ndim - 1))
-    return np.moveaxis(total, 0, axis).astype(image.dtype)
+        if weight:
+            steps = slice(number, number + parts * count, parts)
+            total += fine.dtype.type(weight) * rows[steps]
+            whole += weight * exists[steps]
+    return total / whole.reshape(-1, *[1] * (fine.ndim - 1)).astype(fine.dtype)

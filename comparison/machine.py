@@ -12,7 +12,20 @@ ROOT = Path(__file__).resolve().parent.parent
 SOURCES = (
     "integrators/*.py",
     "vpl/**/*.py",
-    *(f"comparison/{name}.py" for name in ("worker", "rendering", "scene_files")),
+    *(
+        f"comparison/{name}.py"
+        for name in (
+            "worker",
+            "rendering",
+            "measuring",
+            "pass_sizes",
+            "sample_density",
+            "features",
+            "fine_film",
+            "denoising",
+            "scene_files",
+        )
+    ),
 )
 
 

@@ -54,9 +54,7 @@ def measure(progressive, job):
 
 def _render_in_time(progressive, budget, seeds=None):
     """Render passes in parts within a `budget` in seconds, of the sizes that `render` uses with a limit of time."""
-    sizes = PassSizes(
-        progressive.pixels, time=budget, in_parts=True, accepts=progressive.accepts, probes=progressive.differs
-    )  # fmt: skip
+    sizes = PassSizes.of(progressive, time=budget)
     while not isinstance(spp := sizes.next(progressive.passes, progressive.seconds), str):
         progressive.render(spp, next(seeds) if seeds else None, is_probe=sizes.is_probe)
 
@@ -89,7 +87,9 @@ def _compile(progressive, sizes, seeds):
     """Render warm-up passes that compile the kernels for passes of `sizes` (samples per pixel); return the seconds of
     the first. Small passes come first. Full-size passes follow if they take at most `LONG_PASS`, because integrators
     may use other kernels for more samples."""
-    small = {spp: min(spp, WARM_SPP + (spp & (spp - 1) != 0)) for spp in sizes}  # keeps "is a power of two"
+    least = progressive.parts**2  # samples of a pass of a fine film
+    # Keeps "is a power of two"
+    small = {spp: min(spp, least * (WARM_SPP + (spp & (spp - 1) != 0))) for spp in sizes}
     cold, *_ = [progressive.render(spp, next(seeds)).seconds for spp in dict.fromkeys(small.values())]
     for spp in sorted({*sizes} - {*small.values()}):
         seconds = progressive.render(small[spp], next(seeds)).seconds
@@ -122,8 +122,8 @@ def _samples_of_a_pass(progressive, budget, seeds):
     unknown start of 0 s.
     """
     largest = progressive.largest_pass
-    if largest < WARM_SPP:
-        return 1, 0.0
+    if largest < WARM_SPP * progressive.parts**2:
+        return progressive.parts**2, 0.0
     one = progressive.render(1, next(seeds))
     if one.seconds > budget / 2:
         return one.spp, 0.0

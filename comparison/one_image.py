@@ -8,7 +8,6 @@ import numpy as np
 
 from . import batch, command_line, images, machine
 from .checkpoint import Checkpoint, file_of
-from .fine_film import usual_parts
 from .interruption import Deadline
 from .occasional import OccasionalWriter
 from .progress import ImageBar
@@ -60,11 +59,6 @@ class Image:
             mi.Log(mi.LogLevel.Info, f"The integrator is {self._name}; -i scene would keep the scene's.")
         self._described = {"scene": str(options.scene), **described, "variant": options.mode, "seed": options.seed}
         self.path, self._checkpoint, self._remote = batch.output(options, sensor), None, None
-        # Passes of workers, and those that a later process adds, have a resolution that does not depend on times
-        parts = 1
-        if (pool or options.resume) and (options.denoise_quality or options.denoise):
-            sampling = scene.file.sampling(sensor)
-            parts = usual_parts(sampling.may_be_finer, sampling.pixels, options.spp)
         if pool or options.resume:
             made_by = {
                 "value of denoised": scene.file.integrator[1].get("denoised", False),
@@ -73,13 +67,11 @@ class Image:
                 "seed": options.seed,
                 **machine.versions(),
             }
-            self._checkpoint = Checkpoint(file_of(self.path), made_by, options.resume, parts)
+            self._checkpoint = Checkpoint(file_of(self.path), made_by, options.resume)
         if pool:
             from .cluster.render import DistributedRender
 
-            self._remote = DistributedRender(
-                pool, scene, sensor, checkpoint=self._checkpoint, parts=parts, **self._limits()
-            )
+            self._remote = DistributedRender(pool, scene, sensor, checkpoint=self._checkpoint, **self._limits())
 
     @property
     def fills_pool(self):

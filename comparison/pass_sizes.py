@@ -71,6 +71,14 @@ class PassSizes:
         self._dearer = 1.0  # expected cost of a sample of the next pass over that of known passes
         self._before = None  # number of passes from a checkpoint; None until the first call
 
+    @classmethod
+    def of(cls, progressive, spp=None, time=None, fixed=None, many=False):
+        """Sizes of the passes of a `rendering.Progressive`."""
+        return cls(
+            progressive.pixels, spp, time, fixed, many, progressive.in_parts, progressive.accepts, progressive.differs,
+            progressive.probe_multiple, progressive.parts**2,
+        )  # fmt: skip
+
     def next(self, passes, elapsed):
         """Return the samples per pixel of the pass after `passes` (list of `Pass`) and `elapsed` seconds, or the limit
         that ends the render: "spp" or "time"."""

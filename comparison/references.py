@@ -130,7 +130,7 @@ def path_traced(scene_file, spp, cache):
     file.parent.mkdir(parents=True, exist_ok=True)
     with locked(file.with_suffix(".lock")):
         images.remove_abandoned(file.parent, file.stem)
-        batches = _read_batches(file, scene_file.sampling(0).pixels)
+        batches = _read_batches(file, scene_file.sampling(0)[0])
         if batches.spp < spp or batches.count < 2:
             described = {"integrator": "path", "scene": scene_file.name, "seed": SEED, **parameters}
             described["mitsuba"] = mi.__version__

@@ -22,6 +22,7 @@ from .counters import TotalStatistics
 from .denoising import Denoiser, for_denoising, quality_of
 from .ending import Ending
 from .features import Layers, channels_of, features_of
+from .fine_film import usual_parts
 from .interruption import Interruption
 from .pass_sizes import PassSizes
 from .rendering import Progressive
@@ -125,18 +126,15 @@ def render(
     if error is None and time is None and spp is None:
         spp = scene.sensors()[sensor].sampler().sample_count()
     begin = clock.perf_counter()
-    # The passes of a checkpoint have the resolution that does not depend on times
-    parts = checkpoint.parts if checkpoint else None
+    # Passes of a checkpoint have the usual resolution, as the choice depends on times
+    parts = 1 if checkpoint or not denoise else usual_parts(scene.sensors()[sensor], integrator, spp)
     denoiser = Denoiser(scene, sensor, seed, spp, time, quality, parts) if denoise else None
     planes = layers_of(layers, scene, sensor, denoiser, seed=seed, spp=spp, time_limit=time)
     # The error is that of the raw image, which equal numbers of samples suit best
     chooses = denoiser.denoise if denoiser and not error else None
     progressive = Progressive(scene, seed, sensor, integrator, chooses, denoiser.parts if denoiser else 1)
     reserved = denoiser.expected_seconds if denoiser else 0.0
-    sizes = PassSizes(
-        progressive.pixels, spp, time and time - reserved, pass_spp, error is not None, progressive.in_parts,
-        progressive.accepts, progressive.differs, progressive.probe_multiple, progressive.parts**2,
-    )  # fmt: skip
+    sizes = PassSizes.of(progressive, spp, time and time - reserved, pass_spp, error is not None)
     ending = Ending(spp, time and time - reserved, error, reserved)
     if checkpoint:
         begin -= checkpoint.restore(progressive)

@@ -192,7 +192,8 @@ class Passes:
         planes, one = image.planes.astype(np.float64), image.taken
         self.channels = image.channels
         self.sum = self.sum + one.weight * planes
-        self.estimate.add(_shown(self.merged(planes), self.channels), one.weight)
+        level = _shown(planes, self.channels).mean(axis=-1, keepdims=True)
+        self.estimate.add(self.merged(level), one.weight)
         self.passes.append(one)
         return one
 
@@ -259,7 +260,9 @@ class Progressive(Passes):
         first = (self.passes[0].spp, self.passes[0].seed) if self.passes else None
         sensor = self._scene.sensors()[self._sensor]
         density = self.density.of_pass(self.integrator, sensor, spp)
-        half = is_probe and spp % self.probe_multiple == 0 and self.density.suits(self.integrator, sensor)
+        # Halves need fewer multiples than different numbers
+        whole = -(-spp // self._own_multiple) * self._own_multiple
+        half = is_probe and spp % self.probe_multiple == 0 and self.density.suits(self.integrator, sensor, whole)
         image = render_pass(
             self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density, half, self.parts
         )  # fmt: skip
@@ -275,11 +278,15 @@ class Progressive(Passes):
         samples of pixels of the film."""
         return max(MULTIPLE, 2 * self.parts**2)
 
+    @property
+    def _own_multiple(self):
+        """The samples per pixel of which passes have multiples whose pixels have different numbers."""
+        return MULTIPLE * self.parts**2
+
     def accepts(self, spp):
         """Return whether the sampler keeps a number of samples per pixel, which some samplers round up, and whether
         pixels may have the different numbers of samples that the render has determined."""
-        cells = self.parts**2
-        multiple = MULTIPLE * cells
+        cells, multiple = self.parts**2, self._own_multiple
         with _sample_count(self._scene.sensors()[self._sensor].sampler(), -(-spp // cells)) as rounded:
             is_multiple = spp % multiple == 0 or spp < multiple or self.density.relative is None
             return cells * rounded == spp and is_multiple
@@ -293,7 +300,7 @@ class Progressive(Passes):
     def differs(self):
         """Whether pixels may have different numbers of samples after the second pass."""
         suits = self.density.suits(self.integrator, self._scene.sensors()[self._sensor])
-        return suits and self.largest_pass >= max(LEAST_SAMPLES, MULTIPLE * self.parts**2)
+        return suits and self.largest_pass >= max(LEAST_SAMPLES, self._own_multiple)
 
     @property
     def decisions(self):

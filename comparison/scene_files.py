@@ -7,7 +7,6 @@ created; a scene may therefore name an integrator that does not exist here, if i
 import hashlib
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -29,14 +28,6 @@ def short_name(path):
     """Return the short name of a scene file: its stem, or the name of its folder for `scene.xml`."""
     path = Path(path)
     return path.resolve().parent.name if path.stem == "scene" else path.stem
-
-
-class Sampling(NamedTuple):
-    """Samples of a sensor: number of `pixels`, `sampler` (`mi.Sampler`), and the result of `fine_film.may_be_finer`."""
-
-    pixels: int
-    sampler: Any
-    may_be_finer: bool
 
 
 class SceneFile:
@@ -161,13 +152,12 @@ class SceneFile:
                 yield file
 
     def sampling(self, sensor):
-        """Return the `Sampling` of a sensor (by index) without creating the scene. Raises ValueError for an invalid
-        index."""
+        """Return the number of pixels and the `mi.Sampler` of a sensor (by index) without creating the scene. Raises
+        ValueError for an invalid index."""
         sensors = self._nodes(mi.ObjectType.Sensor)
         if not 0 <= sensor < len(sensors):
             raise ValueError(f"no sensor {sensor}: the scene has {len(sensors)}")
-        own = mi.Properties(sensors[sensor].props)
-        values = [value for _, value in own.items()]
+        values = [value for _, value in mi.Properties(sensors[sensor].props).items()]
         parts = [self._state.nodes[one.index()] for one in values if isinstance(one, mi.Properties.ResolvedReference)]
         film, sampler = (
             mi.Properties(next((part.props for part in parts if part.type == kind), mi.Properties(default)))
@@ -175,9 +165,7 @@ class SceneFile:
         )
         width, height = film.get("width", 768), film.get("height", 576)
         pixels = film.get("crop_width", width) * film.get("crop_height", height)
-        is_usual = film.plugin_name() == "hdrfilm" and not film.get("sample_border", False)
-        sampler = mi.PluginManager.instance().create_object(sampler)
-        return Sampling(pixels, sampler, is_usual and own.plugin_name() != "batch")
+        return pixels, mi.PluginManager.instance().create_object(sampler)
 
     def load(self, threads=None):
         """Create the `mi.Scene`, once, because this consumes the parsed nodes. `threads`: limit for later work."""

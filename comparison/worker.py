@@ -24,6 +24,7 @@ from . import images, machine
 from .command_line import failure, set_variant, versions
 from .counters import total_statistics
 from .denoising import Denoiser
+from .fine_film import usual_parts
 from .measuring import measure
 from .rendering import Progressive
 from .scene_files import SceneFile
@@ -136,7 +137,8 @@ def render(job):
     parameters, scene = file.integrator[1], file.load(job.threads)
     load_seconds = time.perf_counter() - begin
 
-    denoiser = _denoiser(scene, job) if job.denoised_output else None
+    usual = usual_parts(scene.sensors()[0], scene.integrator(), job.spp)
+    denoiser = _denoiser(scene, job, usual) if job.denoised_output else None
     # Pixels may have different numbers of samples, which the denoiser decides, if the render ends by time
     decides = denoiser and job.budget and hasattr(scene.integrator(), "may_differ")
     parts = denoiser.parts if denoiser else 1
@@ -167,11 +169,11 @@ def render(job):
     described |= {"integrator": job.integrator, "scene": job.scene, "seed": job.seed, **versions()}
     images.write_exr(job.output, progressive.image, progressive.channels, described | {"run": job.run or ""})
     result |= _denoise(job, scene, progressive, denoiser, described)
-    return result | {"vpl_output": _render_vpl(job, passes, described) if job.vpl_folder else None}
+    return result | {"vpl_output": _render_vpl(job, progressive, described) if job.vpl_folder else None}
 
 
-def _denoiser(scene, job, parts=None):
-    """Return the `Denoiser` for the image of a job; `parts`: of its film, if known."""
+def _denoiser(scene, job, parts):
+    """Return the `Denoiser` for the image of a job; `parts`: see there."""
     return Denoiser(scene, seed=job.seed, spp=None if job.budget else job.spp, time_limit=job.budget, parts=parts)
 
 
@@ -200,17 +202,18 @@ def _parse(job):
     return file
 
 
-def _render_vpl(job, passes, described):
-    """Render the passes of another integrator by `vpl`, with equal seeds and parameters and so equal lights and camera
-    rays: the image that the integrator approximates. Return its file. An existing file of the same passes and
-    parameters is reused."""
+def _render_vpl(job, rendered, described):
+    """Render the passes of another integrator, those of the `Progressive` `rendered`, by `vpl`, with equal seeds and
+    parameters and so equal lights and camera rays: the image that the integrator approximates. Return its file. An
+    existing file of the same passes and parameters is reused."""
     file = _parse(job)
     file.set_integrator("vpl", {"aovs": ""}, keep=None)  # AOVs are not needed, and `vpl` may not know them
-    shared = [file.fingerprint(), machine.versions(), [(one.spp, one.seed) for one in passes]]
+    passes, parts = rendered.passes, rendered.parts
+    shared = [file.fingerprint(), machine.versions(), parts, [(one.spp, one.seed) for one in passes]]
     key = hashlib.sha256(json.dumps(shared).encode()).hexdigest()[:16]
     output = Path(job.vpl_folder) / f"{file.name}.vpl.{key}.exr"
     if not output.is_file():
-        parameters, progressive = file.integrator[1], Progressive(file.load(job.threads), job.seed)
+        parameters, progressive = file.integrator[1], Progressive(file.load(job.threads), job.seed, parts=parts)
         for one in passes:
             progressive.render(one.spp, one.seed)
         described |= {"integrator": "vpl", "parameters": parameters, "seconds": progressive.seconds}

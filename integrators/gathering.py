@@ -196,6 +196,10 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         sky = emitters.environment is not None and not self.hide_emitters
         return CameraPass(seed, emitters, traits, paths, paths.valid | (active & sky), clock)
 
+    # Whether images that will be denoised may have a film that is finer than the image. Most methods share work between
+    # the samples of a pixel
+    suits_fine_film = False
+
     def pixel_grid(self, scene, sampler) -> PixelGrid:
         """Layout of the camera rays of this pass in the image.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vpl.core.arrays import NO_LIMIT
 from vpl.core.exclusive import exclusive
 
 from .camera_samples import has_free_order, may_differ
@@ -34,6 +35,11 @@ class PassRenderer(GatheringIntegrator):
 
     _pass = RenderPass()
 
+    @property
+    def suits_fine_film(self) -> bool:
+        """Whether passes may have a finer film: not passes that Mitsuba divides, which have its order of samples."""
+        return self.samples_per_pass == NO_LIMIT
+
     @contextmanager
     def pass_of(self, shared, is_first: bool, density=None, half: bool = False, parts: int = 1):
         """Within the block, a render is a pass of a longer render and uses the start that its passes share.
@@ -41,10 +47,10 @@ class PassRenderer(GatheringIntegrator):
         ``shared``: object with an attribute ``start``, None until the first pass is rendered.  The start depends on the
         first pass alone: where it is missing and this is not the first pass, yields True, and the caller has to render
         the first pass within :meth:`only_start`.  ``parts``: the film has ``parts``² pixels for each pixel of the
-        image.  ``density`` (height, width): samples of each pixel of the image
-        over their mean, about; None for equal numbers.  ``half``: whether the image has the mean of every second sample
-        as channels of the layer :data:`vpl.split.film_cells.HALF`, with an even number of samples for each pixel of the
-        film.  Both need :meth:`may_differ`, and exclude each other.
+        image, the same in all passes.  ``density`` (height, width): samples of each pixel of the image over their mean,
+        about; None for equal numbers.  ``half``: whether the image has the mean of every second sample as channels of
+        the layer :data:`vpl.split.film_cells.HALF`, with an even number of samples for each pixel of the film.  Both
+        need :meth:`may_differ`, and exclude each other.
         """
         if half and density is not None:
             raise ValueError("half must be False where pixels have different numbers of samples, by a density")
@@ -72,8 +78,11 @@ class PassRenderer(GatheringIntegrator):
         in_one = spp <= self.samples_per_pass * parts**2
         return self.denoised and self.stratified and in_one and may_differ(sensor, spp, parts)
 
-    def parts_of(self, sensor, spp: int) -> int:
-        """The ``parts`` of a pass by a ``sensor``, with ``spp`` samples for each pixel of its film: 1 if pixels of the
-        film count as pixels of the image."""
-        in_one = (spp or sensor.sampler().sample_count()) <= self.samples_per_pass
-        return self._pass.parts if in_one and has_free_order(sensor) else 1
+    def parts_of(self, sensor) -> int:
+        """The ``parts`` of a pass by a ``sensor`` with its film: 1 if pixels of the film count as pixels of the image.
+
+        Raises ValueError for a finer film with ``samples_per_pass``.
+        """
+        if self._pass.parts > 1 and not self.suits_fine_film:
+            raise ValueError(f"parts must be 1 with samples_per_pass, got {self._pass.parts}")
+        return self._pass.parts if has_free_order(sensor) else 1

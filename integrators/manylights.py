@@ -245,7 +245,7 @@ class ManyLightsIntegrator(PassRenderer):
     def _render(self, scene, sensor, seed, spp, develop, evaluate):
         if self._layer_names:
             _require_unit_weight(sensor)
-        density, parts = self._pass.density, self.parts_of(sensor, spp)
+        density, parts = self._pass.density, self.parts_of(sensor)
         with stratified(sensor, spp, density, parts) if self.stratified else nullcontext(sensor) as chosen:
             return super()._render(scene, chosen, seed, spp, develop, evaluate)
 

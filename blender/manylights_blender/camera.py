@@ -18,8 +18,8 @@ def image_size(render):
 def sensor(camera, render, problems):
     """Return the dictionary of the sensor for an evaluated camera object and render settings.
 
-    The film has RGBA pixels and a box filter: the filter of Cycles is hardly wider, and the denoiser needs a box.
-    Raises ValueError for a panoramic camera.
+    The film has RGBA pixels and a box filter: the filter of Cycles is hardly wider, and noise of a box is easier to
+    remove. Raises ValueError for a panoramic camera.
     """
     data = camera.data
     if data.type not in ("PERSP", "ORTHO"):

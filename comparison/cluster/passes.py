@@ -32,18 +32,17 @@ class DistributedPasses(Passes):
     """Running average of passes on the workers of a `Pool`, with the interface of `rendering.Progressive`.
 
     `bundle`: the scene (`SceneBundle`); `pixels`, `sampler` (`mi.Sampler`): of the sensor of index `sensor`;
-    `pass_spp`: samples per pixel of all passes except the last; `spp`: of the image, or None; `parts`: of the film, see
-    fine_film.py. `deadline`: time of
+    `pass_spp`: samples per pixel of all passes except the last; `spp`: of the image, or None. `deadline`: time of
     `perf_counter` that ends the wait for passes, except for the first one. `workers`: number of passes by address of a
     worker.
     """
 
-    def __init__(self, pool, bundle, seed, sensor, pixels, sampler, pass_spp, spp=None, parts=1):
-        super().__init__(seed, parts)
+    def __init__(self, pool, bundle, seed, sensor, pixels, sampler, pass_spp, spp=None):
+        super().__init__(seed)
         self.pixels, self.workers, self.deadline = pixels, Counter(), math.inf
         self._pool, self._bundle, self._sensor = pool, bundle, sensor
-        sampler.set_sample_count(-(-pass_spp // parts**2))
-        self._pass_spp, self._rounded, self._spp = pass_spp, sampler.sample_count() * parts**2, spp
+        sampler.set_sample_count(pass_spp)
+        self._pass_spp, self._rounded, self._spp = pass_spp, sampler.sample_count(), spp
         self._finished, self._failure, self._seconds, self._late = {}, None, 0.0, False
 
     def start(self):
@@ -92,7 +91,7 @@ class DistributedPasses(Passes):
         if self is not sources[0] and sum(one.waiting_bytes for one in sources) >= WAITING_BYTES:
             return None  # earlier images wait for a pass
         first = (self.passes[0].spp, self.passes[0].seed) if self.passes else (self._size(0), pass_seed(self.seed, 0))
-        arguments = (self._bundle, self._sensor, size, pass_seed(self.seed, self._next), first, self.parts)
+        arguments = (self._bundle, self._sensor, size, pass_seed(self.seed, self._next), first)
         task = Task(self, self._next, worker.render_pass, arguments)
         self._next += 1
         return task
@@ -105,7 +104,7 @@ class DistributedPasses(Passes):
     @property
     def _pass_bytes(self):
         """Memory of the image of a pass; before the first pass is added, with three channels."""
-        return 4 * self.pixels * self.parts**2 * (len(self.channels) or 3)
+        return 4 * self.pixels * (len(self.channels) or 3)
 
     def done(self, index, image, address):
         """Take a finished pass."""

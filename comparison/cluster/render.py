@@ -16,23 +16,22 @@ class DistributedRender:
     """Image whose passes idle workers begin while earlier images finish.
 
     `scene`: a `LazyScene`. The other parameters are those of `comparison.render.render`, but passes have a fixed size:
-    `pass_spp`, or the result of `samples_of_a_pass`. `parts`: of the film of the passes, see fine_film.py. Raises
-    ValueError for a sensor that does not exist, and for a checkpoint of another render.
+    `pass_spp`, or the result of `samples_of_a_pass`. Raises ValueError for a sensor that does not exist, and for a
+    checkpoint of another render.
     """
 
     def __init__(
         self, pool, scene, sensor=0, *, error=None, time=None, spp=None, seed=0, pass_spp=None, checkpoint=None,
-        parts=1,
     ):  # fmt: skip
         check(error=error, time=time, spp=spp, pass_spp=pass_spp)
-        pixels, sampler, _ = scene.file.sampling(sensor)
+        pixels, sampler = scene.file.sampling(sensor)
         if error is None and time is None and spp is None:
             spp = sampler.sample_count()
         self.spp, self._error, self._time, self._checkpoint = spp, error, time, checkpoint
         self._scene, self._sensor, self._seed, self._pool = scene, sensor, seed, pool
-        self._pass_spp = pass_spp or max(samples_of_a_pass(pixels, spp), parts**2)
+        self._pass_spp = pass_spp or samples_of_a_pass(pixels, spp)
         travelling = bundle(scene.file)
-        self.passes = DistributedPasses(pool, travelling, seed, sensor, pixels, sampler, self._pass_spp, spp, parts)
+        self.passes = DistributedPasses(pool, travelling, seed, sensor, pixels, sampler, self._pass_spp, spp)
         self._seconds = checkpoint.restore(self.passes) if checkpoint else 0.0
         self.passes.start()
 
@@ -56,17 +55,13 @@ class DistributedRender:
             if layers:
                 check_layers(layers, self._scene.integrator)
             limits = {"seed": self._seed, "spp": self.spp, "time_limit": self._time}
-            denoiser, parts = None, self.passes.parts
-            if scene:
-                self.passes.filter = scene.sensors()[self._sensor].film().rfilter()
-            if denoise:
-                denoiser = Denoiser(scene, self._sensor, **limits, quality=quality_of(denoise), parts=parts)
+            denoiser = Denoiser(scene, self._sensor, **limits, quality=quality_of(denoise)) if denoise else None
             planes = layers_of(layers, scene, self._sensor, denoiser, **limits)
             reserved = denoiser.expected_seconds if denoiser else 0.0
             ending = Ending(self.spp, self._time and self._time - reserved, self._error, reserved)
             if self._time:
                 self.passes.deadline = begin + self._time - reserved
-            sizes = PassSizes(self.passes.pixels, self.spp, fixed=self._pass_spp, least=parts**2)
+            sizes = PassSizes(self.passes.pixels, self.spp, fixed=self._pass_spp)
             return render_passes(self.passes, sizes, ending, begin, progress, denoiser, self._checkpoint, planes)
         finally:
             self.close()

@@ -43,19 +43,18 @@ def add_file(hash, content, dask_worker):
     Store(dask_worker.local_directory).add(hash, content)
 
 
-def render_pass(bundle, sensor, spp, seed, first, parts):
+def render_pass(bundle, sensor, spp, seed, first):
     """Render a pass of the scene of a `SceneBundle`; return a `PassImage`.
 
-    `first`, `parts`: see `rendering.render_pass`. Raises FilesMissing for missing files, Interrupted for an unfinished
-    pass, and RenderError for other errors.
+    `first`: see `rendering.render_pass`. Raises FilesMissing for missing files, Interrupted for an unfinished pass, and
+    RenderError for other errors.
     """
     with _LOCK:
         path = Store(get_worker().local_directory).place(bundle)
         try:
             scene, starts = _scene(bundle, path)
-            shared = starts.setdefault((sensor, first, parts), rendering.SharedStart())
-            one = scene.integrator()
-            image = rendering.render_pass(scene, sensor, one, spp, seed, first, shared, parts=parts)
+            shared = starts.setdefault((sensor, first), rendering.SharedStart())
+            image = rendering.render_pass(scene, sensor, scene.integrator(), spp, seed, first, shared)
         except Exception as error:
             # Exceptions of Mitsuba and Dr.Jit may be impossible to unpickle on the client
             raise RenderError(explain(error)) from None

@@ -13,6 +13,7 @@ import compare
 import manylights
 from comparison import images
 from comparison.denoising import Denoiser
+from comparison.pass_sizes import PassSizes
 from tests.support.comparisons import results_of
 from tests.support.marks import stress
 from tests.support.paths import CORNELL
@@ -79,14 +80,13 @@ def test_a_quality_chooses_the_network():
 
 def test_time_includes_denoising(monkeypatch):
     """What the filter will take is reserved."""
-    told = []
-    original = manylights.render.__globals__["PassSizes"]
+    told, original = [], PassSizes.of
 
-    def sizes(pixels, spp, time, *more, **keywords):
+    def sizes(progressive, spp, time, *more):
         told.append(time)
-        return original(pixels, spp, time, *more, **keywords)
+        return original(progressive, spp, time, *more)
 
-    monkeypatch.setitem(manylights.render.__globals__, "PassSizes", sizes)
+    monkeypatch.setattr(PassSizes, "of", sizes)
     manylights.render(cornell().load(), time=1, denoise=True)
     assert 0 < told[0] < 1
 
@@ -236,15 +236,18 @@ def test_the_network_suits_the_time(share, chosen, monkeypatch):
 )
 def test_the_resolution_suits_the_time(share, parts, chosen, monkeypatch):
     made_up_networks(monkeypatch, share)
-    found = Denoiser(cornell(40).load(), time_limit=1000)
+    found = Denoiser(cornell(40).load(), time_limit=1000, parts=2)
     assert (found.parts, found.quality) == (parts, chosen)
     assert found.description["denoise_resolution"] == parts
+    # A network that is asked for is the one that has to be quick
+    asked = Denoiser(cornell(40).load(), time_limit=1000, quality="high", parts=2)
+    assert asked.parts == (2 if share <= 0.05 else 1) and asked.quality == "high"
 
 
 @pytest.mark.parametrize(("spp", "chosen"), [(4, "fast"), (16, "balanced"), (64, "high"), (None, "high")])
 def test_the_network_at_twice_the_resolution_suits_the_samples(spp, chosen):
-    assert Denoiser(cornell(16).load(), spp=spp).quality == chosen
-    assert Denoiser(cornell(16).load(), spp=spp, quality="high").quality == "high"
+    assert Denoiser(cornell(16).load(), spp=spp, parts=2).quality == chosen
+    assert Denoiser(cornell(16).load(), spp=spp, quality="high", parts=2).quality == "high"
 
 
 def test_the_smallest_image_in_the_shortest_time():

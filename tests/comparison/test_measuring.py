@@ -1,8 +1,10 @@
 """Passes of an image for a time budget or a number of samples, and the measured passes among them."""
 
+import mitsuba as mi
 import pytest
 
 from comparison import measuring, rendering, worker
+from tests.support.scenes import cornell
 from vpl.core.stages import Stage
 
 
@@ -46,6 +48,14 @@ class InParts(Recorded):
         statistics = {"seconds": stages, "pilots": int(pilot > 0)}
         self.passes.append(rendering.Pass(seed or 0, spp, pilot + 0.1 + 0.01 * spp, statistics))
         return self.passes[-1]
+
+
+def test_passes_of_images_for_denoising_include_one_that_determines_numbers():
+    scene, plugin = cornell().load(), mi.load_dict({"type": "manylights", "denoised": True})
+    for parts in (1, 2):
+        progressive = rendering.Progressive(scene, 0, 0, plugin, lambda image, *_: image, parts)
+        measuring.measure(progressive, worker.Job("p", "manylights", "s.xml", "a.exr", budget=0.5))
+        assert progressive.density.relative is not None
 
 
 def test_passes_in_parts_are_those_of_a_render_by_time_and_include_a_pilot():

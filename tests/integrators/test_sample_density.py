@@ -301,12 +301,17 @@ def test_halves_of_a_fine_film_have_the_mean_of_the_image(lights):
     assert_same_mean_of_pixels(pair)
 
 
-@pytest.mark.parametrize("more", [{"stratified": False}, {"samples_per_pass": 2}], ids=str)
-def test_a_fine_film_counts_as_an_image_where_samples_have_the_order_of_the_film(more):
-    scene, integrator = room(), plugin(**more)
+def test_a_fine_film_counts_as_an_image_where_samples_are_not_stratified():
+    scene, integrator = room(), plugin(stratified=False)
     assert_same_mean_of_pixels(
         lambda seed: (render(scene, integrator, None, seed, parts=2), render(scene, integrator, None, 1000 + seed))
     )
+
+
+def test_a_fine_film_is_refused_where_mitsuba_divides_a_pass():
+    with pytest.raises(RuntimeError) as raised:
+        render(room(), plugin(samples_per_pass=4), None, 0, 64, parts=2)
+    assert "parts must be 1 with samples_per_pass, got 2" in f"{raised.value} {raised.value.__cause__}"
 
 
 # ---------------------- Where numbers may differ ----------------------

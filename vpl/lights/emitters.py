@@ -110,7 +110,7 @@ class Emitters:
 
     ``points``, ``spots``, ``directional``: virtual lights; ``area``: rows; ``environment``: the environment emitter or
     None; ``others``: (class name, emitter) of the remaining emitters, sampled by Mitsuba's routines; ``dropped``:
-    number of emitters dropped because of negative or non-finite values.
+    number of emitters dropped because of values that are negative, not finite, or too large.
     """
 
     points: VirtualLights
@@ -197,6 +197,7 @@ def _read_areas(scene, group_of: Callable) -> tuple[AreaEmitters, int, list]:
     area, shapes = _surface_areas(scene, shape_index, [by_index[index] for index in indices])
     # The square of an area overflows before the extent of a scene does
     bad = ~(usable(radiance).all(1) & usable(area))
+    textured = [(row, emitter) for row, emitter in textured if usable(area[row])]
     radiance[bad], area[bad] = 0, 0
     rows = SphereRows(spheres) if any(spheres) else None
     group = np.array(groups, np.uint32)
@@ -280,8 +281,8 @@ def read_emitters(scene, group_of: Callable[[mi.Emitter], int] = lambda _: 0) ->
 
     ``group_of``: number of the group of an emitter, by default 0.
 
-    Emitters with negative or non-finite values are dropped, counted and logged.  Raises ValueError for environment maps
-    with invalid texels and for emitters on shapes that Mitsuba cannot sample.
+    Emitters with a radiance or area that is negative, not finite, or too large are dropped, counted and logged.  Raises
+    ValueError for environment maps with invalid texels and for emitters on shapes that Mitsuba cannot sample.
     """
     points, spots, suns, others = [], [], [], []
     environment, dropped = _read_environment(scene)
@@ -314,7 +315,10 @@ def read_emitters(scene, group_of: Callable[[mi.Emitter], int] = lambda _: 0) ->
         dropped += bad
         kept.append(lights)
     if dropped:
-        mi.Log(mi.LogLevel.Warn, f"Dropped {dropped} emitter(s) with negative or non-finite values.")
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"Dropped {dropped} emitter(s) with values that are negative, not finite, or above {LARGEST_VALUE:.0e}.",
+        )
     others += [row for row in others_on_shapes if not _lights_nothing(row[1])]
     others.sort(key=lambda row: (row[0], row[1].id(), str(row[1])))
     return Emitters(*kept, area, environment, others, dropped)

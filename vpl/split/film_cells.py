@@ -54,7 +54,7 @@ class FilmCells:
     def places(self, lane: mi.UInt32) -> RayNumbers:
         """Places of the rays ``lane`` (UInt32) in cells: ``pixel`` is the cell.
 
-        Successive rays of a pixel belong to different cells, and those of a pair to neighbours of every kind.
+        Successive rays of a pixel belong to different cells: the two rays of a pair differ as the parts of a pixel do.
         """
         places = self.rays.places(lane)
         if self.parts == 1:

@@ -125,7 +125,7 @@ def test_images_that_wait_for_another_one_have_bounded_memory(monkeypatch):
     """However long the first image waits for its last pass, workers begin with few of the others."""
     workers = SimpleNamespace(sources=[], workers={"one": [], "two": []})
     file = SceneFile(CORNELL, TINY)
-    pixels, sampler, _ = file.sampling(0)
+    pixels, sampler = file.sampling(0)
     monkeypatch.setattr(passes, "WAITING_BYTES", 10 * 12 * pixels)
     waiting = [passes.DistributedPasses(workers, None, 0, 0, pixels, sampler, 4, spp=16) for _ in range(8)]
     for one in waiting:
