@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import add_at
+from ..core.sampling import HASH_ROUNDS
 from .pixel_rays import PixelRays, RayNumbers
 
 # Name of the channels of an image with the mean of every second ray of a cell
@@ -54,13 +55,14 @@ class FilmCells:
     def places(self, lane: mi.UInt32) -> RayNumbers:
         """Places of the rays ``lane`` (UInt32) in cells: ``pixel`` is the cell.
 
-        Successive rays of a pixel belong to different cells: the two rays of a pair differ as the parts of a pixel do.
+        Successive rays of a pixel belong to different cells, in an order that is random for each pixel and each round.
+        With a regular order, virtual lights of few samples are gathered in a regular pattern, which a denoiser keeps.
         """
         places = self.rays.places(lane)
         if self.parts == 1:
             return places
         parts, cells = (dr.opaque(mi.UInt32, number) for number in (self.parts, self.parts**2))
-        part = (places.number + places.pixel) % cells
+        part = (places.number + _turn(places.pixel, places.number // cells)) % cells
         width = dr.opaque(mi.UInt32, self.width)
         row = places.pixel // width * parts + part // parts
         column = places.pixel % width * parts + part % parts
@@ -115,7 +117,7 @@ class FilmCells:
         row, column = self._even_places.pixel // (width * parts), self._even_places.pixel % (width * parts)
         pixel = row // parts * width + column // parts
         part = row % parts * parts + column % parts
-        first = (part + cells - pixel % cells) % cells
+        first = (part + cells - _turn(pixel, self._even_places.number) % cells) % cells
         ray = pixel * dr.opaque(mi.UInt32, self.rays.mean) + self._even_places.number * cells + first
         dr.eval(ray)
         return ray
@@ -127,3 +129,8 @@ class FilmCells:
         add_at(numbers, dr.opaque(mi.Float, 1, self.rays.count), self._places.pixel)
         dr.eval(numbers)
         return numbers
+
+
+def _turn(pixel: mi.UInt32, turn: mi.UInt32) -> mi.UInt32:
+    """Random numbers by which the order of a pixel's cells is rotated, for every round of its rays over the cells."""
+    return mi.sample_tea_32(pixel, turn, HASH_ROUNDS)[0] >> 8

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy import stats
 
 from vpl.core.arrays import upload
 from vpl.split.film_cells import FilmCells
@@ -92,3 +93,17 @@ def test_even_masks_have_the_fractions_of_cells(layout):
     assert np.abs(even - fraction).max() < 1 / cells.mean
     # Without rounding where the fraction is a multiple of 1 / mean
     assert (even == fraction)[cells.mean % number == 0].all()
+
+
+def test_the_order_of_cells_is_random_for_every_pixel_and_round():
+    """A regular order would light a pattern of cells where few rays of a pixel are lit."""
+    cells = FilmCells(PixelRays.uniform(4096, 8), 2, 64)
+    row, column = np.divmod(places(cells)[0], 128)
+    part = (row % 2 * 2 + column % 2).reshape(4096, 8)
+    for number in range(8):
+        for pixels in (slice(None), slice(0, None, 2), slice(0, None, 4)):
+            counts = np.bincount(part[pixels, number], minlength=4)
+            assert stats.chisquare(counts).pvalue > 1e-4
+    # Of one round and the next, and of a pixel and the next
+    for one, other in ((part[:, 0], part[:, 4]), (part[1:, 0], part[:-1, 0])):
+        assert stats.chisquare(np.bincount((one - other) % 4, minlength=4)).pvalue > 1e-4
