@@ -82,7 +82,7 @@ class Denoiser:
         self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
         one = scene.sensors()[sensor]
         self._filter, self._size = one.film().rfilter(), np.array(one.film().crop_size(), np.int64)
-        self.parts = parts
+        self.parts, self._known = parts, {}  # (parts, quality) -> expected seconds
         if parts > 1 and time_limit is not None:
             # The time of a network is that of its tiles at the resolution of `parts`
             is_quick = self._expected(quality or QUALITIES[-1]) <= FINE_SHARE * time_limit
@@ -105,30 +105,25 @@ class Denoiser:
         """Denoise the colour of an image (height, width, channels) in the resolution of its sensor's film. Keeps its
         other channels, and treats non-finite pixels as black. `quality`: one of `QUALITIES`, by default that of the
         denoiser."""
-        return self._denoised(image, channels, quality, self._merged_guides)
+        return self._denoised(image, channels, quality, self.merged_features)
 
     def denoise_fine(self, image, channels):
         """Denoise the colour of an image in the resolution of the fine film, as `denoise`; return the image in the
         resolution of the sensor's film."""
-        guides = {name: self.features[name] for name in GUIDES}
-        return merged(self._denoised(image, channels, None, guides), self.parts, self._filter)
+        return merged(self._denoised(image, channels, None, self.features), self.parts, self._filter)
 
     @cached_property
     def merged_features(self):
         """Features in the resolution of the sensor's film, a dict as of `auxiliary_features`."""
         return {name: merged(plane, self.parts, self._filter) for name, plane in self.features.items()}
 
-    @property
-    def _merged_guides(self):
-        return {name: self.merged_features[name] for name in GUIDES}
-
-    def _denoised(self, image, channels, quality, guides):
+    def _denoised(self, image, channels, quality, features):
         begin = time.perf_counter()
         names = ("R", "G", "B") if "R" in channels else ("Y",)
         planes = np.array(image, np.float32)
         rgb = np.nan_to_num(colour(planes, channels), nan=0.0, posinf=0.0, neginf=0.0)
         network = self._networks[quality or self.quality]
-        filtered = self._filtered({"color": rgb, **guides}, network)
+        filtered = self._filtered({"color": rgb, **{name: features[name] for name in GUIDES}}, network)
         where = [list(channels).index(name) for name in names]
         planes[..., where] = filtered if len(where) == 3 else filtered.mean(axis=-1, keepdims=True)
         self.seconds += time.perf_counter() - begin
@@ -154,6 +149,12 @@ class Denoiser:
         self.expected_seconds = seconds[self.quality]
 
     def _expected(self, quality):
+        """Return the seconds that denoising an image is expected to take."""
+        if (self.parts, quality) not in self._known:
+            self._known[self.parts, quality] = self._expected_by_tiles(quality)
+        return self._known[self.parts, quality]
+
+    def _expected_by_tiles(self, quality):
         """Return the seconds that denoising an image is expected to take, by the time of a tile of it."""
         columns, rows = self.parts * self._size
 

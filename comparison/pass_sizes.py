@@ -76,7 +76,7 @@ class PassSizes:
         """Sizes of the passes of a `rendering.Progressive`."""
         return cls(
             progressive.pixels, spp, time, fixed, many, progressive.in_parts, progressive.accepts, progressive.differs,
-            progressive.probe_multiple, progressive.parts**2,
+            progressive.density.probe_multiple, progressive.parts**2,
         )  # fmt: skip
 
     def next(self, passes, elapsed):

@@ -12,7 +12,6 @@ from vpl.core.compilation import compilation_measured
 from vpl.core.garbage import garbage_kept
 from vpl.core.stages import Stage
 from vpl.split.film_cells import HALF
-from vpl.split.pixel_rays import MULTIPLE
 
 from .convergence import ErrorEstimate
 from .fine_film import fine_film, merged
@@ -260,9 +259,7 @@ class Progressive(Passes):
         first = (self.passes[0].spp, self.passes[0].seed) if self.passes else None
         sensor = self._scene.sensors()[self._sensor]
         density = self.density.of_pass(self.integrator, sensor, spp)
-        # Halves need fewer multiples than different numbers
-        whole = -(-spp // self._own_multiple) * self._own_multiple
-        half = is_probe and spp % self.probe_multiple == 0 and self.density.suits(self.integrator, sensor, whole)
+        half = is_probe and self.density.suits_probe(self.integrator, sensor, spp)
         image = render_pass(
             self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density, half, self.parts
         )  # fmt: skip
@@ -272,21 +269,10 @@ class Progressive(Passes):
             self.density.learn(*(self.merged(one) for one in (image.planes, image.half)), image.channels)
         return self.add(image)
 
-    @property
-    def probe_multiple(self):
-        """The samples per pixel of which a pass that determines the samples of the pixels has a multiple: halves of the
-        samples of pixels of the film."""
-        return max(MULTIPLE, 2 * self.parts**2)
-
-    @property
-    def _own_multiple(self):
-        """The samples per pixel of which passes have multiples whose pixels have different numbers."""
-        return MULTIPLE * self.parts**2
-
     def accepts(self, spp):
         """Return whether the sampler keeps a number of samples per pixel, which some samplers round up, and whether
         pixels may have the different numbers of samples that the render has determined."""
-        cells, multiple = self.parts**2, self._own_multiple
+        cells, multiple = self.parts**2, self.density.multiple
         with _sample_count(self._scene.sensors()[self._sensor].sampler(), -(-spp // cells)) as rounded:
             is_multiple = spp % multiple == 0 or spp < multiple or self.density.relative is None
             return cells * rounded == spp and is_multiple
@@ -300,7 +286,7 @@ class Progressive(Passes):
     def differs(self):
         """Whether pixels may have different numbers of samples after the second pass."""
         suits = self.density.suits(self.integrator, self._scene.sensors()[self._sensor])
-        return suits and self.largest_pass >= max(LEAST_SAMPLES, self._own_multiple)
+        return suits and self.largest_pass >= max(LEAST_SAMPLES, self.density.multiple)
 
     @property
     def decisions(self):

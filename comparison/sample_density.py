@@ -38,12 +38,28 @@ class SampleDensity:
     def __init__(self, denoise=None, parts=1):
         self._denoise, self._parts, self.relative, self.seconds = denoise, parts, None, 0.0
 
+    @property
+    def multiple(self):
+        """The samples per pixel of which passes have multiples whose pixels have different numbers."""
+        return MULTIPLE * self._parts**2
+
+    @property
+    def probe_multiple(self):
+        """The samples per pixel of which a pass that determines the samples has a multiple: halves of the samples of
+        pixels of the film."""
+        return max(MULTIPLE, 2 * self._parts**2)
+
     def suits(self, integrator, sensor, spp=None):
         """Return whether the pixels of a pass may have different numbers of samples, `spp` in the mean, by default as
         few as possible."""
-        spp = spp or MULTIPLE * self._parts**2
         differs = getattr(integrator, "may_differ", lambda *_: False)
-        return self._denoise is not None and differs(sensor, spp, self._parts)
+        return self._denoise is not None and differs(sensor, spp or self.multiple, self._parts)
+
+    def suits_probe(self, integrator, sensor, spp):
+        """Return whether a pass of `spp` samples per pixel may determine the samples of later passes."""
+        # Halves need fewer samples than different numbers
+        enough = -(-spp // self.multiple) * self.multiple
+        return spp % self.probe_multiple == 0 and self.suits(integrator, sensor, enough)
 
     def of_pass(self, integrator, sensor, spp):
         """Return samples over their mean for the pixels of a pass, None for equal numbers."""

@@ -21,6 +21,7 @@ from vpl.lights.emitters import Emitters, read_emitters
 from vpl.points.camera_paths import CameraPaths, PixelGrid, SceneTraits, follow_camera_rays, refuse_media, scene_traits
 
 from . import VARIANTS
+from .camera_samples import film_size
 from .knobs import PATH_KNOBS, Integer, read_knobs, show_knobs
 
 # A property of Mitsuba's integrators, whose value Mitsuba does not expose
@@ -94,6 +95,9 @@ class GatheringIntegrator(mi.SamplingIntegrator):
     along_curve = True  # whether gather points are sorted along a space-filling curve
     # Whether a pass is rendered in parts: it can stop between them, and needs little memory (50 bytes a sample)
     renders_in_parts = False
+    # Whether images that will be denoised may have a film that is finer than the image. Most methods share work between
+    # the samples of a pixel
+    suits_fine_film = False
     knobs = PATH_KNOBS
 
     def __init__(self, props):
@@ -196,10 +200,6 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         sky = emitters.environment is not None and not self.hide_emitters
         return CameraPass(seed, emitters, traits, paths, paths.valid | (active & sky), clock)
 
-    # Whether images that will be denoised may have a film that is finer than the image. Most methods share work between
-    # the samples of a pixel
-    suits_fine_film = False
-
     def pixel_grid(self, scene, sampler) -> PixelGrid:
         """Layout of the camera rays of this pass in the image.
 
@@ -208,9 +208,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         """
         samples = min(sampler.sample_count(), self.samples_per_pass)
         for sensor in [self._sensor] if self._sensor else scene.sensors():
-            film = sensor.film()
-            border = 2 * film.rfilter().border_size() if film.sample_border() else 0
-            size = np.array(film.crop_size(), np.int64) + border
+            size = film_size(sensor.film())
             if sampler.wavefront_size() == samples * int(np.prod(size)):
                 return PixelGrid(int(size[0]), samples)
         return PixelGrid(8, 1, known=samples == 1)

@@ -227,6 +227,8 @@ class Groups(Knob):
         )
 
     def parse(self, value):
+        """Patterns by name of the group, in order, from text such as ``lamps=lamp*,bulb; sky=env``; None if the text is
+        not allowed."""
         if not isinstance(value, str):
             return None
         found: dict[str, tuple[str, ...]] = {}
