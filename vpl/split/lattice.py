@@ -1,4 +1,4 @@
-"""Stratified random numbers for vertices that scatter: a lattice over the samples of a pixel at each vertex.
+"""Stratified random numbers for the vertices of paths: a lattice over the samples of a pixel at each vertex.
 
 Rank-1 lattices with a random shift of the unit square, so every single number is uniform [Cranley and Patterson 1976;
 Sloan and Joe 1994, "Lattice Methods for Multiple Integration"].  Each dimension, vertex and pixel takes the points in
@@ -24,6 +24,8 @@ from .pixel_rays import RayNumbers
 _MIXING = (0x7FEB352D, 0x846CA68B)
 # 2^32 over the golden ratio, made odd: far from any simple fraction
 _STEP = 0x9E3779B9
+# The same over the root of 2, for vertices: no small multiples of both steps are equal
+_VERTEX_STEP = 0x6FE0483D
 # Largest number of orders and of entries (1 MB) in the table, with a minimum of 1 order; two dimensions share an order
 # and a start with a probability of 1 / entries. Number of candidate multipliers of a lattice
 _ORDERS, _ENTRIES, _TRIED = 256, 1 << 18, 64
@@ -73,9 +75,10 @@ class Lattice:
     """Numbers for paths; ``places`` of the paths in pixels; ``sizes``: different numbers of paths in a pixel."""
 
     def __init__(self, places: RayNumbers, sizes: Sequence[int], seed: int):
-        self._pixel, self._number = places.pixel, places.number
-        # Derived, because vertex numbers are added to the seed
-        self._seed = dr.opaque(mi.UInt32, derived_seed(seed, 0))
+        self._number = places.number
+        # A good hash of each pixel once; cheap hashes derive the numbers of each vertex, in the loops of kernels
+        self._bits, _ = mi.sample_tea_32(places.pixel, dr.opaque(mi.UInt32, derived_seed(seed, 0)), HASH_ROUNDS)
+        dr.eval(self._bits)
         tables = [_orders(size) for size in sizes]
         self._orders = upload(mi.UInt32, np.concatenate(tables))
         begins = np.cumsum([0, *(len(table) for table in tables[:-1])])
@@ -101,16 +104,15 @@ class Lattice:
     def at(self, vertex):
         """Numbers of a path at a ``vertex`` (UInt32, counted): (number, pair, number, pair) in [0, 1)."""
         found = []
-        # A single good hash; cheap hashes derive the remaining bits
-        orders, shifts = mi.sample_tea_32(self._pixel, self._seed + vertex, HASH_ROUNDS)
+        bits = self._bits + vertex * _VERTEX_STEP
         for stream in range(4):
-            point = self._point(_mixed(orders, stream))
-            shift = _mixed(shifts, 2 * stream)
+            point = self._point(_mixed(bits, 3 * stream))
+            shift = _mixed(bits, 3 * stream + 1)
             numbers = [_fraction(point * self._steps[0] + shift)]
             if stream % 2:
                 # Mirrored with probability 1/2, because every lattice is coarse in some directions
                 mirrored = dr.select((shift & 1) == 0, point, 0 - point)
-                numbers.append(_fraction(mirrored * self._steps[1] + _mixed(shifts, 2 * stream + 1)))
+                numbers.append(_fraction(mirrored * self._steps[1] + _mixed(bits, 3 * stream + 2)))
             found.append(mi.Point2f(*numbers) if stream % 2 else numbers[0])
         return tuple(found)
 

@@ -132,8 +132,8 @@ def trace_paths(
 ) -> Traced:  # fmt: skip
     """Trace paths to their ends.
 
-    ``lattice``: numbers for the choice of emitter, point, lobe and direction at scattering vertices; ``sampler``: the
-    remaining random numbers; ``sums`` by layer, for camera rays.
+    ``lattice``: numbers for the choice of emitter, point, lobe and direction at each vertex; ``sampler``: the remaining
+    random numbers; ``sums`` by layer, for camera rays.
     """
     context, count = mi.BSDFContext(), dr.width(first.throughput)
     path, found, gathered = Path.of(first), Contributions.none(count, sums), Gathered.none(count)
@@ -162,12 +162,10 @@ def trace_paths(
         hit.smooth &= hit.goes_on
 
         # ---------------------- Next-event estimation ----------------------
-        chosen, place, lobe, turn = lattice.at(path.scattered)
+        chosen, place, lobe, turn = lattice.at(path.depth)
         path.scattered += dr.select(hit.smooth, 1, 0)
         path.cell, member = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side), sampler.next_1d()
         sample = emitters.sample(hit.si, path.cell, chosen, member, place, hit.smooth)
-        lobe = dr.select(hit.smooth, lobe, sampler.next_1d())
-        turn = dr.select(hit.smooth, turn, sampler.next_2d())
         # A single call: each call adds the code of every material to the kernel. A path that ends needs the sample only
         # to tell whether the surface counts in alpha
         toward, scatters = hit.si.to_local(sample.direction), path.active & ~hit.hidden & (hit.goes_on | ~path.valid)
