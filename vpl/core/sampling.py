@@ -140,9 +140,15 @@ def rounded_shares(share: np.ndarray, length: np.ndarray) -> np.ndarray:
     number = np.add.reduceat(positive.astype(np.int64), first)
     # Rounding keeps the difference of two sums at a multiple of 2^-23 or more
     least = np.minimum(2.0**-_SAMPLE_BITS, 0.5 / np.maximum(number, 1))
-    total = np.cumsum((1 - least * number)[row] * share + least[row] * positive)
+    # In place: filling new memory takes longer than the sums
+    total = (1 - least * number)[row]
+    total *= share
+    total += least[row] * positive
+    np.cumsum(total, out=total)
     total -= np.concatenate([[0.0], total])[first][row]
-    total = np.round(total * 2.0**_SAMPLE_BITS) * 2.0**-_SAMPLE_BITS
+    total *= 2.0**_SAMPLE_BITS
+    np.round(total, out=total)
+    total *= 2.0**-_SAMPLE_BITS
     # The last positive member receives the remainder
     last = np.maximum.reduceat(np.where(positive, member, -1), first)
     total[member >= last[row]] = 1
@@ -169,9 +175,9 @@ class RowChoice:
         # At least half as many guides per row as members: a power of two, so that the product with a uniform number
         # is exact, and at least two, because arrays of one entry change the kernels
         guides = 2 ** max(int(np.log2(len(share) / rows)), 1)
-        steps = np.arange(rows)[:, None] + np.arange(guides) / guides
-        order = np.repeat(np.arange(rows), length + 1) + before
-        low = np.searchsorted(order, steps.ravel(), side="right") - 1
+        # The last member that starts at each guide or before, by counts of starts: a search takes ten times as long
+        start = np.repeat(np.arange(rows) * guides, length + 1) + np.ceil(before * guides).astype(np.int64)
+        low = np.cumsum(np.bincount(start, minlength=rows * guides)[: rows * guides]) - 1
         # Up to the last member that starts before the next guide
         high = np.append(low[1:], 0)
         high[guides - 1 :: guides] = first + length - 1

@@ -2,6 +2,7 @@
 
 - ``base``: interface and results of samplers, the uniform sampler, irradiance by a sampler
 - ``cell_choice``: learned probabilities of sources by spatial cell
+- ``arriving_power``: light of each source that arrives in each cell, from which they are learned
 - ``learned``: emitters and regions of the environment, chosen by visibility from a pilot's vertices
 - ``tree``: many emitters, chosen through a tree
 """

@@ -9,20 +9,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...core.arrays import channel_mean, download, upload, upload_vectors
+from ...core.arrays import download, upload, upload_vectors
 from ...core.sampling import RowChoice, derived_seed, independent_sampler
 from ..spatial_cells import SpatialCells
+from .arriving_power import RAYS, Looks, arriving_power
 from .base import Places
 
 # Rays to learn by, as a fraction of the camera rays: learning may take a few percent of a render
 _LEARNING_SHARE = 0.25
 # The same for later passes of a render, several of which use what was learned
 _LATER_SHARE = 0.5
-# Rays from a cell to each source; largest total number of rays, and number of rays at a time: bounds of memory, some 50
-# bytes a ray in NumPy and 100 bytes on the device
-_RAYS_EACH, _MOST_RAYS, _RAYS_AT_A_TIME = 2, 1 << 21, 1 << 20
-# Weight of the neighbours of a cell and of the prior visibility, as equivalent numbers of rays; the first is a maximum
-_NEIGHBOURS, _PRIOR = 4.0, 1.0
+# Largest total number of rays, and number of rays at a time: bounds of memory, some 100 bytes a ray
+_MOST_RAYS, _RAYS_AT_A_TIME = 1 << 21, 1 << 20
 
 
 def learning_rays(paths: int, is_later: bool = False) -> int:
@@ -97,69 +95,43 @@ class CellChoice:
         ``look(places, cell, seed)``: :func:`vpl.split.emitters.base.irradiance_from_emitters` with a single sample
         each.
         """
-        each = _RAYS_EACH * self.count
+        each = RAYS * self.count
         most = rays // each
         if most < 1 or len(position) == 0:
             return False
         self._cells, cell = SpatialCells.around(position, normal, most)
         vertices = _VerticesOfCells.of(position, normal, cell)
         most = max(_RAYS_AT_A_TIME // each, 1)
+        learned = np.ones(self.count, bool)
+        learned[self._ignored] = False
+        learned, looks = mi.Bool(upload(mi.UInt32, learned) > 0), Looks.none(vertices.cells * self.count)
         self._learns = dr.opaque(mi.Bool, True)
         try:
-            parts = [
-                self._look(vertices, first, min(most, vertices.cells - first), derived_seed(seed, first), look)
-                for first in range(0, vertices.cells, most)
-            ]
+            for first in range(0, vertices.cells, most):
+                cells = min(most, vertices.cells - first)
+                reached, unoccluded, _ = self._look(vertices, first, cells, derived_seed(seed, first), look)
+                looks.write(first * self.count, reached, unoccluded, learned)
         finally:
             self._learns = dr.opaque(mi.Bool, False)
-        reached, unoccluded = (np.concatenate(part) for part in zip(*parts, strict=True))
-        self._use(self._shares(unoccluded, reached > 0))
+        power = arriving_power(looks, self.count, self._cells.neighbours())
+        self._use(self._shares(download(power).reshape(-1, self.count)))
         return True
 
     def _look(self, vertices: _VerticesOfCells, first: int, cells: int, seed: int, look: Callable):
-        """(Arriving, unoccluded) irradiance (cells, sources, rays), float64, in ``cells`` cells from ``first`` on."""
-        each = _RAYS_EACH * self.count
+        """Irradiance by :data:`RAYS` rays to each source in ``cells`` cells from ``first`` on, see :meth:`learn`."""
+        each = RAYS * self.count
         lane = dr.arange(mi.UInt32, cells * each)
         row = lane // dr.opaque(mi.UInt32, each) + dr.opaque(mi.UInt32, first)
-        source = lane // _RAYS_EACH % dr.opaque(mi.UInt32, self.count)
+        source = lane // RAYS % dr.opaque(mi.UInt32, self.count)
         places = vertices.drawn(row, independent_sampler(derived_seed(seed, 0), len(lane)))
         dr.eval(places, source)
-        reached, unoccluded, _ = look(places, source, derived_seed(seed, 1))
-        shape = cells, self.count, _RAYS_EACH
-        return [download(x).astype(np.float64).reshape(shape) for x in (channel_mean(reached), unoccluded)]
+        return look(places, source, derived_seed(seed, 1))
 
-    def _shares(self, unoccluded: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        """Probabilities (cells + 1, sources) from unoccluded irradiance and visibility (cells, sources, rays).
-
-        Proportional to the root mean square of the arriving light.  Row 0 is for unknown cells.
-        """
-        possible = np.nan_to_num(unoccluded, posinf=0) ** 2
-        possible[:, self._ignored] = 0
-        found = possible * seen
-        # Prior visibility of a source in a cell: how often the cell sees sources, times how often cells see the source
-        of_cell, of_source, of_all = (_share(found, possible, axes) for axes in ((1, 2), (0, 2), (0, 1, 2)))
-        visible = np.minimum(of_cell * of_source / max(float(of_all.squeeze()), 1e-9), 1)[..., 0]
-        found, possible = found.mean(2), possible.mean(2)
-        # The mean of roots, because a neighbour may be next to an emitter that is far from this cell
-        expected, rays = self._of_neighbours(found**0.5, (visible * possible) ** 0.5)
-        rays = np.minimum(rays, _NEIGHBOURS)
-        power = ((_RAYS_EACH * found + rays * expected**2) / (_RAYS_EACH + rays)) ** 0.5
+    def _shares(self, power: np.ndarray) -> np.ndarray:
+        """Probabilities (cells + 1, sources) in proportion to ``power`` (cells, sources); row 0: for unknown cells."""
         total = power.sum(1, keepdims=True)
         learned = np.where(total > 0, power / np.maximum(total, np.finfo(np.float64).tiny), self._usual)
         return np.concatenate([self._usual[None], (1 - self._share) * learned + self._share * self._usual])
-
-    def _of_neighbours(self, power: np.ndarray, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean ``power`` (cells, sources) of the neighbours of each cell, and the number of rays (cells, 1) behind it.
-
-        ``guess``: prior mean, with the weight of ``_PRIOR`` rays.
-        """
-        neighbours, total = self._cells.neighbours(), _PRIOR * guess
-        # Row 0 represents missing neighbours
-        padded = np.concatenate([np.zeros((1, self.count)), _RAYS_EACH * power])
-        for neighbour in neighbours.T:
-            total += padded[neighbour]
-        rays = _RAYS_EACH * np.count_nonzero(neighbours, 1)[:, None] + _PRIOR
-        return total / rays, rays
 
     # ---------------------- Sampling ----------------------
 
@@ -183,8 +155,3 @@ class CellChoice:
     def _row(self, cell):
         """Start of a cell's row in the table of probabilities."""
         return cell * self._stride
-
-
-def _share(found: np.ndarray, possible: np.ndarray, axes: tuple) -> np.ndarray:
-    """Fraction of the rays with unoccluded light that found light, over some axes; keeps the axes."""
-    return np.count_nonzero(found, axes, keepdims=True) / np.maximum(np.count_nonzero(possible, axes, keepdims=True), 1)
