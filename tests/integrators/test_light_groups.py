@@ -166,7 +166,8 @@ def test_a_group_is_the_image_of_its_emitters(group):
     scene, reference = mi.load_dict(description), mi.load_dict(only(description, members))
 
     def pair(seed):
-        # The seeds from 0 on fail by chance: of 120 others, the points' mean is 0.02 ± 0.08% above that of `path`
+        # The points fail by chance with the seeds from 0 on. The same comparison of 120 pairs, seeds 200 to 319, has
+        # the p value 0.86
         seed, asked = 100 + seed, {"light_groups": groups, "max_depth": 4}
         _, layers, statistics = layers_of(scene, 256, seed, **asked)
         assert statistics["light_paths"] > 0

@@ -175,7 +175,7 @@ class RowChoice:
         # At least half as many guides per row as members: a power of two, so that the product with a uniform number
         # is exact, and at least two, because arrays of one entry change the kernels
         guides = 2 ** max(int(np.log2(len(share) / rows)), 1)
-        # The last member that starts at each guide or before, by counts of starts: a search takes ten times as long
+        # For each guide, the last member that starts there or before. A search takes ten times as long as counting
         start = np.repeat(np.arange(rows) * guides, length + 1) + np.ceil(before * guides).astype(np.int64)
         low = np.cumsum(np.bincount(start, minlength=rows * guides)[: rows * guides]) - 1
         # Up to the last member that starts before the next guide

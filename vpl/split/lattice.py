@@ -24,7 +24,7 @@ from .pixel_rays import RayNumbers
 _MIXING = (0x7FEB352D, 0x846CA68B)
 # 2^32 over the golden ratio, made odd: far from any simple fraction
 _STEP = 0x9E3779B9
-# The same over the root of 2, for vertices: no small multiples of both steps are equal
+# For vertices, 2^32 over the golden ratio and the root of 2, made odd: no small multiples of both steps are equal
 _VERTEX_STEP = 0x6FE0483D
 # Largest number of orders and of entries (1 MB) in the table, with a minimum of 1 order; two dimensions share an order
 # and a start with a probability of 1 / entries. Number of candidate multipliers of a lattice
@@ -76,7 +76,7 @@ class Lattice:
 
     def __init__(self, places: RayNumbers, sizes: Sequence[int], seed: int):
         self._number = places.number
-        # A good hash of each pixel once; cheap hashes derive the numbers of each vertex, in the loops of kernels
+        # A good hash of the pixel, once for each path; cheap hashes derive the numbers of each vertex
         self._bits, _ = mi.sample_tea_32(places.pixel, dr.opaque(mi.UInt32, derived_seed(seed, 0)), HASH_ROUNDS)
         dr.eval(self._bits)
         tables = [_orders(size) for size in sizes]

@@ -1,6 +1,6 @@
 """Light of each source that arrives in each spatial cell, from a few rays of the cell and of its neighbours.
 
-All arrays have an entry for each pair of a cell and a source, cell by cell.
+A *pair* is a cell and a source.  Arrays of pairs go cell by cell.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ _NEIGHBOURS, _PRIOR = 4.0, 1.0
 class Looks:
     """Results of rays from cells to sources.
 
-    ``possible``, ``found``: unoccluded and arriving irradiance, squared, means over the rays, double precision;
-    ``rays``, ``hits``: numbers of rays with unoccluded light, and of those that found it, UInt32.
+    For each pair: ``possible``: squared unoccluded irradiance, mean over the rays, double precision; ``found``: the
+    same with 0 for rays that were blocked; ``rays``, ``hits``: numbers of rays with unoccluded light, and of those that
+    found it, UInt32.
     """
 
     possible: mi.Float64
@@ -41,8 +42,8 @@ class Looks:
     def write(self, first: int, reached, unoccluded, learned: mi.Bool) -> None:
         """Write the pairs from ``first`` on.
 
-        ``reached``, ``unoccluded``: irradiance by each ray, :data:`RAYS` for each pair, a spectrum and its mean over
-        channels; ``learned``: whether each source is learned; others count as black.
+        Irradiance by each ray, :data:`RAYS` for each pair: ``reached``, a spectrum; ``unoccluded``, mean over channels;
+        ``learned``: whether each source is learned; others count as black.
         """
         pairs = dr.width(unoccluded) // RAYS
         lane, precise = dr.arange(mi.UInt32, pairs), dr.float64_array_t(mi.Float)
@@ -63,9 +64,10 @@ class Looks:
 
 
 def arriving_power(looks: Looks, sources: int, neighbours: np.ndarray) -> mi.Float64:
-    """Root mean square of the arriving irradiance, double precision.
+    """Root mean square of the arriving irradiance for each pair, double precision.
 
-    ``neighbours`` (cells, 26): numbers of the cells around each cell, from 1 on; 0 for none.
+    The mean of the cell's own rays, of those of its neighbours, and of a prior, each with a weight.  ``sources``: their
+    number; ``neighbours`` (cells, 26): numbers of the cells around each cell, from 1 on; 0 for none.
     """
     precise = dr.float64_array_t(mi.Float)
     lane, stride = dr.arange(mi.UInt32, dr.width(looks.rays)), dr.opaque(mi.UInt32, sources)
@@ -80,9 +82,9 @@ def arriving_power(looks: Looks, sources: int, neighbours: np.ndarray) -> mi.Flo
     # The mean of roots, because a neighbour may be next to an emitter that is far from this cell
     power, total = dr.sqrt(looks.found), _PRIOR * dr.sqrt(visible * looks.possible)
     dr.eval(power, total)
-    around, padded = upload(mi.UInt32, neighbours), neighbours.shape[1]
-    for number in range(padded):
-        near = dr.gather(mi.UInt32, around, cell * padded + number)
+    around, most = upload(mi.UInt32, neighbours), neighbours.shape[1]
+    for number in range(most):
+        near = dr.gather(mi.UInt32, around, cell * most + number)
         total += RAYS * dr.gather(precise, power, (near - 1) * stride + source, near > 0)
     rays = upload(precise, RAYS * np.count_nonzero(neighbours, 1) + _PRIOR)
     rays = dr.gather(precise, rays, cell)

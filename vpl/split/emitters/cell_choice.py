@@ -19,7 +19,7 @@ from .base import Places
 _LEARNING_SHARE = 0.25
 # The same for later passes of a render, several of which use what was learned
 _LATER_SHARE = 0.5
-# Largest total number of rays, and number of rays at a time: bounds of memory, some 100 bytes a ray
+# Bounds of memory: largest number of rays, some 20 bytes each; number of rays at a time, some 100 bytes each
 _MOST_RAYS, _RAYS_AT_A_TIME = 1 << 21, 1 << 20
 
 
@@ -118,7 +118,7 @@ class CellChoice:
         return True
 
     def _look(self, vertices: _VerticesOfCells, first: int, cells: int, seed: int, look: Callable):
-        """Irradiance by :data:`RAYS` rays to each source in ``cells`` cells from ``first`` on, see :meth:`learn`."""
+        """Result of ``look`` for :data:`RAYS` rays to each source, in ``cells`` cells from ``first`` on."""
         each = RAYS * self.count
         lane = dr.arange(mi.UInt32, cells * each)
         row = lane // dr.opaque(mi.UInt32, each) + dr.opaque(mi.UInt32, first)
