@@ -78,7 +78,6 @@ class Lattice:
         self._number = places.number
         # A good hash of the pixel, once for each path; cheap hashes derive the numbers of each vertex
         self._bits, _ = mi.sample_tea_32(places.pixel, dr.opaque(mi.UInt32, derived_seed(seed, 0)), HASH_ROUNDS)
-        dr.eval(self._bits)
         tables = [_orders(size) for size in sizes]
         self._orders = upload(mi.UInt32, np.concatenate(tables))
         begins = np.cumsum([0, *(len(table) for table in tables[:-1])])

@@ -39,27 +39,28 @@ class Looks:
         precise = dr.float64_array_t(mi.Float)
         return cls(*(dr.zeros(kind, pairs) for kind in (precise, precise, mi.UInt32, mi.UInt32)))
 
-    def write(self, first: int, reached, unoccluded, learned: mi.Bool) -> None:
+    def write(self, first: int, reached, unoccluded, learnable: mi.Bool) -> None:
         """Write the pairs from ``first`` on.
 
         Irradiance by each ray, :data:`RAYS` for each pair: ``reached``, a spectrum; ``unoccluded``, mean over channels;
-        ``learned``: whether each source is learned; others count as black.
+        ``learnable``: whether each source is learned; others count as black.
         """
         pairs = dr.width(unoccluded) // RAYS
         lane, precise = dr.arange(mi.UInt32, pairs), dr.float64_array_t(mi.Float)
         arrives, unoccluded = channel_mean(reached) > 0, dr.select(dr.isfinite(unoccluded), unoccluded, 0)
         dr.eval(arrives, unoccluded)
-        source = (lane + dr.opaque(mi.UInt32, first)) % dr.opaque(mi.UInt32, dr.width(learned))
+        pair = lane + dr.opaque(mi.UInt32, first)
+        counts = dr.gather(mi.Bool, learnable, pair % dr.opaque(mi.UInt32, dr.width(learnable)))
         of_pairs = Looks(precise(0), precise(0), mi.UInt32(0), mi.UInt32(0))
         for ray in range(RAYS):
             light = dr.gather(mi.Float, unoccluded, lane * RAYS + ray)
-            light = dr.square(precise(dr.select(dr.gather(mi.Bool, learned, source), light, 0)))
+            light = dr.square(precise(dr.select(counts, light, 0)))
             hits = (light > 0) & dr.gather(mi.Bool, arrives, lane * RAYS + ray)
             of_pairs.possible += light / RAYS
             of_pairs.found += dr.select(hits, light, 0) / RAYS
             of_pairs.rays += dr.select(light > 0, mi.UInt32(1), 0)
             of_pairs.hits += dr.select(hits, mi.UInt32(1), 0)
-        dr.scatter(self, of_pairs, lane + dr.opaque(mi.UInt32, first))
+        dr.scatter(self, of_pairs, pair)
         dr.eval(self)
 
 

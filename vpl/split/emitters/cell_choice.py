@@ -67,7 +67,9 @@ class CellChoice:
 
     def __init__(self, usual: np.ndarray, share: float, ignored: np.ndarray):
         self.count, self._stride = len(usual), dr.opaque(mi.UInt32, len(usual) + 1)
-        self._usual, self._share, self._ignored = usual, share, ignored
+        self._usual, self._share = usual, share
+        self._learnable = upload(mi.UInt32, np.isin(np.arange(len(usual)), ignored, invert=True)) > 0
+        dr.eval(self._learnable)
         # During learning, every source has a cell, and the cell draws only the source
         self._learns = dr.opaque(mi.Bool, False)
         self.forget()
@@ -102,15 +104,13 @@ class CellChoice:
         self._cells, cell = SpatialCells.around(position, normal, most)
         vertices = _VerticesOfCells.of(position, normal, cell)
         most = max(_RAYS_AT_A_TIME // each, 1)
-        learned = np.ones(self.count, bool)
-        learned[self._ignored] = False
-        learned, looks = mi.Bool(upload(mi.UInt32, learned) > 0), Looks.none(vertices.cells * self.count)
+        looks = Looks.none(vertices.cells * self.count)
         self._learns = dr.opaque(mi.Bool, True)
         try:
             for first in range(0, vertices.cells, most):
                 cells = min(most, vertices.cells - first)
                 reached, unoccluded, _ = self._look(vertices, first, cells, derived_seed(seed, first), look)
-                looks.write(first * self.count, reached, unoccluded, learned)
+                looks.write(first * self.count, reached, unoccluded, self._learnable)
         finally:
             self._learns = dr.opaque(mi.Bool, False)
         power = arriving_power(looks, self.count, self._cells.neighbours())
