@@ -5,6 +5,10 @@ import os
 import mitsuba as mi
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vpl.core.arrays import upload
 
 
 def examples(usual: int, most: int = 10_000) -> int:
@@ -29,3 +33,17 @@ def assert_properties_are_shown(plugin, given):
     """The printed plugin shows the values of properties."""
     text = str(mi.load_dict({"type": plugin, **given}))
     assert all(f"{name} = {value}" in text for name, value in given.items())
+
+
+def points(columns):
+    """Points on the device from an array (n, 3)."""
+    return mi.Point3f(*(upload(mi.Float, columns[:, k]) for k in range(3)))
+
+
+def seeds(usual):
+    """A property of random scenes, by their seed."""
+
+    def decorate(test):
+        return settings(max_examples=examples(usual), deadline=None)(given(st.integers(0, 2**31))(test))
+
+    return decorate

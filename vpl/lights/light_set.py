@@ -20,7 +20,7 @@ from ..core.stages import Stage
 from .emission import bounding_sphere
 from .emitters import Emitters
 from .focus import Focus, spacing
-from .light_tree import CONE_COS, WINDOW, DeviceTree, LightTree, build_light_tree
+from .light_tree import CONE_COS, LEAST_C, WINDOW, DeviceTree, LightTree, build_light_tree
 from .tracing import LightPathSettings, TracedLights, trace_lights
 from .virtual_lights import KINDS, DeviceLights, VirtualLights
 
@@ -202,8 +202,13 @@ class ScatteredGroup(LightGroup):
 
     @classmethod
     def of(cls, lights: VirtualLights, seed: int, sign: float = 1.0) -> ScatteredGroup:
-        """Group with a tree over lights of one kind; ``seed``: of the representatives; ``sign``: see LightGroup."""
+        """Group with a tree over lights of one kind; ``seed``: of the representatives; ``sign``: see LightGroup.
+
+        Surface lights need a c.
+        """
         tree = _tree_of(lights, np.random.default_rng(seed), _SMALL_WINDOW)
+        if lights.c is not None:
+            tree.records[:, LEAST_C] = -largest_below(tree, -lights.c)
         first, last = (upload(mi.UInt32, column) for column in _leaf_ranges(tree).T)
         intensity = lights.intensity.mean(1, dtype=np.float64)
         return cls(

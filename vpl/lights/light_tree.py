@@ -50,6 +50,8 @@ WINDOW = 16
 # Columns of LightTree.records, and their number
 BOX_MIN, BOX_MAX, CONE_AXIS, CONE_COS = slice(0, 3), slice(3, 6), slice(6, 9), 9
 INTENSITY, FLUX, ESCAPE, REPRESENTATIVE = 10, slice(11, 14), 14, 15
+# Clusters of surface lights have no representative, and the least c of their lights instead
+LEAST_C = REPRESENTATIVE
 COLUMNS = 16
 
 
@@ -262,7 +264,10 @@ def _cone_cosines(axis, directions, leaves, depth):
 
 @dataclass
 class Node:
-    """Nodes of a light tree in a kernel: one per lane.  Fields as in the records of :class:`LightTree`."""
+    """Nodes of a light tree in a kernel: one per lane.  Fields as in the records of :class:`LightTree`.
+
+    ``least_c``: least c of the surface lights, undefined for other kinds.
+    """
 
     box_min: mi.Point3f
     box_max: mi.Point3f
@@ -270,6 +275,7 @@ class Node:
     cosine: mi.Float
     intensity: mi.Color3f
     escape: mi.UInt32
+    least_c: mi.Float
 
     @property
     def center(self):
@@ -313,6 +319,7 @@ class DeviceTree:
             c.y,
             mi.Color3f(c.w, d.x, d.y),
             dr.reinterpret_array(mi.UInt32, d.z),
+            d.w,
         )
 
     def _column(self, column: int, index, active):

@@ -19,7 +19,7 @@ KINDS = ("point", "spot", "oriented", "directional", "environment", "surface")
 AT_INFINITY = ("directional", "environment")
 
 _RECORD = 16
-_COLUMNS = ("position", "direction", "intensity", "depth", "cone", "group", "facing", "uncertainty")
+_COLUMNS = ("position", "direction", "intensity", "depth", "cone", "group", "facing", "uncertainty", "c")
 
 
 @dataclass
@@ -35,7 +35,8 @@ class VirtualLights:
     ``group`` (n,) uint32: of the emitter of the light, see :class:`vpl.lights.emitter_groups.EmitterGroups`;
     ``facing`` (n, 3) float32: normal of the lit half-space of lights on surfaces, for example a shading normal (None:
     only ``direction`` limits the light);
-    ``uncertainty`` (n,) float32: of the position of lights on surfaces along ``direction``, world units (None: 0).
+    ``uncertainty`` (n,) float32: of the position of lights on surfaces along ``direction``, world units (None: 0);
+    ``c`` (n,) float32: of surface lights, see :mod:`vpl.transport.carried_share`, world units (None: 0).
     """
 
     kind: str
@@ -47,6 +48,7 @@ class VirtualLights:
     group: np.ndarray
     facing: np.ndarray | None = None
     uncertainty: np.ndarray | None = None
+    c: np.ndarray | None = None
 
     @property
     def count(self) -> int:
@@ -105,6 +107,7 @@ class Light:
     group: mi.UInt32
     facing: mi.Vector3f | None = None
     uncertainty: mi.Float | None = None
+    c: mi.Float | None = None
 
 
 class DeviceLights:
@@ -123,6 +126,8 @@ class DeviceLights:
         records[:, 12:14] = lights.cone
         if lights.facing is not None:
             records[:, 12:15] = lights.facing
+        if lights.c is not None:
+            records[:, 15] = lights.c
         self.kind = lights.kind
         self._facing = lights.facing is not None
         self.count = lights.count
@@ -134,14 +139,15 @@ class DeviceLights:
         first = dr.gather(mi.Vector4f, self._records, index * 4, active)
         second = dr.gather(mi.Vector4f, self._records, index * 4 + 1, active)
         third = dr.gather(mi.Vector4f, self._records, index * 4 + 2, active)
-        cone, facing = mi.Vector2f(0), None
+        cone, facing, c = mi.Vector2f(0), None, mi.Float(0)
         if self.kind == "spot" or self._facing:
             fourth = dr.gather(mi.Vector4f, self._records, index * 4 + 3, active)
             cone, facing = mi.Vector2f(fourth.x, fourth.y), fourth.xyz if self._facing else None
+            c = fourth.w
         depth = dr.reinterpret_array(mi.UInt32, first.w)
         color = mi.Color3f(third.x, third.y, third.z)
         group = dr.reinterpret_array(mi.UInt32, third.w)
-        return Light(first.xyz, second.xyz, color, depth, cone, group, facing, second.w)
+        return Light(first.xyz, second.xyz, color, depth, cone, group, facing, second.w, c)
 
 
 def spot_falloff(cosine, cone):

@@ -65,13 +65,14 @@ class EmitterLights:
         area = float(self.emitters.area.area[self.carried & (self.emitters.area.power > 0)].sum(dtype=np.float64))
         return (area / count) ** 0.5
 
-    def groups(self, count: int, seed: int) -> list[ScatteredGroup]:
-        """The lights with their trees; ``count``: number of points on area emitters."""
+    def groups(self, count: int, c: float, seed: int) -> list[ScatteredGroup]:
+        """The lights with their trees; ``count``: number of points on area emitters; ``c``: of the points."""
         lights, weight = [self.omni], self._weight
         if weight.any():
             on_areas = area_lights(self.emitters, count, derived_seed(seed, 0), weight)
             # `facing` is set as for lights on surfaces: both kinds use the same kernels
-            lights.append(replace(on_areas, kind="surface", facing=on_areas.direction).without_bad()[0])
+            on_areas = replace(on_areas, kind="surface", facing=on_areas.direction).without_bad()[0]
+            lights.append(replace(on_areas, c=np.full(on_areas.count, c, np.float32)))
         return [ScatteredGroup.of(x, derived_seed(seed, 1, k)) for k, x in enumerate(lights) if x.count]
 
 

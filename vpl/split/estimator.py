@@ -114,22 +114,21 @@ def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
 
 def make_lights(view: View, decision: Decision, kept: KeptLights | None, clock: Clock) -> tuple[ViewLights, dict]:
     """(Virtual lights with trees, statistics) of a plan."""
-    surfaces, statistics = _surface_lights(view, decision, kept, clock)
+    lights, statistics = _surface_lights(view, decision, kept, clock)
     if not decision.plan.emitters:
-        return ViewLights(surfaces), statistics
+        return lights, statistics
     clock.begin(Stage.TREE)
-    lights = view.emitters.lights
-    groups = lights.groups(lights.points(view.count, view.model), derived_seed(view.seed, Stream.EMITTER_LIGHTS))
-    emitters = view.emitter_lights(groups)
+    sources, c, seed = view.emitters.lights, view.emitters_c, derived_seed(view.seed, Stream.EMITTER_LIGHTS)
+    emitters = view.light_set(sources.groups(sources.points(view.count, view.model), c, seed), c)
     counts = statistics.get("lights", {}) | {"emitters": emitters.count}
-    return ViewLights(surfaces, emitters), statistics | {"lights": counts}
+    return replace(lights, emitters=emitters), statistics | {"lights": counts}
 
 
-def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clock: Clock):
-    """(Light set on surfaces, or None; statistics)."""
+def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clock: Clock) -> tuple[ViewLights, dict]:
+    """(Virtual lights on surfaces, statistics)."""
     wanted, pilot = decision.plan.light_paths, decision.pilot
     if not wanted:
-        return None, {}
+        return ViewLights(), {}
     clock.begin(Stage.LIGHTS)
     drawn = []
 
@@ -140,8 +139,8 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
     made = kept.find(view.scene, (view.seed, view.rules.max_depth, view.model.shared), make) if kept else make()
     statistics = {"light_paths": sum(drawn), "lights": {"surface": made.lights.count}}
     if not made.groups:
-        return None, statistics
-    return view.light_set(made.groups, pilot.spacing(made.sampler, made.lines)), statistics
+        return ViewLights(), statistics
+    return ViewLights(view.light_set(made.groups), c=made.c), statistics
 
 
 # ---------------------- Image ----------------------

@@ -23,9 +23,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import upload, upload_vectors
-from ..core.morton import interleaved
-from ..core.sampling import find_interval, independent_sampler, last_at_most, precise_sample
-from .arrival_octree import LEVELS, SCENE_SHARE, ArrivalOctree
+from ..core.sampling import find_interval, independent_sampler, precise_sample
+from .arrival_octree import SCENE_SHARE, ArrivalOctree
+from .line_density import LineDensity
 
 
 @dataclass
@@ -52,7 +52,8 @@ class Lines:
 
 
 class LineSampler:
-    """Draws lines through the boxes of an octree; ``scene_size``: extent of the scene, world units."""
+    """Draws lines through the boxes of an octree, with a known ``density``; ``scene_size``: extent of the scene, world
+    units."""
 
     def __init__(self, octree: ArrivalOctree):
         parts = octree.leaves, octree.parents
@@ -64,11 +65,7 @@ class LineSampler:
         chance = np.concatenate([*(part.chance for part in parts), [SCENE_SHARE]])
         self._cumulative = upload(mi.Float64, np.concatenate([[0.0], np.cumsum(chance)]))
         self._last = len(chance)
-        self._per_area = upload(mi.Float64, np.concatenate([part.chance / part.surface for part in parts]))
-        self._anywhere = SCENE_SHARE / (6 * octree.scene_size**2)
-        self._number = upload(mi.UInt64, np.concatenate([part.number for part in parts]))
-        self._root = octree.low, octree.size
-        self._levels = _levels(parts)
+        self.density = LineDensity.of(octree)
 
     def draw(self, count: int, seed: int) -> Lines:
         """Draw ``count`` random lines, stratified over the boxes."""
@@ -87,57 +84,6 @@ class LineSampler:
         lines = Lines(mi.Point3f(low + place), mi.Vector3f(direction), mi.Float(length), low, size)
         dr.eval(lines)
         return lines
-
-    def density(self, position: mi.Point3f, normal: mi.Vector3f):
-        """Expected hits per area of a line, on the side of surfaces with a ``normal``: double precision, evaluated."""
-        place, (low, size) = mi.Point3d(position), self._root
-        low = mi.Point3d(*(dr.opaque(mi.Float64, float(x)) for x in low))
-        cell = dr.floor((place - low) * dr.opaque(mi.Float64, 2.0**LEVELS / size))
-        cell = dr.clip(cell, 0, 2.0**LEVELS - 1)
-        finest = interleaved([mi.UInt64(x) for x in cell]) + 8**LEVELS
-        found = _density_at(self, finest, place, normal) + dr.opaque(mi.Float64, self._anywhere)
-        dr.eval(found)
-        return found
-
-
-@dataclass
-class _Levels:
-    """Levels of the leaves, then of the parents: ``first`` and ``last`` + 1 box of each, and the bits of the numbers of
-    the finest nodes that are below the level."""
-
-    first: mi.UInt32
-    last: mi.UInt32
-    below: mi.UInt64
-    count: mi.UInt32
-
-
-def _levels(parts) -> _Levels:
-    """The levels of two sets of boxes with ascending numbers, and thus ascending levels."""
-    rows, start = [], 0
-    for part in parts:
-        level, first = np.unique(part.level, return_index=True)
-        last = np.append(first[1:], len(part.level))
-        rows += zip(first + start, last + start, 3 * (LEVELS - level), strict=True)
-        start += len(part.level)
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    kinds = mi.UInt32, mi.UInt32, mi.UInt64
-    return _Levels(*(upload(*column) for column in zip(kinds, columns, strict=True)), dr.opaque(mi.UInt32, len(rows)))
-
-
-@dr.syntax
-def _density_at(sampler: LineSampler, finest, place, normal):
-    """Density through the leaf and the parent that hold each ``place``, whose finest node has the number ``finest``."""
-    levels, total = sampler._levels, dr.zeros(mi.Float64, dr.width(place))
-    normal, k = mi.Vector3d(normal), dr.zeros(mi.UInt32, dr.width(place))
-    while dr.hint(k < levels.count, exclude=[sampler, levels, finest, place, normal]):
-        low, high = dr.gather(mi.UInt32, levels.first, k), dr.gather(mi.UInt32, levels.last, k)
-        number = finest >> dr.gather(mi.UInt64, levels.below, k)
-        row = last_at_most(sampler._number, low, high, number)
-        box, size, turn = (dr.gather(type(x), x, row) for x in (sampler._low, sampler._size, sampler._turn))
-        held = (dr.gather(mi.UInt64, sampler._number, row) == number) & _inside(place, box, size)
-        total += dr.select(held, dr.gather(type(total), sampler._per_area, row) * (1 + dr.dot(normal, turn)), 0)
-        k += 1
-    return total
 
 
 def _inside(position, low, size) -> mi.Bool:

@@ -206,7 +206,6 @@ def _carry(path: Path, hit: Hit, settings: PathSettings, radiance, gathered: Gat
     """Turn ``path.carried`` from β F1 into w β F1 F2 at x2, 0 elsewhere; record second vertices; return the x2 mask."""
     si = hit.si
     cosine = dr.abs(dr.dot(si.n, path.ray.d))
-    w = carried_share(settings.squared_c, path.cosine * cosine / dr.square(si.t))
     # A virtual light at x2 shines only to the side of its shading normal
     connects = hit.smooth & (path.state == State.CONNECTING) & agrees(si, hit.side)
     path.carried = dr.select(connects, path.carried * hit.minorant, 0)
@@ -215,6 +214,8 @@ def _carry(path: Path, hit: Hit, settings: PathSettings, radiance, gathered: Gat
     second = connects | (hit.smooth & (path.scattered == 1))
     # On the ray, like virtual lights: on large shapes, Mitsuba's point lies beside the ray
     arrival = SecondVertices(path.ray(si.t), outward, *means)
+    squared_c = settings.c.squared(arrival.position, outward, connects)
+    w = carried_share(squared_c, path.cosine * cosine / dr.square(si.t))
     gathered.second = select_record(second, arrival, gathered.second)
     path.carried = dr.select(connects, path.carried * w, 0)
     return connects

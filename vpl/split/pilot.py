@@ -9,7 +9,7 @@ from functools import cached_property
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, download, upload, upload_vectors
+from ..core.arrays import channel_mean, download, upload
 from ..core.sampling import derived_seed
 from ..lights.emission import bounding_box
 from .arrival_octree import ArrivalOctree
@@ -100,21 +100,6 @@ class Pilot:
         )
         octree.choose_by_radiance(arrivals.radiance)
         return LineSampler(octree)
-
-    def spacing(self, sampler: LineSampler, lines: int) -> float:
-        """Typical distance between the lights of ``lines`` lines by ``sampler``, where paths arrive, world
-        units."""
-        # Kept lights have the lines of another pilot
-        of_one = self._spacing if sampler is vars(self).get("line_sampler") else self._spacing_of(sampler)
-        return of_one / lines**0.5
-
-    @cached_property
-    def _spacing(self) -> float:
-        return self._spacing_of(self.line_sampler)
-
-    def _spacing_of(self, sampler: LineSampler) -> float:
-        position, normal = (upload_vectors(mi.Vector3f, x) for x in (self.arrivals.position, self.arrivals.normal))
-        return float(np.median(download(sampler.density(position, normal)) ** -0.5))
 
     @property
     def brightness(self) -> np.ndarray:

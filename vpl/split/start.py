@@ -19,6 +19,7 @@ from .camera_rays import CameraRays
 from .cost_model import CostModel
 from .emitters.base import EmitterSampler
 from .emitters.cell_choice import learning_rays
+from .local_c import LocalC
 from .pilot import Pilot, mean_radiance, pilot_lanes, relative_errors
 from .plan import Evidence, Option
 from .view import Gathering, Stream, View, ViewLights
@@ -130,7 +131,7 @@ def _options(view: View, pilot: Pilot) -> list[Option]:
     """Kinds of virtual lights that are possible."""
     if not _may_carry_emitters(view):
         return _with_surfaces(view, pilot, None)
-    emitters = view.emitter_lights([])
+    emitters = view.light_set([], view.emitters_c)
     traced = Pilot.trace(view, ViewLights(emitters=emitters))
     only_emitters = Option(False, True, traced.radiance, traced.indirect)
     return [only_emitters, *_with_surfaces(view, pilot, None), *_with_surfaces(view, traced, emitters)]
@@ -146,7 +147,7 @@ def _with_surfaces(view: View, traced: Pilot, emitters: LightSet | None) -> list
     if view.rules.max_depth <= 2 or not traced.indirect.any():
         return []
     # The distance between lights is not known yet. With c = 0 lights carry the most
-    settings = view.settings(ViewLights(view.light_set([], 0.0), emitters), Gathering.AT_FIRST)
+    settings = view.settings(ViewLights(view.light_set([]), emitters, LocalC.constant(0.0)), Gathering.AT_FIRST)
     rays = CameraRays.of(view, upload(mi.UInt32, pilot_lanes(view)))
     # Otherwise the rays would keep those of the view
     dr.eval(rays.ray, rays.active, rays.importance, rays.places)

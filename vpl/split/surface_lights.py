@@ -27,6 +27,7 @@ from .emitters.base import EmitterSampler, Places, irradiance_from_emitters
 from .lattice import Lattice
 from .line_hits import LineHits, hits_of
 from .line_sampling import LineSampler
+from .local_c import LocalC
 from .path_tracer import trace_paths
 from .roulette import OutgoingRadiance
 from .view import FirstEdge, Gathering, PathSettings, State, Stream, View, ViewLights
@@ -39,14 +40,13 @@ _MOST_KEPT = 1 << 21
 
 @dataclass(frozen=True)
 class SurfaceLights:
-    """``lights`` of kind "surface", drawn by ``lines`` lines of ``sampler``.
+    """``lights`` of kind "surface" with their ``c``.
 
     ``groups``: the positive and the negative parts of their intensities with light trees, empty parts left out.
     """
 
     lights: VirtualLights
-    sampler: LineSampler
-    lines: int
+    c: LocalC
     groups: list[ScatteredGroup]
 
 
@@ -60,12 +60,14 @@ def surface_lights(view: View, sampler: LineSampler, count: int, announce_tree: 
     rules = replace(view.rules, max_depth=view.rules.max_depth - 2, rr_depth=1)
     settings = replace(view, rules=rules, outgoing=OutgoingRadiance.unknown()).settings(ViewLights())
     seed = derived_seed(view.seed, Stream.SURFACE_LIGHTS)
-    lights = _drawn_lights(view.scene, view.emitters, sampler, count, settings, seed)
+    hits = hits_of(view.scene, sampler.draw(count, derived_seed(seed, 2)), sampler.scene_size, derived_seed(seed, 4))
+    c = LocalC.of(sampler.density, count, view.model.c_per_spacing)
+    lights = _lights_at(view.scene, view.emitters, hits, c, count, settings, derived_seed(seed, 1))
     parts = _by_sign(lights)
     if parts:
         announce_tree()
     seed = derived_seed(view.seed, Stream.TREE)
-    return SurfaceLights(lights, sampler, count, [ScatteredGroup.of(part, seed, sign) for part, sign in parts])
+    return SurfaceLights(lights, c, [ScatteredGroup.of(part, seed, sign) for part, sign in parts])
 
 
 def _by_sign(lights: VirtualLights) -> list[tuple[VirtualLights, float]]:
@@ -80,16 +82,8 @@ def _by_sign(lights: VirtualLights) -> list[tuple[VirtualLights, float]]:
     return [(part, sign) for part, sign in parts if part.count]
 
 
-def _drawn_lights(
-    scene, emitters: EmitterSampler, sampler: LineSampler, count: int, settings: PathSettings, seed: int
-) -> VirtualLights:
-    """The lights at the crossings of ``count`` lines."""
-    hits = hits_of(scene, sampler.draw(count, derived_seed(seed, 2)), sampler.scene_size, derived_seed(seed, 4))
-    return _lights_at(scene, emitters, hits, sampler, count, settings, derived_seed(seed, 1))
-
-
 def _lights_at(
-    scene, emitters: EmitterSampler, hits: LineHits, sampler: LineSampler, lines: int, settings: PathSettings, seed: int
+    scene, emitters: EmitterSampler, hits: LineHits, c: LocalC, lines: int, settings: PathSettings, seed: int
 ) -> VirtualLights:
     """A light at every hit of ``lines`` lines on a surface with a minorant: minorant × irradiance over the density.
 
@@ -104,13 +98,16 @@ def _lights_at(
     irradiance, length, group = _irradiance(scene, emitters, places, settings, seed)
     position = dr.gather(mi.Point3f, hits.position, hit)
     sent = spectrum_to_rgb(minorant * irradiance)
-    dr.eval(position, sent, length, group)
-    density = lines * download(sampler.density(position, places.normal))
+    density = c.density.per_area(position, places.normal)
+    squared_c = c.squared(position, places.normal)
+    dr.eval(position, sent, length, group, density, squared_c)
+    density = lines * download(density)
     position, normal, sent, length = (download(x) for x in (position, places.normal, sent, length))
     with np.errstate(over="ignore"):
         intensity = (sent / density[:, None]).astype(np.float32)
     lights = VirtualLights.of("surface", position, normal, intensity, length, facing=download(places.facing))
     lights.uncertainty, lights.group = hits.uncertainty[download(hit)], download(group)
+    lights.c = np.sqrt(download(squared_c))
     return lights.select((lights.intensity != 0).any(1))
 
 

@@ -15,6 +15,7 @@ from ..lights.perturbed import Perturbed
 from .contributions import Layers
 from .cost_model import CostModel
 from .emitters.base import EmitterSampler
+from .local_c import LocalC
 from .pixel_rays import PixelRays
 from .roulette import OutgoingRadiance
 
@@ -68,14 +69,14 @@ class PathRules:
 class PathSettings:
     """Settings of :func:`trace_paths`, opaque on the device unless stated.
 
-    ``max_depth``, ``rr_depth``: as in ``path``; ``squared_c``: c², world units²; ``gathering``: a :class:`Gathering`;
+    ``max_depth``, ``rr_depth``: as in ``path``; ``c``: of lights on surfaces; ``gathering``: a :class:`Gathering`;
     ``emitters_carried``: whether virtual lights represent emitters, with ``emitters_squared_c``; ``outgoing``: for
     Russian roulette; ``perturbed``: shapes without a minorant; ``hide_emitters``: a Python bool.
     """
 
     max_depth: mi.UInt32
     rr_depth: mi.UInt32
-    squared_c: mi.Float
+    c: LocalC
     gathering: mi.UInt32
     emitters_carried: mi.Bool
     emitters_squared_c: mi.Float
@@ -143,11 +144,13 @@ class FirstEdge(Edge):
 class ViewLights:
     """Virtual lights on ``surfaces`` and virtual lights representing ``emitters``; None for no lights.
 
-    The smallest distance of each set is the c of the set, see :mod:`vpl.transport.carried_share`.
+    ``c``: of lights on surfaces.  The smallest distance of lights representing emitters is their c, see
+    :mod:`vpl.transport.carried_share`.
     """
 
     surfaces: LightSet | None = None
     emitters: LightSet | None = None
+    c: LocalC | None = None
 
     @property
     def all(self) -> list[LightSet]:
@@ -202,15 +205,15 @@ class View:
         first = np.arange(pairs) * self.count // pairs // 2 * 2
         return np.minimum(first[:, None] + [0, 1], self.count - 1).reshape(-1)
 
-    def light_set(self, groups: list[LightGroup], spacing: float) -> LightSet:
-        """The light set of ``groups`` with a typical distance ``spacing`` between lights, world units; sets the c of
-        the set."""
-        return LightSet(groups, self.model.c_per_spacing * spacing, self.rules.max_depth, 0, 0, {})
+    def light_set(self, groups: list[LightGroup], smallest_distance: float = 0.0) -> LightSet:
+        """The light set of ``groups`` in this view."""
+        return LightSet(groups, smallest_distance, self.rules.max_depth, 0, 0, {})
 
-    def emitter_lights(self, groups: list[LightGroup]) -> LightSet:
-        """The light set representing emitters; ``groups`` may be empty if only c is needed."""
+    @property
+    def emitters_c(self) -> float:
+        """c of lights representing emitters, world units."""
         lights = self.emitters.lights
-        return self.light_set(groups, lights.spacing(lights.points(self.count, self.model)))
+        return self.model.c_per_spacing * lights.spacing(lights.points(self.count, self.model))
 
     def settings(self, lights: ViewLights, least: int = Gathering.NOWHERE) -> PathSettings:
         """Settings of paths of which ``lights`` carry a part; without lights, vertices are gathered by ``least``."""
@@ -218,11 +221,10 @@ class View:
         # vertices, the lights would add more variance than the lights remove
         gathering = Gathering.EVERYWHERE if lights.surfaces else Gathering.AT_FIRST if lights.emitters else least
         longest = dr.opaque(mi.UInt32, int(min(self.rules.max_depth, 0xFFFFFFFF)))
-        squared_c, of_emitters = (
-            dr.opaque(mi.Float, (x.smallest_distance if x else _WHOLE) ** 2) for x in (lights.surfaces, lights.emitters)
-        )
+        c = lights.c or LocalC.constant(_WHOLE)
+        of_emitters = dr.opaque(mi.Float, (lights.emitters.smallest_distance if lights.emitters else _WHOLE) ** 2)
         return PathSettings(
-            longest, dr.opaque(mi.UInt32, self.rules.rr_depth), squared_c, dr.opaque(mi.UInt32, gathering),
+            longest, dr.opaque(mi.UInt32, self.rules.rr_depth), c, dr.opaque(mi.UInt32, gathering),
             dr.opaque(mi.Bool, lights.emitters is not None), of_emitters, self.outgoing, self.perturbed,
             self.rules.hide_emitters,
         )  # fmt: skip

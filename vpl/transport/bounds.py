@@ -79,7 +79,7 @@ def contribution_bound(kind: str, receiver: Receiver, node: Node, smallest_dista
     reflected = channel_mean(_material_bound(proxy, cosine, mirror) * node.intensity)
     if kind == "surface":
         # w G grows with the geometry term G
-        factor = carried_geometry_term(dr.square(smallest_distance), factor * cosine)
+        factor = carried_geometry_term(dr.square(node.least_c), factor * cosine)
         reflected = channel_mean(proxy.base * node.intensity) & (cosine > 0)
     # A point inside a flat box has an infinite factor and no cosine: that is nothing, not NaN
     return dr.select(reflected > 0, factor * reflected, 0)

@@ -23,12 +23,12 @@ def contribution(kind: str, surface, light: Light, smallest_distance, active=Tru
     """Radiance that leaves a surface due to an unoccluded light: BSDF × cosine × geometry × intensity.
 
     ``surface``: see :mod:`vpl.points.surfaces`, Lambertian for surface lights (contribution multiplied by w);
-    ``smallest_distance``: the clamp, or c for surface lights.  Infinite and NaN values count as zero.
+    ``smallest_distance``: the clamp of oriented lights.  Infinite and NaN values count as zero.
     """
     to_light, factor = geometry(kind, surface.interaction.p, light, smallest_distance)
     if kind == "surface":
         cosine = dr.maximum(dr.dot(surface.normal, to_light), 0)
-        factor *= carried_share(dr.square(smallest_distance), cosine * factor)
+        factor *= carried_share(dr.square(light.c), cosine * factor)
     active = active & (factor > 0)
     reflected = surface.reflected(to_light, active)
     return finite_or_zero(reflected * rgb_to_spectrum(light.intensity) * factor) & active

@@ -131,7 +131,7 @@ def test_no_lights_stand_for_emitters_with_normals_of_vertices(tmp_path, always)
     scene = mi.load_dict(closed_box(bulbs(64, rng) | smooth_tile(tmp_path), 16))
     emitters = sampler_of(scene, rng, False)
     assert emitters.lights.carried.tolist() == [False]
-    assert [group.kind for group in emitters.lights.groups(1000, 0)] == ["spot"]
+    assert [group.kind for group in emitters.lights.groups(1000, 0.1, 0)] == ["spot"]
     assert_lights_stand_for_emitters(mi.load_dict({"type": "manylights", "max_depth": 3}), scene, 64)
     assert_image_of_path(scene, max_depth=3)
 
@@ -199,7 +199,7 @@ def test_a_dim_emitter_next_to_a_bright_one_has_points():
             lights.emitters, area=dataclasses.replace(lights.emitters.area, radiance=radiance)
         ),
     )
-    (group,) = uneven.groups(1000, 0)
+    (group,) = uneven.groups(1000, 0.1, 0)
     found = np.array(group.lights.gather(dr.arange(mi.UInt32, 1000)).intensity)[0]
     np.testing.assert_allclose(found.sum(), uneven.emitters.area.power.sum() / np.pi, rtol=0.05)
     assert (found < 1e-3 * found.max()).sum() == pytest.approx(500, rel=0.1)
@@ -229,7 +229,7 @@ def test_lights_have_the_power_of_the_emitters_and_typical_distances():
     rng = np.random.default_rng(2)
     scene = mi.load_dict(closed_box(panels(100, rng) | bulbs(50, rng)))
     lights = sampler_of(scene, rng, False).lights
-    omni, areas = lights.groups(20_000, 0)
+    omni, areas = lights.groups(20_000, 0.1, 0)
     area = lights.emitters.area
     assert omni.count == 50 and areas.count == 20_000
     np.testing.assert_allclose(omni.lights.scalar_intensity.sum(), lights.omni.intensity.mean(1).sum(), rtol=1e-5)

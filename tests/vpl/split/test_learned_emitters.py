@@ -18,6 +18,7 @@ from vpl.split.emitters import cell_choice
 from vpl.split.emitters.cell_choice import CellChoice
 from vpl.split.emitters.learned import LearnedEmitters
 from vpl.split.gather_vertices import LitVertices
+from vpl.split.local_c import LocalC
 from vpl.split.spatial_cells import SpatialCells
 from vpl.split.view import ViewLights
 
@@ -243,7 +244,8 @@ def test_the_weights_of_gather_vertices_are_finite():
 
     def look(*arguments):
         view = original(*arguments)
-        lane, lights = dr.arange(mi.UInt32, view.count), ViewLights(LightSet([], 0.1, plugin.max_depth, 0, 0, {}))
+        lane = dr.arange(mi.UInt32, view.count)
+        lights = ViewLights(LightSet([], 0, plugin.max_depth, 0, 0, {}), c=LocalC.constant(0.1))
         gathered = trace_camera_rays(view, lane, view.settings(lights), 9).gathered
         seen.extend(np.isfinite(np.array(x.weight)).all() for x in (gathered.first, gathered.later))
         return view

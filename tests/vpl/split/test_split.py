@@ -7,22 +7,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import stats
 
 from tests.support.catalogue import EMITTERS, MATERIALS, one_of, stage
-from tests.support.properties import examples, unit_vectors
+from tests.support.properties import points, seeds, unit_vectors
 from vpl.core.arrays import download, upload, upload_vectors
 from vpl.direct.emitter_sampling import power_heuristic
 from vpl.lights.light_set import ScatteredGroup
 from vpl.lights.perturbed import Perturbed
 from vpl.lights.virtual_lights import DeviceLights, VirtualLights
 from vpl.points.surfaces import LambertianSurface
-from vpl.split.arrival_octree import ArrivalOctree
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
 from vpl.split.lattice import Lattice, lattice_multiplier
-from vpl.split.line_sampling import LineSampler
 from vpl.split.pixel_clusters import PixelClusters, Receivers
 from vpl.split.pixel_rays import PixelRays
 from vpl.split.spatial_cells import FACINGS, facing
@@ -31,20 +27,6 @@ from vpl.transport.bounds import contribution_bound
 from vpl.transport.carried_share import carried_geometry_term, carried_share
 from vpl.transport.contribution import contribution
 from vpl.transport.minorant import agrees, minorant_of, side_of
-
-
-def points(columns):
-    return mi.Point3f(*(upload(mi.Float, columns[:, k]) for k in range(3)))
-
-
-def seeds(usual):
-    """A property of random scenes, by their seed."""
-
-    def decorate(test):
-        return settings(max_examples=examples(usual), deadline=None)(given(st.integers(0, 2**31))(test))
-
-    return decorate
-
 
 # ---------------------- Minorants ----------------------
 
@@ -170,90 +152,6 @@ def test_numbers_of_other_dimensions_vertices_pixels_and_seeds_are_independent()
         assert abs(np.corrcoef(dimension[:-1, 0], dimension[1:, 0])[0, 1]) < 0.08
 
 
-# ---------------------- Cells ----------------------
-
-
-def cells_on_sphere_and_plane(seed, tilt):
-    """Points on the outside of a sphere and on top of a plane; `tilt`: whether their normals are given."""
-    rng = np.random.default_rng(seed)
-    ball = unit_vectors(rng, 300).astype(np.float64)
-    plane = np.column_stack([rng.uniform(-2, 2, (300, 2)), np.full(300, -1.5)])
-    position = np.concatenate([0.8 * ball, plane])
-    normal = np.concatenate([ball, np.repeat([[0.0, 0.0, 1.0]], 300, 0)]) * tilt
-    return ArrivalOctree(position, normal, rng.uniform(0.1, 1, 600), [-2.5] * 3, 5.0, rng)
-
-
-def rays_of(lines):
-    """(Origins, directions, lengths) in double precision."""
-    return tuple(download(x).astype(np.float64) for x in (lines.origin, lines.direction, lines.length))
-
-
-def density_of(sampler, position, normal):
-    return download(sampler.density(*(upload_vectors(mi.Vector3f, np.float32(x)) for x in (position, normal))))
-
-
-def hits_of_sphere(lines, radius=0.8):
-    """(position, normal of the hit side) of all hits."""
-    o, d, length = rays_of(lines)
-    b = (o * d).sum(1)
-    disc = b**2 - (o**2).sum(1) + radius**2
-    found = []
-    for sign in (-1, 1):
-        t = -b + sign * np.sqrt(np.maximum(disc, 0))
-        ok = (disc > 0) & (t > 0) & (t < length)
-        p = (o + t[:, None] * d)[ok]
-        found.append((p, -sign * p / radius))
-    return tuple(np.concatenate(columns) for columns in zip(*found, strict=True))
-
-
-def hits_of_plane(lines, height=-1.5):
-    o, d, length = rays_of(lines)
-    t = (height - o[:, 2]) / d[:, 2]
-    p = o + t[:, None] * d
-    ok = (t > 0) & (t < length) & (np.abs(p[:, :2]) < 2).all(1)
-    return p[ok], np.where(d[ok, 2:] < 0, 1.0, -1.0) * [[0, 0, 1]]
-
-
-@pytest.mark.parametrize("tilt", [0, 1])
-@pytest.mark.parametrize("seed", range(3))
-def test_lines_meet_surfaces_with_the_density_that_is_said(seed, tilt):
-    """The mean of 1 / density over hits is the area of each side, in every octant and quadrant."""
-    cells, count = cells_on_sphere_and_plane(seed, tilt), 400_000
-    sampler = LineSampler(cells)
-    lines = sampler.draw(count, seed + 100)
-    for hits, area in ((hits_of_sphere, 4 * np.pi * 0.64 / 8), (hits_of_plane, 16 / 4)):
-        position, normal = hits(lines)
-        density = density_of(sampler, position, np.broadcast_to(normal, position.shape))
-        assert (density > 0).all()
-        outside = (normal * (position if hits is hits_of_sphere else [[0, 0, 1]])).sum(1) > 0
-        parts = position[:, 0] > 0, position[:, 1] > 0, (position[:, 2] > 0) & (hits is hits_of_sphere)
-        key = sum(part * 2**k for k, part in enumerate(parts))
-        for side in (False, True):
-            for octant in np.unique(key):
-                weight = np.where((outside == side) & (key == octant), 1 / density, 0)
-                error = np.sqrt((weight**2).sum()) / count
-                assert abs(weight.sum() / count - area) < 5 * error
-
-
-@seeds(20)
-def test_lines_stay_in_the_scene_and_every_side_has_a_density(seed):
-    rng = np.random.default_rng(seed)
-    size = 10.0 ** rng.uniform(-4, 4)
-    count = int(rng.integers(1, 200))
-    flat = rng.random(3) < 0.3
-    position = np.where(flat, 0.5, rng.random((count, 3))) * size
-    normal = unit_vectors(rng, count)
-    cells = ArrivalOctree(position, normal, rng.uniform(0.1, 1, count), [-0.1 * size] * 3, 1.2 * size, rng)
-    cells.choose_by(rng.random(len(cells.leaf_weight)) + 1e-3)
-    sampler = LineSampler(cells)
-    for side in (normal, -normal):
-        density = density_of(sampler, position, side)
-        assert (density > 0).all() and np.isfinite(density).all()
-    origin, direction, length = rays_of(sampler.draw(500, seed))
-    assert np.isfinite(origin).all() and (length >= 0).all()
-    np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1, atol=1e-5)
-
-
 # ---------------------- Bounds, lights and clusters ----------------------
 
 
@@ -266,6 +164,7 @@ def surface_lights(rng, count, spread=1.0):
     )  # fmt: skip
     facing = direction + 0.3 * unit_vectors(rng, count)
     lights.facing = (facing / np.linalg.norm(facing, axis=1, keepdims=True)).astype(np.float32)
+    lights.c = rng.uniform(0, 1, count).astype(np.float32)
     return lights
 
 
@@ -291,28 +190,41 @@ def test_bounds_are_above_what_lights_of_surfaces_contribute(seed):
     receivers = Receivers.of(*box, upload(mi.Float, cosines[:1]))
     node = SimpleNamespace(
         center=points(center[1:]), extent=mi.Vector3f(points(extent[1:])), axis=mi.Vector3f(points(axes[1:])),
-        cosine=upload(mi.Float, cosines[1:]), intensity=mi.Color3f(intensity),
+        cosine=upload(mi.Float, cosines[1:]), intensity=mi.Color3f(intensity), least_c=mi.Float(c),
     )  # fmt: skip
-    bound = float(np.array(contribution_bound("surface", receivers.receiver, node, mi.Float(c)))[0])
+    bound = float(np.array(contribution_bound("surface", receivers.receiver, node, mi.Float(0)))[0])
     assert bound >= true * (1 - 1e-4)
 
 
 def test_a_pair_contributes_what_the_split_leaves_to_it():
     """F G w, in double precision; nothing behind the geometric or the shading normal of either end."""
-    rng, count, c = np.random.default_rng(2), 2000, 0.4
+    rng, count = np.random.default_rng(2), 2000
     lights = surface_lights(rng, count)
     position, normal = rng.normal(size=(count, 3)).astype(np.float32), unit_vectors(rng, count)
     offset = lights.position.astype(np.float64) - position
     d2 = (offset**2).sum(1)
     to_light = offset / np.sqrt(d2)[:, None]
     cosine1, cosine2 = np.maximum((normal * to_light).sum(1), 0), np.maximum(-(lights.direction * to_light).sum(1), 0)
-    shared = cosine1 * cosine2 / (d2 + c**2 * cosine1 * cosine2) * ((lights.facing * to_light).sum(1) < 0)
+    shared = (
+        cosine1
+        * cosine2
+        / (d2 + lights.c.astype(np.float64) ** 2 * cosine1 * cosine2)
+        * ((lights.facing * to_light).sum(1) < 0)
+    )
     interaction = dr.zeros(mi.Interaction3f, count)
     interaction.p, interaction.n = points(position), mi.Normal3f(points(normal))
     surface = LambertianSurface(interaction, dr.full(mi.UInt32, 1, count), interaction.n, mi.Color3f(1))
     light = DeviceLights(lights).gather(dr.arange(mi.UInt32, count))
-    found = np.array(contribution("surface", surface, light, mi.Float(c))).T
+    found = np.array(contribution("surface", surface, light, mi.Float(0))).T
     np.testing.assert_allclose(found, shared[:, None] * lights.intensity, rtol=1e-3, atol=1e-5)
+
+
+def test_nodes_know_the_least_c_of_their_lights():
+    lights = surface_lights(np.random.default_rng(5), 200)
+    group = ScatteredGroup.of(lights, 1)
+    first, last, order = (np.array(x) for x in (group.first, group.last, group.order))
+    least = download(group.tree.gather(dr.arange(mi.UInt32, group.tree.count)).least_c)
+    np.testing.assert_array_equal(least, [lights.c[order[a:b]].min() for a, b in zip(first, last, strict=True)])
 
 
 def test_lights_of_a_node_are_drawn_by_their_share_of_its_intensity():
