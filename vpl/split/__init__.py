@@ -34,7 +34,8 @@ The lights and the decisions:
 - ``cost_model``: every constant of the decisions, with unit and evidence
 - ``plan``: whether lights pay, the number of lights, and the fineness of the clusters
 - ``arrival_octree``: boxes around the arrivals of camera paths
-- ``line_sampling``: random lines through the boxes, with a known density on surfaces
+- ``line_sampling``, ``line_density``: random lines through the boxes, and their density on surfaces
+- ``local_c``: c of the share w by place, from this density
 - ``line_hits``: crossings of random lines with surfaces, each counted once
 - ``surface_lights``: a virtual light at each crossing of a line with a surface; kept lights
 - ``emitter_lights``: virtual lights representing many emitters
