@@ -82,10 +82,10 @@ class LightGroup:
 class LightSet:
     """Lights of one render.
 
-    ``groups``: non-empty groups; ``smallest_distance``: clamping distance of oriented lights, world units; ``clamp``:
-    the same number on the device, opaque to kernels; ``max_depth``: edges of the longest path from camera to emitter;
-    ``paths``: number of emitted light paths; ``dropped``: number of lights with non-finite values; ``seconds``: time by
-    stage.
+    ``groups``: non-empty groups; ``smallest_distance``: clamping distance of oriented lights, world units, 0 for
+    none; ``clamp``: the same number on the device, opaque to kernels; ``max_depth``: edges of the longest path from
+    camera to emitter; ``paths``: number of emitted light paths; ``dropped``: number of lights with non-finite values;
+    ``seconds``: time by stage.
     """
 
     groups: list[LightGroup]
@@ -204,15 +204,16 @@ class ScatteredGroup(LightGroup):
     def of(cls, lights: VirtualLights, seed: int, sign: float = 1.0) -> ScatteredGroup:
         """Group with a tree over lights of one kind; ``seed``: of the representatives; ``sign``: see LightGroup.
 
-        Surface lights need a c.
+        Surface lights need a c.  Their clusters have the least c in place of a representative.
         """
         tree = _tree_of(lights, np.random.default_rng(seed), _SMALL_WINDOW)
-        if lights.c is not None:
+        representative = tree.representative.copy()
+        if lights.kind == "surface":
             tree.records[:, LEAST_C] = -largest_below(tree, -lights.c)
         first, last = (upload(mi.UInt32, column) for column in _leaf_ranges(tree).T)
         intensity = lights.intensity.mean(1, dtype=np.float64)
         return cls(
-            lights.kind, DeviceLights(lights), DeviceTree(lights.kind, tree, tree.representative), first, last,
+            lights.kind, DeviceLights(lights), DeviceTree(lights.kind, tree, representative), first, last,
             upload(mi.UInt32, tree.leaf_order), running_sums(upload(mi.Float, intensity[tree.leaf_order])), sign=sign,
         )  # fmt: skip
 

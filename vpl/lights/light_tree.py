@@ -65,7 +65,7 @@ class LightTree:
     records: (2n - 1, 16) float32. BOX_MIN, BOX_MAX: exact bounds of the positions, world units (zeros for lights at
       infinity). CONE_AXIS, CONE_COS: unit axis and cosine of the half-angle of a cone around the directions (+z and -1
       for omnidirectional lights). INTENSITY, FLUX: summed flux, as the mean over channels and per channel. ESCAPE,
-      REPRESENTATIVE: uint32 bit patterns, see the properties.
+      REPRESENTATIVE: uint32 bit patterns, see the properties. LEAST_C: in place of REPRESENTATIVE, see ScatteredGroup.
     leaf_order: (n,) uint32, the caller's indices of the lights in preorder. A node's lights are a contiguous range.
     depth: edges from the root to the deepest leaf.
     """

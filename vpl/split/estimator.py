@@ -119,9 +119,9 @@ def make_lights(view: View, decision: Decision, kept: KeptLights | None, clock: 
         return lights, statistics
     clock.begin(Stage.TREE)
     sources, c, seed = view.emitters.lights, view.emitters_c, derived_seed(view.seed, Stream.EMITTER_LIGHTS)
-    emitters = view.light_set(sources.groups(sources.points(view.count, view.model), c, seed), c)
+    emitters = view.light_set(sources.groups(sources.points(view.count, view.model), c, seed))
     counts = statistics.get("lights", {}) | {"emitters": emitters.count}
-    return replace(lights, emitters=emitters), statistics | {"lights": counts}
+    return replace(lights, emitters=emitters, emitters_c=c), statistics | {"lights": counts}
 
 
 def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clock: Clock) -> tuple[ViewLights, dict]:

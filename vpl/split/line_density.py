@@ -1,13 +1,14 @@
 """Density of random lines on surfaces by place, for kernels: a table along the Morton curve of the octree.
 
 Nodes of the octree are ranges of Morton codes.  The ends of the ranges of all boxes cut the curve into intervals, and
-an interval lies in at most one leaf and in a fixed set of parents.  A single search finds the interval of a place.  A
-record holds A and B of the density
+an interval lies in at most one leaf and in a fixed set of parents.  A single search finds the interval of a place.  On
+the side of a surface with the normal n, the density is
 
-    anywhere + A + n·B
+    anywhere + A + n·B.
 
-on a surface with the normal n, and a second record A and B in the box of the leaf.  A box of surface S that is drawn
-with probability p, with the mean normal M, adds p / S (1 + n·M): see :mod:`vpl.split.line_sampling`.
+Each interval has two records of A and B, for places outside and inside of the box of its leaf.  A box with the surface
+area S that is drawn with probability p, with the mean normal M, adds p / S (1 + n·M): see
+:mod:`vpl.split.line_sampling`.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ class LineDensity:
     """Expected hits of a line in an area of ``unit``², the squared extent of the scene, which keeps the numbers small.
 
     ``low``, ``per_cell``: lower corner of the octree, and the inverse of the size of its finest cells; ``guides``: for
-    each node of a level, the first interval and the last + 1; ``start``: Morton code of each interval; ``terms``: two
-    records (B, A) of each interval; ``box``: lower and upper corner of the box in the leaf, four numbers each;
-    ``anywhere``: through the whole scene.  World units; opaque.
+    each node of the level ``_GUIDED``, the first interval and the last + 1; ``start``: Morton code of each interval;
+    ``terms``: two records (B, A) of each interval; ``box``: lower and upper corner of the box in the leaf, four numbers
+    each; ``anywhere``: through the whole scene.  World units; opaque.
     """
 
     unit: float
@@ -93,9 +94,9 @@ class LineDensity:
         terms = dr.gather(mi.Vector4f, self.terms, 2 * row + dr.select(in_box, mi.UInt32(1), 0), inside)
         return self.anywhere + dr.select(inside, dr.maximum(terms.w + dr.dot(mi.Vector3f(normal), terms.xyz), 0), 0)
 
-    def per_area(self, position: mi.Point3f, normal: mi.Vector3f) -> mi.Float64:
-        """Expected hits of a line per area, in double precision, which holds the squares of small distances."""
-        return mi.Float64(self.at(position, normal)) / dr.opaque(mi.Float64, self.unit**2)
+    def per_area(self, density: np.ndarray) -> np.ndarray:
+        """Densities (n,) from :meth:`at` per world unit², float64, which holds the squares of small distances."""
+        return density.astype(np.float64) / self.unit**2
 
 
 def _rounded_inwards(boxes: Boxes) -> np.ndarray:

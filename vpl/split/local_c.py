@@ -1,13 +1,13 @@
-"""c of the share w of virtual lights on surfaces, by place: the only place that computes c.
+"""c of virtual lights on surfaces, by place: the only code that computes it.
 
-A light at a place where lines hit surfaces with the density ρ (per area) stands for an area 1 / ρ.  Its contribution
-is bounded by its intensity / c², and the intensity is proportional to 1 / ρ (:mod:`vpl.transport.carried_share`).  With
+Where lines hit surfaces with the density ρ (per area), a light stands for the area 1 / ρ, and its intensity is the
+radiance L of the surface over ρ.  The light contributes at most its intensity over c²
+(:mod:`vpl.transport.carried_share`).  With
 
     c² = k² / ρ,
 
-no light contributes more than light that arrives at, and is reflected by, its place, over k².  Where lights are sparse,
-for example beyond the edge of the image, they leave more of the light nearby to paths and make no soft spots.  Where
-lights are dense, they carry more.
+every light thus contributes at most L / k².  Where lights are sparse, for example beyond the edge of the image, they
+leave more of the light nearby to paths and make weaker soft spots.  Where lights are dense, they carry more.
 """
 
 from __future__ import annotations
@@ -38,5 +38,9 @@ class LocalC:
         return cls(LineDensity.even(), dr.opaque(mi.Float, c**2))
 
     def squared(self, position: mi.Point3f, normal: mi.Vector3f, active=True) -> mi.Float:
-        """c² of the sides of surfaces with a ``normal``, world units²."""
-        return self.scale / self.density.at(position, normal, active)
+        """c² on the sides of surfaces with a ``normal``, world units²."""
+        return self.squared_by(self.density.at(position, normal, active))
+
+    def squared_by(self, density: mi.Float) -> mi.Float:
+        """c² where the density has this value, world units²."""
+        return self.scale / density

@@ -5,7 +5,7 @@ The passes of a render may share a start.  Larger passes learn the emitters agai
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import drjit as dr
@@ -14,7 +14,6 @@ import numpy as np
 
 from ..core.arrays import upload
 from ..core.sampling import derived_seed
-from ..lights.light_set import LightSet
 from .camera_rays import CameraRays
 from .cost_model import CostModel
 from .emitters.base import EmitterSampler
@@ -130,15 +129,15 @@ def _refusal(view: View, virtual_lights: bool) -> str:
 def _options(view: View, pilot: Pilot) -> list[Option]:
     """Kinds of virtual lights that are possible."""
     if not _may_carry_emitters(view):
-        return _with_surfaces(view, pilot, None)
-    emitters = view.light_set([], view.emitters_c)
-    traced = Pilot.trace(view, ViewLights(emitters=emitters))
+        return _with_surfaces(view, pilot, ViewLights())
+    emitters = ViewLights(emitters=view.light_set([]), emitters_c=view.emitters_c)
+    traced = Pilot.trace(view, emitters)
     only_emitters = Option(False, True, traced.radiance, traced.indirect)
-    return [only_emitters, *_with_surfaces(view, pilot, None), *_with_surfaces(view, traced, emitters)]
+    return [only_emitters, *_with_surfaces(view, pilot, ViewLights()), *_with_surfaces(view, traced, emitters)]
 
 
-def _with_surfaces(view: View, traced: Pilot, emitters: LightSet | None) -> list[Option]:
-    """The option of lights on surfaces, if there is indirect light, beside lights for ``emitters``; ``traced``: pilot
+def _with_surfaces(view: View, traced: Pilot, lights: ViewLights) -> list[Option]:
+    """The option of lights on surfaces, if there is indirect light, beside ``lights`` for emitters; ``traced``: pilot
     without lights on surfaces.
 
     The option is measured for the first pass in which its lights may pay, and until then keeps the pilot's rays, but
@@ -147,7 +146,8 @@ def _with_surfaces(view: View, traced: Pilot, emitters: LightSet | None) -> list
     if view.rules.max_depth <= 2 or not traced.indirect.any():
         return []
     # The distance between lights is not known yet. With c = 0 lights carry the most
-    settings = view.settings(ViewLights(view.light_set([]), emitters, LocalC.constant(0.0)), Gathering.AT_FIRST)
+    with_surfaces = replace(lights, surfaces=view.light_set([]), c=LocalC.constant(0.0))
+    settings = view.settings(with_surfaces, Gathering.AT_FIRST)
     rays = CameraRays.of(view, upload(mi.UInt32, pilot_lanes(view)))
     # Otherwise the rays would keep those of the view
     dr.eval(rays.ray, rays.active, rays.importance, rays.places)
@@ -156,4 +156,4 @@ def _with_surfaces(view: View, traced: Pilot, emitters: LightSet | None) -> list
     def residual():
         return mean_radiance(measured().radiance)
 
-    return [Option(True, emitters is not None, traced.radiance, traced.indirect, residual)]
+    return [Option(True, lights.emitters is not None, traced.radiance, traced.indirect, residual)]

@@ -98,10 +98,10 @@ def _lights_at(
     irradiance, length, group = _irradiance(scene, emitters, places, settings, seed)
     position = dr.gather(mi.Point3f, hits.position, hit)
     sent = spectrum_to_rgb(minorant * irradiance)
-    density = c.density.per_area(position, places.normal)
-    squared_c = c.squared(position, places.normal)
+    density = c.density.at(position, places.normal)
+    squared_c = c.squared_by(density)
     dr.eval(position, sent, length, group, density, squared_c)
-    density = lines * download(density)
+    density = lines * c.density.per_area(download(density))
     position, normal, sent, length = (download(x) for x in (position, places.normal, sent, length))
     with np.errstate(over="ignore"):
         intensity = (sent / density[:, None]).astype(np.float32)

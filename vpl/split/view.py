@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import drjit as dr
@@ -144,13 +144,14 @@ class FirstEdge(Edge):
 class ViewLights:
     """Virtual lights on ``surfaces`` and virtual lights representing ``emitters``; None for no lights.
 
-    ``c``: of lights on surfaces.  The smallest distance of lights representing emitters is their c, see
-    :mod:`vpl.transport.carried_share`.
+    ``c``: of lights on surfaces; ``emitters_c``: of lights representing emitters, world units.  Without such lights,
+    c is beyond every distance, and the lights would carry nothing.
     """
 
     surfaces: LightSet | None = None
     emitters: LightSet | None = None
-    c: LocalC | None = None
+    c: LocalC = field(default_factory=lambda: LocalC.constant(_WHOLE))
+    emitters_c: float = _WHOLE
 
     @property
     def all(self) -> list[LightSet]:
@@ -205,9 +206,9 @@ class View:
         first = np.arange(pairs) * self.count // pairs // 2 * 2
         return np.minimum(first[:, None] + [0, 1], self.count - 1).reshape(-1)
 
-    def light_set(self, groups: list[LightGroup], smallest_distance: float = 0.0) -> LightSet:
+    def light_set(self, groups: list[LightGroup]) -> LightSet:
         """The light set of ``groups`` in this view."""
-        return LightSet(groups, smallest_distance, self.rules.max_depth, 0, 0, {})
+        return LightSet(groups, 0, self.rules.max_depth, 0, 0, {})
 
     @property
     def emitters_c(self) -> float:
@@ -221,10 +222,8 @@ class View:
         # vertices, the lights would add more variance than the lights remove
         gathering = Gathering.EVERYWHERE if lights.surfaces else Gathering.AT_FIRST if lights.emitters else least
         longest = dr.opaque(mi.UInt32, int(min(self.rules.max_depth, 0xFFFFFFFF)))
-        c = lights.c or LocalC.constant(_WHOLE)
-        of_emitters = dr.opaque(mi.Float, (lights.emitters.smallest_distance if lights.emitters else _WHOLE) ** 2)
         return PathSettings(
-            longest, dr.opaque(mi.UInt32, self.rules.rr_depth), c, dr.opaque(mi.UInt32, gathering),
-            dr.opaque(mi.Bool, lights.emitters is not None), of_emitters, self.outgoing, self.perturbed,
-            self.rules.hide_emitters,
+            longest, dr.opaque(mi.UInt32, self.rules.rr_depth), lights.c, dr.opaque(mi.UInt32, gathering),
+            dr.opaque(mi.Bool, lights.emitters is not None), dr.opaque(mi.Float, lights.emitters_c**2),
+            self.outgoing, self.perturbed, self.rules.hide_emitters,
         )  # fmt: skip

@@ -43,8 +43,8 @@ def hits_on_ground(scene, count=100_000):
     hits = hits_of(scene, sampler.draw(count, 1), size, 2)
     normal = download(scene.ray_intersect(hits.ray).n)
     normal *= -np.sign((normal * download(hits.ray.d)).sum(1, keepdims=True))
-    density = sampler.density.per_area(hits.position, upload_vectors(mi.Vector3f, normal))
-    return hits, normal, count * download(density)
+    density = download(sampler.density.at(hits.position, upload_vectors(mi.Vector3f, normal)))
+    return hits, normal, count * sampler.density.per_area(density)
 
 
 @not_on_cuda("OptiX finds hits on a plane of a million units to within 0.2 units")
