@@ -12,7 +12,7 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import add_at
+from ..core.loops import recorded_once
 from ..core.sampling import HASH_ROUNDS
 from .pixel_rays import PixelRays, RayNumbers
 
@@ -81,12 +81,8 @@ class FilmCells:
         """
         if not self.rays.differ:
             return dr.gather(type(values), values, self._ray)
-        channels = []
-        for channel in values if dr.depth_v(values) > 1 else [values]:
-            total = dr.zeros(mi.Float, self.count)
-            add_at(total, channel, self._places.pixel)
-            channels.append(dr.gather(mi.Float, total / self._numbers, self._even_places.pixel))
-        return type(values)(*channels)
+        means = (self._means(channel) for channel in (values if dr.depth_v(values) > 1 else [values]))
+        return type(values)(*(dr.gather(mi.Float, mean, self._even_places.pixel) for mean in means))
 
     def evenly_masked(self, mask: mi.Bool, seed: int) -> mi.Bool:
         """As :meth:`evenly`, for a ``mask``: a multiple of 1 / mean number for each cell, with the mean fraction."""
@@ -104,31 +100,44 @@ class FilmCells:
         return RayNumbers.of_lanes(dr.arange(mi.UInt32, self.rays.count), self.mean)
 
     @cached_property
-    def _places(self) -> RayNumbers:
-        """Places of all rays in the cells, evaluated."""
-        places = self.places(dr.arange(mi.UInt32, self.rays.count))
-        dr.eval(places)
-        return places
-
-    @cached_property
     def _ray(self) -> mi.UInt32:
         """The ray at each of the even places, for equal numbers of rays: the inverse of :meth:`places`, evaluated."""
-        parts, cells, width = (dr.opaque(mi.UInt32, x) for x in (self.parts, self.parts**2, self.width))
-        row, column = self._even_places.pixel // (width * parts), self._even_places.pixel % (width * parts)
-        pixel = row // parts * width + column // parts
-        part = row % parts * parts + column % parts
-        first = (part + cells - _turn(pixel, self._even_places.number) % cells) % cells
-        ray = pixel * dr.opaque(mi.UInt32, self.rays.mean) + self._even_places.number * cells + first
+        pixel, part = self._pixel_and_part(self._even_places.pixel)
+        cells = dr.opaque(mi.UInt32, self.parts**2)
+        ray = pixel * dr.opaque(mi.UInt32, self.rays.mean) + _number(pixel, part, self._even_places.number, cells)
         dr.eval(ray)
         return ray
 
-    @cached_property
-    def _numbers(self) -> mi.Float:
-        """Number of rays of each cell."""
-        numbers = dr.zeros(mi.Float, self.count)
-        add_at(numbers, dr.opaque(mi.Float, 1, self.rays.count), self._places.pixel)
-        dr.eval(numbers)
-        return numbers
+    def _pixel_and_part(self, cell: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+        """The pixel of each cell, and the number of the cell in the pixel."""
+        parts, width = (dr.opaque(mi.UInt32, x) for x in (self.parts, self.width))
+        row, column = cell // (width * parts), cell % (width * parts)
+        return row // parts * width + column // parts, row % parts * parts + column % parts
+
+    def _means(self, values: mi.Float) -> mi.Float:
+        """Mean over the rays of each cell, evaluated."""
+        pixel, part = self._pixel_and_part(dr.arange(mi.UInt32, self.count))
+        rays, cells = dr.gather(mi.UInt32, self.rays.by_level(self.sizes), pixel), dr.opaque(mi.UInt32, self.parts**2)
+        first = dr.gather(mi.UInt32, self.rays.device_first, pixel)
+        dr.eval(values, pixel, part, rays, first)
+        return _sums(values, pixel, part, rays, first, cells) / mi.Float(rays)
+
+
+@recorded_once
+@dr.syntax
+def _sums(values, pixel, part, rays, first, cells):
+    """Sum of the values of each cell's rays, in step: independent of the number of threads."""
+    total, k = dr.zeros(mi.Float, dr.width(pixel)), dr.zeros(mi.UInt32, dr.width(pixel))
+    while dr.hint(k < rays, exclude=[values, pixel, part, rays, first, cells]):
+        total += dr.gather(mi.Float, values, first + _number(pixel, part, k, cells))
+        k += 1
+    dr.eval(total)
+    return total
+
+
+def _number(pixel: mi.UInt32, part: mi.UInt32, turn: mi.UInt32, cells: mi.UInt32) -> mi.UInt32:
+    """Number in the pixel of the ray that a cell, ``part`` of ``cells``, gets in round ``turn``."""
+    return turn * cells + (part + cells - _turn(pixel, turn) % cells) % cells
 
 
 def _turn(pixel: mi.UInt32, turn: mi.UInt32) -> mi.UInt32:
