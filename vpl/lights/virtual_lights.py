@@ -129,7 +129,7 @@ class DeviceLights:
         if lights.c is not None:
             records[:, 15] = lights.c
         self.kind = lights.kind
-        self._facing, self._c = lights.facing is not None, lights.c is not None
+        self._facing = lights.facing is not None
         self.count = lights.count
         self.scalar_intensity = lights.intensity.mean(1, dtype=np.float64)
         self._records = upload(mi.Float, records)
@@ -140,7 +140,7 @@ class DeviceLights:
         second = dr.gather(mi.Vector4f, self._records, index * 4 + 1, active)
         third = dr.gather(mi.Vector4f, self._records, index * 4 + 2, active)
         cone, facing, c = mi.Vector2f(0), None, mi.Float(0)
-        if self.kind == "spot" or self._facing or self._c:
+        if self.kind in ("spot", "surface") or self._facing:
             fourth = dr.gather(mi.Vector4f, self._records, index * 4 + 3, active)
             cone, facing = mi.Vector2f(fourth.x, fourth.y), fourth.xyz if self._facing else None
             c = fourth.w

@@ -26,6 +26,8 @@ from .arrival_octree import LEVELS, SCENE_SHARE, ArrivalOctree, Boxes
 
 # Levels of the octree whose nodes have a guide to the search: 32 768 guides, so that most searches end in a few steps
 _GUIDED = 5
+# Beyond every coordinate in single precision, world units
+_REMOTE = 1e100
 
 
 @dataclass
@@ -59,25 +61,25 @@ class LineDensity:
         interval, row = _held(start, *of_leaves)
         terms[interval, 1] += _terms(octree.leaves, unit)[row]
         box[interval, :, :3] = _rounded_inwards(octree.leaves)[row]
-        return cls._of(unit, octree.low, octree.size, start, terms, box, SCENE_SHARE / 6)
+        of_guide = (8**_GUIDED + np.arange(8**_GUIDED + 1, dtype=np.uint64)) << np.uint64(3 * (LEVELS - _GUIDED))
+        first = np.searchsorted(start, of_guide[:-1], side="right") - 1
+        guides = np.stack([first, np.searchsorted(start, of_guide[1:], side="left")], 1)
+        # At least two entries: arrays of a single one change the kernels
+        start, terms, box = (np.concatenate([x, x[-1:]]) for x in (start, terms, box))
+        return cls._of(unit, octree.low, octree.size, guides, start, terms, box, SCENE_SHARE / 6)
 
     @classmethod
     def even(cls) -> LineDensity:
-        """A density of one at every place, in world units."""
-        none = np.zeros((1, 2, 4))
-        return cls._of(1.0, np.zeros(3), 1.0, np.array([8**LEVELS], np.uint64), none, none, 1.0)
+        """A density of one at every place, in world units: every place lies outside of a remote octree."""
+        none = np.zeros((2, 2, 4))
+        return cls._of(1.0, np.full(3, _REMOTE), 1.0, none[0], none[0, 0], none, none, 1.0)
 
     @classmethod
-    def _of(cls, unit, low, size, start, terms, box, anywhere) -> LineDensity:
-        of_guide = (8**_GUIDED + np.arange(8**_GUIDED + 1, dtype=np.uint64)) << np.uint64(3 * (LEVELS - _GUIDED))
-        first = np.searchsorted(start, of_guide[:-1], side="right") - 1
-        last = np.searchsorted(start, of_guide[1:], side="left")
-        # At least two entries: arrays of a single one change the kernels
-        start, terms, box = (np.concatenate([x, x[-1:]]) for x in (start, terms, box))
+    def _of(cls, unit, low, size, guides, start, terms, box, anywhere) -> LineDensity:
         return cls(
             float(unit), mi.Point3d(*(dr.opaque(mi.Float64, float(x)) for x in low)),
-            dr.opaque(mi.Float64, 2.0**LEVELS / size), upload(mi.UInt32, np.stack([first, last], 1).ravel()),
-            upload(mi.UInt64, start), upload(mi.Float, terms.ravel()), upload(mi.Float, box.ravel()),
+            dr.opaque(mi.Float64, 2.0**LEVELS / size), upload(mi.UInt32, guides.ravel()), upload(mi.UInt64, start),
+            upload(mi.Float, terms.ravel()), upload(mi.Float, box.ravel()),
             dr.opaque(mi.Float, float(anywhere)),
         )  # fmt: skip
 

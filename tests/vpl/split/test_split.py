@@ -205,12 +205,8 @@ def test_a_pair_contributes_what_the_split_leaves_to_it():
     d2 = (offset**2).sum(1)
     to_light = offset / np.sqrt(d2)[:, None]
     cosine1, cosine2 = np.maximum((normal * to_light).sum(1), 0), np.maximum(-(lights.direction * to_light).sum(1), 0)
-    shared = (
-        cosine1
-        * cosine2
-        / (d2 + lights.c.astype(np.float64) ** 2 * cosine1 * cosine2)
-        * ((lights.facing * to_light).sum(1) < 0)
-    )
+    c2 = lights.c.astype(np.float64) ** 2
+    shared = cosine1 * cosine2 / (d2 + c2 * cosine1 * cosine2) * ((lights.facing * to_light).sum(1) < 0)
     interaction = dr.zeros(mi.Interaction3f, count)
     interaction.p, interaction.n = points(position), mi.Normal3f(points(normal))
     surface = LambertianSurface(interaction, dr.full(mi.UInt32, 1, count), interaction.n, mi.Color3f(1))
