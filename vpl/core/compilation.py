@@ -56,6 +56,17 @@ def compilation_measured():
         _HISTORY.release()
 
 
+@contextmanager
+def unrecorded():
+    """Within the block, Dr.Jit does not record kernels, and compilation is not measured.
+
+    Each number that Python reads is an entry of the history: with the history of 108 000 numbers of 8000 emitters,
+    reading them takes 0.4 s instead of 0.2.
+    """
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, False):
+        yield
+
+
 def compiled_since_last() -> float:
     """Return the seconds of compilation in this thread since the last call, 0 if they are not measured."""
     compilation = _MEASURED.get()

@@ -7,7 +7,7 @@ times as long as reading the values in a scene of a hundred thousand emitters.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 
 import drjit as dr
@@ -46,9 +46,11 @@ def parameters_of(node, below: bool = True) -> Parameters:
     return found
 
 
-def matrix_of(transform) -> np.ndarray:
-    """Matrix of a transformation of one lane, (4, 4) float64."""
-    return np.array([[x[0] if dr.is_jit_v(x) else x for x in row] for row in transform.matrix], np.float64)
+def matrix_of(transform, columns: Sequence[int] = range(4)) -> np.ndarray:
+    """Matrix of a transformation of one lane, or some of its columns, (4, columns) float64."""
+    # Reading a number takes a microsecond, which counts for thousands of emitters
+    rows = ([row[column] for column in columns] for row in transform.matrix)
+    return np.array([[x[0] if dr.is_jit_v(x) else x for x in row] for row in rows], np.float64)
 
 
 def numbers(value) -> list[float]:

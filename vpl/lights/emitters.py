@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import LARGEST_VALUE, download, finite_or_zero, rgb_to_spectrum, upload, usable
+from ..core.compilation import unrecorded
 from ..core.parameters import matrix_of, numbers, parameters_of
 from ..core.registry import RegistryTable
 from .spheres import SphereRows
@@ -145,8 +146,8 @@ def _constant_rgb(parameters, name):
 
 def _frame_of(to_world):
     """Origin and z axis of an emitter's frame, as float64 vectors."""
-    matrix = matrix_of(to_world)
-    return matrix[:3, 3], matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
+    axis, origin = matrix_of(to_world, (2, 3))[:3].T
+    return origin, axis / np.linalg.norm(axis)
 
 
 def _textured_radiance(emitter, shape) -> np.ndarray:
@@ -276,6 +277,7 @@ def _lights_nothing(emitter) -> bool:
     return emitter.class_name() == "DirectionalArea" or (is_delta and emitter.sampling_weight() == 0)
 
 
+@unrecorded()
 def read_emitters(scene, group_of: Callable[[mi.Emitter], int] = lambda _: 0) -> Emitters:
     """Read the emitters of ``scene`` that contribute in Mitsuba's ``path``.
 
