@@ -20,6 +20,9 @@ from .sample_density import LEAST_SAMPLES, SampleDensity
 
 MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the time to the first image
 MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
+# Camera rays for a second of a limit: a low estimate, so that the pilot of `manylights` takes little of the limit
+# (kitchen: 900 000 rays in a second on two cores)
+_RAYS_PER_SECOND = 100_000
 # Stages of `manylights` with times about proportional to the samples
 PER_SAMPLE = Stage.LIGHTS, Stage.TREE, Stage.TRACED, Stage.CLUSTERS, Stage.CUTS
 
@@ -148,9 +151,10 @@ def _render(scene, sensor, integrator, spp, seed, parts):
 @dataclass
 class SharedStart:
     """What the passes of a render share: `start`, an object of the integrator, None before the first pass. The scene
-    must not change while it is used."""
+    must not change while it is used. `rays`: camera rays of the whole render, as far as known before the first pass."""
 
     start: object = None
+    rays: int = 0
 
 
 @contextmanager
@@ -236,17 +240,19 @@ class Passes:
 
 class Progressive(Passes):
     """Running average of passes in this process. `integrator` is by default the scene's; `denoise`: see
-    `SampleDensity`, for an image that will be denoised; `parts`: see fine_film.py."""
+    `SampleDensity`, for an image that will be denoised; `parts`: see fine_film.py; `seconds`: limit of the render, or
+    None."""
 
-    def __init__(self, scene, seed, sensor=0, integrator=None, denoise=None, parts=1):
+    def __init__(self, scene, seed, sensor=0, integrator=None, denoise=None, parts=1, seconds=None):
         self._scene, self._sensor, self._denoise = scene, sensor, denoise
+        self._rays = int(_RAYS_PER_SECOND * (seconds or 0))
         self.integrator = integrator or scene.integrator()
         super().__init__(seed, parts, scene.sensors()[sensor].film().rfilter())
 
     def restart(self):
         """Remove all passes and what they share."""
         super().restart()
-        self._shared, self.density = SharedStart(), SampleDensity(self._denoise, self.parts)
+        self._shared, self.density = SharedStart(rays=self._rays), SampleDensity(self._denoise, self.parts)
 
     def render(self, spp, seed=None, accept=lambda: True, is_probe=False):
         """Render and add a pass of `spp` samples per pixel; return the `Pass`.

@@ -141,8 +141,8 @@ def render(job):
     denoiser = _denoiser(scene, job, usual) if job.denoised_output else None
     # Pixels may have different numbers of samples, which the denoiser decides, if the render ends by time
     decides = denoiser and job.budget and hasattr(scene.integrator(), "may_differ")
-    parts = denoiser.parts if denoiser else 1
-    progressive = Progressive(scene, job.seed, denoise=denoiser.denoise if decides else None, parts=parts)
+    parts, denoise = denoiser.parts if denoiser else 1, denoiser.denoise if decides else None
+    progressive = Progressive(scene, job.seed, denoise=denoise, parts=parts, seconds=job.budget)
     cold = measure(progressive, job)
     passes, spp, pixels = progressive.passes, progressive.spp, progressive.pixels
     warm = [one.seconds for one in passes[1 if job.cold else 0 :]]

@@ -300,13 +300,15 @@ class ManyLightsIntegrator(PassRenderer):
         count, pixels = dr.width(ray), cells.rays.pixels
         dr.make_opaque(ray, active)
         # A shared start serves larger passes, too
-        learning = max(count, _SHARED_SAMPLES * pixels) if self._pass.shared else count
+        shared = self._pass.shared
+        learning = max(count, _SHARED_SAMPLES * pixels) if shared else count
+        planned = max(learning, shared.rays) if shared else count
         groups = EmitterGroups(scene, self.light_groups) if self.light_groups and not known else None
         emitters = known.emitters if known else emitter_sampler(scene, learning_rays(learning), groups)
         return View(
             scene, emitters, Perturbed(scene), PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray,
             active, cells.width, cells.rays, seed, dr.opaque(mi.Float, 1.0, pixels), OutgoingRadiance.unknown(),
-            learning, self.cost_model if self.denoised else self.cost_model.without_denoiser(),
+            learning, planned, self.cost_model if self.denoised else self.cost_model.without_denoiser(),
             Layers(bool(self.layers), emitters.groups),
         )  # fmt: skip
 

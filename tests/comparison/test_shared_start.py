@@ -34,6 +34,14 @@ def test_a_render_has_a_single_pilot_and_lights_for_each_pass():
     assert took.statistics["light_paths"] == 3 * 2000
 
 
+@pytest.mark.parametrize(("rays", "size"), [(0, 256), (8192, 512), (10**6, 1024)])
+def test_long_renders_have_larger_pilots(rays, size):
+    shared = SharedStart(rays=rays)
+    # A pilot has at most the rays of the first pass
+    render_pass(scene(), 0, plugin(), *FIRST, shared=shared)
+    assert len(shared.start.pilot.radiance) == size
+
+
 def test_passes_are_weighted_by_their_expected_precision():
     box, shared, images = scene(), SharedStart(), []
     passes = Passes(0)

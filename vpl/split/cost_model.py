@@ -29,7 +29,16 @@ class CostModel:
     """Constants of the decisions of ``manylights``; raises ValueError for a value out of range."""
 
     # ---------------------- Pilot ----------------------
-    pilot_rays: int = _constant(1 << 15, "camera rays", "Largest size of a pilot.", _SENSITIVITY)
+    pilot_rays: int = _constant(
+        1 << 15, "camera rays", "From this size on, pilots grow with the root of the rays of the image.", _SENSITIVITY
+    )
+    root_from: float = _constant(
+        1 << 21,
+        "camera rays",
+        "Number of rays of the image from which pilots grow with its root.",
+        "256 samples, pilots of 65 536 rays and of 16 384: denoised error 0.96 in kitchen and living_room, 0.98 in "
+        "staircase2, raw variance 0.95 to 0.96",
+    )
     pilot_share: float = _constant(
         1 / 36,
         "1 / camera ray",
@@ -234,7 +243,8 @@ class CostModel:
     def pilot_size(self, rays: int) -> int:
         """Number of camera rays of a pilot for an image of so many ``rays``."""
         small = min(self.small_pilot, int(self.large_pilot_share * rays))
-        return min(max(int(self.pilot_share * rays), small), self.pilot_rays)
+        most = self.pilot_rays * max(rays / self.root_from, 1) ** 0.5
+        return int(min(max(self.pilot_share * rays, small), most))
 
     def left_out(self, errors: int) -> int:
         """How many of so many squared ``errors``, the largest, a relative variance leaves out."""

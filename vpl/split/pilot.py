@@ -128,7 +128,7 @@ class Pilot:
 
 def pilot_lanes(view: View) -> np.ndarray:
     """Indices (n,) of the camera rays of a pilot: pairs over the whole image."""
-    return view.pairs(view.model.pilot_size(view.learning_count))
+    return view.pairs(view.model.pilot_size(view.planned_count))
 
 
 def mean_radiance(radiance) -> np.ndarray:

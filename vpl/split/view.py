@@ -166,8 +166,8 @@ class View:
     ``scene``; ``emitters``: emitter sampler; ``perturbed``: shapes without a minorant; ``rules`` of the paths; ``ray``,
     ``active``: of the camera, evaluated, by pixel as in ``rays``; ``width`` of the image in pixels;
     ``seed``; ``importance`` of radiance in each pixel and ``outgoing`` radiance of surfaces: for Russian roulette;
-    ``learning_count``: number of camera rays, for the sizes of the pilot and of the emitter sampler's learning;
-    ``model``: constants of the decisions; ``layers`` of the image.
+    ``learning_count``: number of camera rays, for the size of the emitter sampler's learning; ``planned_count``: the
+    same for the size of the pilot; ``model``: constants of the decisions; ``layers`` of the image.
     """
 
     scene: mi.Scene
@@ -182,6 +182,7 @@ class View:
     importance: mi.Float
     outgoing: OutgoingRadiance
     learning_count: int
+    planned_count: int
     model: CostModel
     layers: Layers
 

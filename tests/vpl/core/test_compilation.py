@@ -10,7 +10,7 @@ import pytest
 from comparison import rendering
 from tests.support.scenes import cornell
 from vpl.core.clock import Clock
-from vpl.core.compilation import compilation_measured, compiled_since_last
+from vpl.core.compilation import compilation_measured, compiled_since_last, unrecorded
 from vpl.core.stages import Stage
 
 
@@ -34,6 +34,15 @@ def test_a_kernel_is_compiled_once(number):
     with compilation_measured() as again:
         launch(number)
     assert 0.001 < first.seconds < 10 and again.seconds == 0.0
+
+
+def test_kernels_of_a_block_without_a_record_do_not_count(number):
+    with compilation_measured() as compilation:
+        with unrecorded():
+            launch(number)
+        assert compilation.since_last() == 0.0
+        launch(number + 1000)
+    assert compilation.seconds > 0.001
 
 
 def test_a_clock_tells_compilation_apart_from_the_stage(number):

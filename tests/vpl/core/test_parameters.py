@@ -58,6 +58,7 @@ def test_matrices():
     assert np.allclose(matrix_of(placed()), expected, atol=1e-6)
     assert np.allclose(matrix_of(lamp["to_world"]), expected, atol=1e-6)
     assert matrix_of(lamp["to_world"]).dtype == np.float64
+    np.testing.assert_array_equal(matrix_of(placed(), (3, 1)), matrix_of(placed())[:, [3, 1]])
 
 
 def test_a_mesh_attribute_as_radiance_is_refused_by_name():
