@@ -151,7 +151,8 @@ def _render(scene, sensor, integrator, spp, seed, parts):
 @dataclass
 class SharedStart:
     """What the passes of a render share: `start`, an object of the integrator, None before the first pass. The scene
-    must not change while it is used. `rays`: camera rays of the whole render, as far as known before the first pass."""
+    must not change while it is used. `rays`: least number of camera rays for which the start is made; 0 without a limit
+    of time, and on a cluster."""
 
     start: object = None
     rays: int = 0

@@ -74,11 +74,11 @@ class ManyLightsIntegrator(PassRenderer):
     emitter.  Environments, directional emitters, and meshes with vertex normals other than their geometric normals are
     traced.
 
-    **Decisions.** A pilot of up to 32 768 paths, or a sixteenth of the camera rays, decides whether virtual lights pay,
-    how many there are, where they lie, and how many samples of a pixel they light.  Without lights, ``manylights`` is
-    ``path`` with stratified samples.  The decision is in ``statistics``, in the log (level Info) and in the files that
-    the command writes.  It depends on the seed and not on the clock.  The passes of ``manylights.render`` and of the
-    command share the pilot of the first pass; each pass draws its own lights.
+    **Decisions.** A pilot of a 36th of the camera rays (a 16th in raw images), in long renders less, decides whether
+    virtual lights pay, how many there are, where they lie, and how many samples of a pixel they light.  Without lights,
+    ``manylights`` is ``path`` with stratified samples.  The decision is in ``statistics``, in the log (level Info) and
+    in the files that the command writes.  It depends on the seed and not on the clock.  The passes of
+    ``manylights.render`` and of the command share the pilot of the first pass; each pass draws its own lights.
 
     **Gradients.** ``mi.render(scene, params, integrator=...)`` has gradients in ``*_ad_*`` variants.  The image is that
     of ``manylights``, and its derivatives are those of ``prb`` with the same ``max_depth``, ``rr_depth`` and
