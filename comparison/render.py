@@ -132,7 +132,9 @@ def render(
     planes = layers_of(layers, scene, sensor, denoiser, seed=seed, spp=spp, time_limit=time)
     # The error is that of the raw image, which equal numbers of samples suit best
     chooses = denoiser.denoise if denoiser and not error else None
-    progressive = Progressive(scene, seed, sensor, integrator, chooses, denoiser.parts if denoiser else 1, time)
+    # Without a limit of time for a checkpoint, which may go on with another one or on other machines
+    limits = {} if checkpoint else {"seconds": time, "spp": spp}
+    progressive = Progressive(scene, seed, sensor, integrator, chooses, denoiser.parts if denoiser else 1, **limits)
     reserved = denoiser.expected_seconds if denoiser else 0.0
     sizes = PassSizes.of(progressive, spp, time and time - reserved, pass_spp, error is not None)
     ending = Ending(spp, time and time - reserved, error, reserved)

@@ -152,7 +152,7 @@ def _render(scene, sensor, integrator, spp, seed, parts):
 class SharedStart:
     """What the passes of a render share: `start`, an object of the integrator, None before the first pass. The scene
     must not change while it is used. `rays`: least number of camera rays for which the start is made; 0 without a limit
-    of time, and on a cluster."""
+    of time, with a checkpoint, and on a cluster."""
 
     start: object = None
     rays: int = 0
@@ -241,12 +241,14 @@ class Passes:
 
 class Progressive(Passes):
     """Running average of passes in this process. `integrator` is by default the scene's; `denoise`: see
-    `SampleDensity`, for an image that will be denoised; `parts`: see fine_film.py; `seconds`: limit of the render, or
-    None."""
+    `SampleDensity`, for an image that will be denoised; `parts`: see fine_film.py; `seconds`, `spp`: limits of the
+    render, or None."""
 
-    def __init__(self, scene, seed, sensor=0, integrator=None, denoise=None, parts=1, seconds=None):
+    def __init__(self, scene, seed, sensor=0, integrator=None, denoise=None, parts=1, seconds=None, spp=None):
         self._scene, self._sensor, self._denoise = scene, sensor, denoise
         self._rays = int(_RAYS_PER_SECOND * (seconds or 0))
+        if spp:
+            self._rays = min(self._rays, spp * int(np.prod(scene.sensors()[sensor].film().crop_size())))
         self.integrator = integrator or scene.integrator()
         super().__init__(seed, parts, scene.sensors()[sensor].film().rfilter())
 

@@ -31,7 +31,7 @@ from .knobs import Boolean, Groups, Words
 from .longer_renders import PassRenderer
 from .manual import manual_page
 
-# Samples of a pixel by which the pilot and its learning are sized where passes share them: a usual size of a pass
+# Least samples of a pixel by which the pilot and its learning are sized where passes share them: a usual pass
 _SHARED_SAMPLES = 16
 # Largest depth that prb can count, with 32 bits
 _DEEPEST = 2**32 - 1
@@ -74,11 +74,12 @@ class ManyLightsIntegrator(PassRenderer):
     emitter.  Environments, directional emitters, and meshes with vertex normals other than their geometric normals are
     traced.
 
-    **Decisions.** A pilot of a 36th of the camera rays (a 16th in raw images), in long renders less, decides whether
-    virtual lights pay, how many there are, where they lie, and how many samples of a pixel they light.  Without lights,
-    ``manylights`` is ``path`` with stratified samples.  The decision is in ``statistics``, in the log (level Info) and
-    in the files that the command writes.  It depends on the seed and not on the clock.  The passes of
-    ``manylights.render`` and of the command share the pilot of the first pass; each pass draws its own lights.
+    **Decisions.** A pilot of a 36th of the camera rays (a 16th in raw images), a smaller part in long renders, decides
+    whether virtual lights pay, how many there are, where they lie, and how many samples of a pixel they light.  Without
+    lights, ``manylights`` is ``path`` with stratified samples.  The decision is in ``statistics``, in the log (level
+    Info) and in the files that the command writes.  It depends on the seed and the limit of time, not on the clock.
+    The passes of ``manylights.render`` and of the command share the pilot of the first pass; each pass draws its own
+    lights.
 
     **Gradients.** ``mi.render(scene, params, integrator=...)`` has gradients in ``*_ad_*`` variants.  The image is that
     of ``manylights``, and its derivatives are those of ``prb`` with the same ``max_depth``, ``rr_depth`` and
@@ -302,7 +303,8 @@ class ManyLightsIntegrator(PassRenderer):
         # A shared start serves larger passes, too
         shared = self._pass.shared
         learning = max(count, _SHARED_SAMPLES * pixels) if shared else count
-        planned = max(learning, shared.rays) if shared else count
+        # For many pixels and little time, 16 samples of each would be more than the render has
+        planned = max(count, shared.rays, min(learning, self.cost_model.root_from)) if shared else count
         groups = EmitterGroups(scene, self.light_groups) if self.light_groups and not known else None
         emitters = known.emitters if known else emitter_sampler(scene, learning_rays(learning), groups)
         return View(

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import manylights
-from comparison.rendering import Passes, SharedStart, render_pass
+from comparison.checkpoint import Checkpoint
+from comparison.rendering import Passes, Progressive, SharedStart, render_pass
 from tests.support.rendering import plugin_with_model, render
 from tests.support.scenes import area_light, closed_box
 from tests.support.statistics import assert_same_mean
@@ -40,6 +41,31 @@ def test_long_renders_have_larger_pilots(rays, size):
     # A pilot has at most the rays of the first pass
     render_pass(scene(), 0, plugin(), *FIRST, shared=shared)
     assert len(shared.start.pilot.radiance) == size
+
+
+@pytest.mark.parametrize(
+    ("limits", "rays"),
+    [({}, 0), ({"spp": 8}, 0), ({"seconds": 2.0}, 200_000), ({"seconds": 2.0, "spp": 8}, 8 * 16 * 16)],
+)
+def test_limits_of_a_render_determine_the_rays_of_the_start(limits, rays):
+    progressive = Progressive(scene(), 0, integrator=plugin(), **limits)
+    assert progressive._shared.rays == rays
+    progressive.restart()
+    assert progressive._shared.rays == rays
+
+
+@pytest.mark.parametrize(("with_checkpoint", "rays"), [(False, 8 * 16 * 16), (True, 0)])
+def test_the_start_of_a_checkpoint_does_not_depend_on_the_limit_of_time(with_checkpoint, rays, tmp_path, monkeypatch):
+    made, usual = [], Progressive.restart
+
+    def restart(self):
+        usual(self)
+        made.append(self._shared.rays)
+
+    monkeypatch.setattr(Progressive, "restart", restart)
+    checkpoint = Checkpoint(tmp_path / "a.checkpoint", {}) if with_checkpoint else None
+    manylights.render(scene(), plugin(), spp=8, time=60, checkpoint=checkpoint)
+    assert set(made) == {rays}
 
 
 def test_passes_are_weighted_by_their_expected_precision():

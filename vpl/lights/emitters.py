@@ -278,18 +278,10 @@ def _lights_nothing(emitter) -> bool:
 
 
 @unrecorded()
-def read_emitters(scene, group_of: Callable[[mi.Emitter], int] = lambda _: 0) -> Emitters:
-    """Read the emitters of ``scene`` that contribute in Mitsuba's ``path``.
-
-    ``group_of``: number of the group of an emitter, by default 0.
-
-    Emitters with a radiance or area that is negative, not finite, or too large are dropped, counted and logged.  Raises
-    ValueError for environment maps with invalid texels and for emitters on shapes that Mitsuba cannot sample.
-    """
+def _read_unbound(scene, group_of: Callable, known: list[mi.Emitter]) -> tuple[list, list, list, list]:
+    """Rows of (point, spot, directional emitters), and (class name, emitter) of the remaining ones that are not
+    ``known``."""
     points, spots, suns, others = [], [], [], []
-    environment, dropped = _read_environment(scene)
-    area, bad_areas, others_on_shapes = _read_areas(scene, group_of)
-    dropped += bad_areas
     for emitter in scene.emitters():
         name = emitter.class_name()
         if emitter.is_environment() or name == "AreaLight" or _lights_nothing(emitter):
@@ -303,8 +295,23 @@ def read_emitters(scene, group_of: Callable[[mi.Emitter], int] = lambda _: 0) ->
             spots.append([*np.concatenate(_frame_of(parameters["to_world"])), *intensity, *cone, group_of(emitter)])
         elif name == "DirectionalEmitter" and intensity is not None:
             suns.append([*_frame_of(parameters["to_world"])[1], *intensity, group_of(emitter)])
-        elif not any(emitter is known for _, known in others_on_shapes):
+        elif not any(emitter is one for one in known):
             others.append((name, emitter))
+    return points, spots, suns, others
+
+
+def read_emitters(scene, group_of: Callable[[mi.Emitter], int] = lambda _: 0) -> Emitters:
+    """Read the emitters of ``scene`` that contribute in Mitsuba's ``path``.
+
+    ``group_of``: number of the group of an emitter, by default 0.
+
+    Emitters with a radiance or area that is negative, not finite, or too large are dropped, counted and logged.  Raises
+    ValueError for environment maps with invalid texels and for emitters on shapes that Mitsuba cannot sample.
+    """
+    environment, dropped = _read_environment(scene)
+    area, bad_areas, others_on_shapes = _read_areas(scene, group_of)
+    dropped += bad_areas
+    points, spots, suns, others = _read_unbound(scene, group_of, [known for _, known in others_on_shapes])
     points, spots, suns = (_sorted_rows(rows, n) for rows, n in ((points, 7), (spots, 12), (suns, 7)))
     omni = VirtualLights.of("point", points[:, :3], np.tile([0, 0, 1], (len(points), 1)), points[:, 3:6])
     spot = VirtualLights.of("spot", spots[:, :3], spots[:, 3:6], spots[:, 6:9], 0, spots[:, 9:11])

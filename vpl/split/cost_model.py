@@ -30,7 +30,10 @@ class CostModel:
 
     # ---------------------- Pilot ----------------------
     pilot_rays: int = _constant(
-        1 << 15, "camera rays", "From this size on, pilots grow with the root of the rays of the image.", _SENSITIVITY
+        1 << 15,
+        "camera rays",
+        "Largest pilot of images of up to `root_from` rays; beyond, it grows with the root of the rays.",
+        _SENSITIVITY,
     )
     root_from: float = _constant(
         1 << 21,
@@ -38,6 +41,9 @@ class CostModel:
         "Number of rays of the image from which pilots grow with its root.",
         "256 samples, pilots of 65 536 rays and of 16 384: denoised error 0.96 in kitchen and living_room, 0.98 in "
         "staircase2, raw variance 0.95 to 0.96",
+    )
+    most_pilot_rays: int = _constant(
+        1 << 18, "camera rays", "Largest pilot of any image: bounds memory.", "about 300 bytes a ray"
     )
     pilot_share: float = _constant(
         1 / 36,
@@ -243,8 +249,8 @@ class CostModel:
     def pilot_size(self, rays: int) -> int:
         """Number of camera rays of a pilot for an image of so many ``rays``."""
         small = min(self.small_pilot, int(self.large_pilot_share * rays))
-        most = self.pilot_rays * max(rays / self.root_from, 1) ** 0.5
-        return int(min(max(self.pilot_share * rays, small), most))
+        most = self.pilot_rays * max(rays / max(self.root_from, 1), 1) ** 0.5
+        return int(min(max(self.pilot_share * rays, small), most, self.most_pilot_rays))
 
     def left_out(self, errors: int) -> int:
         """How many of so many squared ``errors``, the largest, a relative variance leaves out."""

@@ -106,7 +106,16 @@ def test_values_that_cancel_give_means_that_are_numbers():
 
 @pytest.mark.parametrize(
     ("rays", "size"),
-    [(0, 0), (1600, 100), (1 << 16, 1 << 12), (36 << 13, 1 << 13), (1 << 21, 1 << 15), (1 << 23, 1 << 16)],
+    [
+        (0, 0),
+        (1600, 100),
+        (1 << 16, 1 << 12),
+        (36 << 13, 1 << 13),
+        (3 << 19, 1 << 15),
+        (1 << 21, 1 << 15),
+        (1 << 23, 1 << 16),
+        (1 << 40, 1 << 18),
+    ],
 )
 def test_sizes_of_pilots(rays, size):
     assert MODEL.pilot_size(rays) == size
