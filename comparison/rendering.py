@@ -248,7 +248,7 @@ class Progressive(Passes):
         self._scene, self._sensor, self._denoise = scene, sensor, denoise
         self._rays = int(_RAYS_PER_SECOND * (seconds or 0))
         if spp:
-            self._rays = min(self._rays, spp * int(np.prod(scene.sensors()[sensor].film().crop_size())))
+            self._rays = min(self._rays, spp * self.pixels)
         self.integrator = integrator or scene.integrator()
         super().__init__(seed, parts, scene.sensors()[sensor].film().rfilter())
 
