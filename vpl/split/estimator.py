@@ -36,8 +36,9 @@ from .surface_lights import KeptLights, surface_lights
 from .view import PathSettings, Stream, View, ViewLights
 
 # Smallest and largest number of camera rays per part; the target is half of the image. Filling new memory of a process
-# is slow, which matters for small images, and Dr.Jit records the kernels anew for each part
-_WAVEFRONT = 1 << 18, 1 << 20
+# is slow, which matters for small images. Dr.Jit records the kernels anew for each part, 15 to 100 ms by the number of
+# materials, as long as some 50 000 rays take
+_WAVEFRONT = 1 << 19, 1 << 20
 # Every surface blocks the light of virtual lights: light that passes a surface is traced
 _OPAQUE = SceneTraits(False, False, True, False, False, (), (), None)
 
