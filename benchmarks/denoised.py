@@ -4,22 +4,28 @@
 are single passes, which stratify best, or the mean of several where memory limits a pass: with the sampler
 ``independent`` and a better one, denoised as usual, and with the better one at twice the resolution, as
 ``manylights.render`` denoises.  Times include albedo, normal and denoiser.  Kernels are compiled before.
+
+The time of ``path`` for another error follows from its error with fewer samples, or from the mean of many scenes,
+whichever is less favourable to ``manylights``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from unittest import mock
 
 import numpy as np
 
 from benchmarks import scenes
-from benchmarks.rivals import KINDS, SAMPLERS, TRIMMED, Rival, Timed, load, measure_in_turn
+from benchmarks.rivals import SAMPLERS, TRIMMED, Rival, Timed, load, measure_in_turn
 from comparison.convergence import box_mean
 from comparison.denoising import FALL, Denoiser
 from comparison.fine_film import PARTS
 
 # Seconds of each of the two renders of a reference, over those of an image
 REFERENCE_TIMES = 3
+# Stands for an error that is below the noise of the reference
+LEAST_ERROR = 1e-9
 # Seeds of these renders, in units of the benchmark's seeds
 REFERENCE_SEEDS = 1, 2
 
@@ -61,17 +67,72 @@ class Truth:
 
 
 class Several(Rival):
-    """Images of ``path`` of about ``seconds``: means of as few passes as memory allows."""
+    """Images of ``path`` of about ``seconds``: means of as few passes as memory allows.
+
+    ``shorter``: an image of fewer samples for each of them, the first of its passes or a pass of about a quarter of the
+    samples; ``doublings``: of the samples of a shorter image up to those of an image.
+    """
 
     def __init__(self, name: str, scene, sampler: str, width: int, seconds: float, parts: int):
         super().__init__(name, scene, "path", sampler, width, seconds, parts=parts)
         self.count = max(round(seconds / self.pass_seconds), 1)
+        # Mitsuba rounds the samples of `multijitter` to squares
+        self._fewer = self.spp if self.count > 1 else max(int(self.spp**0.5) // 2, 1) ** 2
+        self.shorter, self.doublings = [], float(np.log2(self.spp * self.count / self._fewer))
 
     def measure(self, seed: int) -> None:
-        """Render and keep one more image."""
+        """Render and keep one more image, and a shorter one."""
         passes = [self.render(1000 * seed + number) for number in range(self.count)]
         self.images.append(np.mean([image for image, _ in passes], axis=0))
         self.seconds.append(sum(spent for _, spent in passes))
+        self.shorter.append(passes[0][0] if self.count > 1 else self._short_image(seed))
+
+    def _short_image(self, seed: int) -> np.ndarray:
+        with mock.patch.object(self, "spp", self._fewer):
+            return self.render(1000 * seed)[0]
+
+
+@dataclass
+class Way:
+    """``path`` with one sampler, denoised in one resolution: ``images``, a :class:`Several` that ``denoiser`` denoises
+    in ``fixed`` seconds.  :meth:`judge` sets their ``error`` and ``fall``, by which it falls where samples double."""
+
+    images: Several
+    denoiser: Denoiser
+    fixed: float
+    error: float = 0.0
+    fall: float = 0.0
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of an image and of its denoiser."""
+        return float(np.median(self.images.seconds)) + self.fixed
+
+    def judge(self, truth: Truth) -> None:
+        """Determine the error and its fall."""
+        self.error, short = (
+            truth.error([self.denoiser.denoise_fine(image, ["R", "G", "B"]) for image in images])
+            for images in (self.images.images, self.images.shorter)
+        )
+        doublings = self.images.doublings
+        self.fall = (short / self.error) ** (1 / doublings) if min(self.error, short, doublings) > 0 else FALL
+
+    def time_for(self, error: float) -> float:
+        """Seconds until the ``error``.  The denoiser works once."""
+        return (self.seconds - self.fixed) * longer(self.error, error, self.fall) + self.fixed
+
+    def __str__(self) -> str:
+        one, fine = self.images, ", fine" if self.images.parts > 1 else ""
+        samples = one.spp * one.count * one.parts**2
+        return f"  path ({one.sampler[:5]}{fine}) {self.error:.5f} ({samples}, {self.seconds:.2f} s)"
+
+
+def longer(error: float, goal: float, fall: float) -> float:
+    """Factor on the time of an image with some ``error`` for the error ``goal``: by its ``fall`` where samples double,
+    or by that of many scenes, whichever makes the factor smaller."""
+    # An error that does not fall tells nothing
+    exponents = (1 / np.log2(one) for one in (FALL, fall) if one > 1)
+    return float(min((max(error, LEAST_ERROR) / max(goal, LEAST_ERROR)) ** exponent for exponent in exponents))
 
 
 def compare(names, width: int, seconds: float, passes: int) -> dict:
@@ -92,40 +153,26 @@ def compare_one(name: str, width: int, seconds: float, passes: int) -> dict:
     """Print the denoised errors of a scene, and the relative times of ``path`` for equal error; returns the row."""
     scene = load(name, width)
     denoisers = {parts: _warm_denoiser(scene, seconds, parts) for parts in (1, PARTS)}
-    ways = [*((sampler, 1) for sampler in SAMPLERS), (SAMPLERS[-1], PARTS)]
-    of_way = [denoisers[parts] for _, parts in ways]
-    fixed = [one.seconds for one in of_way]
-    rivals = [
-        Several(name, scene, sampler, width, seconds - spent, parts)
-        for (sampler, parts), spent in zip(ways, fixed, strict=True)
+    # Before they denoise other images, which adds to their seconds
+    fixed = {parts: denoiser.seconds for parts, denoiser in denoisers.items()}
+    ways = [
+        Way(Several(name, scene, sampler, width, seconds - fixed[parts], parts), denoisers[parts], fixed[parts])
+        for sampler, parts in (*((sampler, 1) for sampler in SAMPLERS), (SAMPLERS[-1], PARTS))
     ]
     # manylights stratifies the samples of this sampler
-    rivals.append(Timed(scene, "manylights", "independent", seconds, denoise=True, denoised=True))
-    measure_in_turn(rivals, passes)
+    ours = Timed(scene, "manylights", "independent", seconds, denoise=True, denoised=True)
+    measure_in_turn([*(way.images for way in ways), ours], passes)
     truth = Truth.of(name, scene, seconds, width)
-    clean = [
-        [one.denoise_fine(image, ["R", "G", "B"]) for image in rival.images]
-        for one, rival in zip(of_way, rivals, strict=False)
-    ]
-    errors = [truth.error(images) for images in (*clean, rivals[-1].images)]
-    times = [float(np.median(rival.seconds)) + spent for rival, spent in zip(rivals, (*fixed, 0.0), strict=True)]
-    points = list(zip(errors, times, strict=True))
-    *theirs, (ours, our_time) = points
-    # The denoiser works once
-    ratios = [
-        ((whole - spent) * (max(error, 1e-9) / max(ours, 1e-9)) ** (np.log(2) / np.log(FALL)) + spent) / our_time
-        for (error, whole), spent in zip(theirs, fixed, strict=True)
-    ]
-    columns = "".join(
-        f"  {rival.kind} ({rival.sampler[:5]}{', fine' if rival.parts > 1 else ''}) {error:.5f} "
-        f"({rival.spp * rival.count * rival.parts**2}, {whole:.2f} s)"
-        for rival, (error, whole) in zip(rivals, points, strict=True)
-    )
-    doubt = "" if min(errors) > 0 else "  an error is below the noise of the reference"
+    for way in ways:
+        way.judge(truth)
+    error, took = truth.error(ours.images), float(np.median(ours.seconds))
+    ratios = [way.time_for(error) / took for way in ways]
+    doubt = "" if min(error, *(way.error for way in ways)) > 0 else "  an error is below the noise of the reference"
+    columns = f"{''.join(map(str, ways))}  manylights {error:.5f} ({ours.spp}, {took:.2f} s)"
     print(f"{name:16s}{columns}  {ratios[0]:7.2f} {min(ratios):7.2f}{doubt}", flush=True)
-    best = theirs[int(np.argmin(ratios))]
-    row = {
-        kind: {"relmse": error, "seconds": spent}
-        for kind, (error, spent) in zip(KINDS, (best, points[-1]), strict=True)
-    }
-    return row | {"independent_speedup": float(ratios[0]), "speedup": float(min(ratios))}
+    best = ways[int(np.argmin(ratios))]
+    return {
+        "path": {"relmse": best.error, "seconds": best.seconds, "fall": best.fall},
+        "manylights": {"relmse": error, "seconds": took},
+        "independent_speedup": float(ratios[0]), "speedup": float(min(ratios)),
+    }  # fmt: skip

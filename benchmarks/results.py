@@ -30,6 +30,7 @@ UNITS = {
     "depth": "levels of the tree",
     "edges": "mean number of edges of a path",
     "error": "property `error`",
+    "fall": "factor by which the error falls where samples double",
     "fewer_rays": "shadow rays of the other method over those of this one, at equal error",
     "gathered_seconds": "s for clusters and cuts",
     "hidden": "whether the noise of the reference exceeds the error",

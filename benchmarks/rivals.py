@@ -21,6 +21,9 @@ KINDS, SAMPLERS = ("path", "manylights"), ("independent", "multijitter")
 DEPTH, TRIMMED = 6, 0.001
 # Largest number of samples of a pass: bounds memory
 LARGEST_PASS = 1 << 24
+# Of the passes that tell the cost of a sample and compile the kernels: not 0, for which `multijitter` has a kernel of
+# its own, so that the first measured pass would compile another one
+CALIBRATION_SEED = 1
 
 
 def load(name: str, width: int):
@@ -80,7 +83,7 @@ class Rival:
         most = int((LARGEST_PASS / (width * scenes.height(name, width))) ** 0.5)
         few, side, times = 16 // parts**2, min(8 // parts, most), []
         for self.spp in (few, few, side**2, side**2):
-            times.append(self.render(0)[1])
+            times.append(self.render(CALIBRATION_SEED)[1])
         each = max(times[-1] - times[1], 0.1 * times[-1]) / max(side**2 - few, 1)
         wanted = side**2 + (seconds - times[-1]) / each
         if sampler == "multijitter":
@@ -88,7 +91,7 @@ class Rival:
             self.spp = min(max(round(max(wanted, few) ** 0.5), round(few**0.5)), most) ** 2
         else:
             self.spp = min(max(round(wanted), few), most**2)
-        self.pass_seconds = self.render(0)[1]
+        self.pass_seconds = self.render(CALIBRATION_SEED)[1]
 
     def render(self, seed: int):
         """Render: (image in the resolution of the film, float64; seconds)."""
