@@ -25,8 +25,8 @@ from comparison.cluster.connection import connected
 from comparison.cluster.pool import TASKS_PER_WORKER, Task
 from comparison.cluster.render import DistributedRender
 from comparison.one_image import LazyScene
-from comparison.rendering import Pass, PassImage
 from comparison.scene_files import SceneFile
+from comparison.single_pass import Pass, PassImage
 
 ROOT = Path(__file__).resolve().parent.parent
 PARTS = ("speed", "overhead", "busy")

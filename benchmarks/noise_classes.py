@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks import scenes
 from benchmarks.rivals import DEPTH, trimmed_variance
-from comparison.rendering import SharedStart
+from comparison.single_pass import SharedStart
 from vpl.split import estimator, path_tracer
 from vpl.split.contributions import Contributions
 

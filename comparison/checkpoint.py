@@ -15,7 +15,7 @@ import numpy as np
 
 from . import images
 from .occasional import OccasionalWriter
-from .rendering import Pass
+from .single_pass import Pass
 
 SUFFIX = ".checkpoint.npz"
 CHECKPOINT_SECONDS = 10.0

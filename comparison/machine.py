@@ -11,9 +11,9 @@ ROOT = Path(__file__).resolve().parent.parent
 # Sources that seconds and images depend on; changes of the report do not invalidate finished runs
 SOURCES = (
     "integrators/*.py", "vpl/**/*.py",
-    "comparison/worker.py", "comparison/rendering.py", "comparison/measuring.py", "comparison/pass_sizes.py",
-    "comparison/sample_density.py", "comparison/features.py", "comparison/fine_film.py", "comparison/denoising.py",
-    "comparison/scene_files.py",
+    "comparison/worker.py", "comparison/rendering.py", "comparison/single_pass.py", "comparison/measuring.py",
+    "comparison/pass_sizes.py", "comparison/sample_density.py", "comparison/features.py", "comparison/fine_film.py",
+    "comparison/denoising.py", "comparison/scene_files.py",
 )  # fmt: skip
 
 

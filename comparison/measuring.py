@@ -5,7 +5,7 @@ from itertools import count
 import numpy as np
 
 from .pass_sizes import FIRST_SAMPLES, PassSizes
-from .rendering import pass_seed, pass_sizes
+from .single_pass import pass_seed, pass_sizes
 
 LONG_PASS = 60.0  # seconds; with given samples, passes longer than this are warmed up by small passes alone
 WARM_SPP = 4  # Mitsuba compiles different kernels below this number, and for numbers other than powers of two

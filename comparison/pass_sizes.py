@@ -23,8 +23,8 @@ it may take all of the remaining time; beyond this size, half. A pass that deter
 
 import math
 
-from .rendering import largest_pass
 from .sample_density import LEAST_SAMPLES
+from .single_pass import largest_pass
 
 PASS_SECONDS = 2.0
 PART_SECONDS, LEAST_REST = 10.0, 1.0  # of a pass in parts; minimum ratio of its rest to its start, which has priority

@@ -20,9 +20,10 @@ import numpy as np
 from tqdm import tqdm
 
 from . import command_line, images
-from .rendering import Progressive, largest_pass, pass_seed
+from .rendering import Progressive
 from .runs import locked
 from .scene_files import SceneFile
+from .single_pass import largest_pass, pass_seed
 
 LAYERS = ["R", "G", "B", "se.R", "se.G", "se.B"]
 BATCHES = 32  # minimum, for a standard error with a relative error of some 13%

@@ -1,177 +1,16 @@
 """Progressive rendering: passes with different seeds, and their average."""
 
-import time
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
-
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-from vpl.core.compilation import compilation_measured
-from vpl.core.garbage import garbage_kept
-from vpl.core.stages import Stage
-from vpl.split.film_cells import HALF
-
 from .convergence import ErrorEstimate
-from .fine_film import fine_film, merged
+from .fine_film import merged
 from .images import colour
 from .sample_density import LEAST_SAMPLES, SampleDensity
+from .single_pass import SharedStart, largest_pass, pass_seed, render_pass, sample_count
 
-MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the time to the first image
-MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
 # Camera rays for a second of a limit: a low estimate, so that the pilot of `manylights` takes little of the limit
 # (kitchen: 900 000 rays in a second on two cores)
 _RAYS_PER_SECOND = 100_000
-# Stages of `manylights` with times about proportional to the samples
-PER_SAMPLE = Stage.LIGHTS, Stage.TREE, Stage.TRACED, Stage.CLUSTERS, Stage.CUTS
-
-
-def pass_seed(seed, index):
-    """Return the seed of pass `index` of a render: `seed` for pass 0, so that a single pass is equal to
-    `mi.render(scene, seed=seed)`, and a 32-bit hash of `seed` and `index` for later passes."""
-    if index == 0:
-        return seed
-    return int(np.random.SeedSequence((seed, index)).generate_state(1)[0])
-
-
-def pass_sizes(spp, size):
-    """Split `spp` samples per pixel into passes of `size` (a list of ints)."""
-    full, rest = divmod(spp, size)
-    return [size] * full + ([rest] if rest else [])
-
-
-def largest_pass(pixels, in_parts=False):
-    """Return the maximum samples per pixel of a pass, at least 1: up to `MAXIMUM_PASS_SAMPLES` samples over all pixels,
-    or `MORE_IN_PARTS` times as many for a pass in parts."""
-    return max(1, (MORE_IN_PARTS if in_parts else 1) * MAXIMUM_PASS_SAMPLES // pixels)
-
-
-@dataclass
-class Pass:
-    """A finished pass: seed, samples per pixel, wall-clock seconds, counters of the integrator, and the seconds of
-    compilation, None if they were not measured."""
-
-    seed: int
-    spp: int
-    seconds: float
-    statistics: dict = field(default_factory=dict)
-    compile_seconds: float | None = None
-
-    @property
-    def weight(self):
-        """Weight in the average of passes: the precision that the integrator expects of the pass before rendering it,
-        or else the samples per pixel. Passes of `manylights` without virtual lights are noisier than the others."""
-        return self.statistics.get("precision", self.spp)
-
-    @property
-    def has_lights(self):
-        """Whether `manylights` used virtual lights."""
-        return Stage.CUTS in self.statistics.get("seconds", {})
-
-    @property
-    def growth(self):
-        """Expected costs of a sample of larger passes, a list of (ratio of the sizes, cost over that in this pass) by
-        size; None if the integrator does not predict them, as for a pass with virtual lights."""
-        return self.statistics.get("growth")
-
-    @property
-    def repeated_seconds(self):
-        """Seconds without compilation, and without the work that later passes share: preparing emitters, the pilot, and
-        measurements by the pilot's paths."""
-        shared, stages = [], self.statistics.get("seconds", {})
-        if self.statistics.get("pilots", 0):
-            shared = [Stage.SCENE, Stage.PILOT]
-        elif self.statistics.get("measured", 0):
-            shared = [Stage.PILOT]
-        not_repeated = (self.compile_seconds or 0.0) + sum(stages.get(stage, 0.0) for stage in shared)
-        return max(self.seconds - not_repeated, 0.0)
-
-    @property
-    def start_seconds(self):
-        """The `repeated_seconds` that hardly grow with the samples; None if the integrator does not report them."""
-        stages = self.statistics.get("seconds", {})
-        if Stage.TRACED not in stages:
-            return None
-        return max(self.repeated_seconds - sum(stages.get(stage, 0.0) for stage in PER_SAMPLE), 0.0)
-
-
-@dataclass
-class PassImage:
-    """Image of a pass. `planes`: average of the samples, (height, width, channels) float32; `channels`: names; `taken`:
-    the `Pass`; `half`: colour of every second sample, None if not requested."""
-
-    planes: np.ndarray
-    channels: list
-    taken: Pass
-    half: np.ndarray | None = None
-
-
-def render_pass(
-    scene, sensor, integrator, spp, seed, first=None, shared=None, density=None, half=False, parts=1
-):  # fmt: skip
-    """Render a pass of `spp` samples per pixel, which stratified samplers round up; return a `PassImage`.
-
-    `sensor`: an index. `first`: (samples per pixel, seed) of the first pass of the render, by default this pass, which
-    then measures compilation; the start that passes of `manylights` share depends on it. `shared`: the `SharedStart` of
-    the render. `density`, `half`: samples of each pixel over `spp`, and whether to return an image of every second
-    sample; see `PassRenderer.pass_of`. `parts`: the image is that of a fine film (fine_film.py), whose pixels have
-    equal numbers of samples, so that `spp` is rounded up.
-    """
-    sensor, begin = scene.sensors()[sensor], time.perf_counter()
-    shared = shared or SharedStart()
-    with fine_film(sensor, parts):
-        sharing = _sharing(scene, sensor, integrator, (spp, seed), first or (spp, seed), shared, density, half, parts)
-        # Later passes compile little, and measuring takes time
-        with compilation_measured() if first is None else nullcontext() as compilation, sharing:
-            spp = _render(scene, sensor, integrator, spp, seed, parts)
-        seconds = time.perf_counter() - begin
-        # The film, as the image of `mi.render` lacks names, and channels of nested integrators
-        bitmap = sensor.film().bitmap()
-    channels = [entry.name for entry in bitmap.struct_()]
-    planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
-    statistics = dict(getattr(integrator, "statistics", None) or {})
-    taken = Pass(seed, spp, seconds, statistics, compilation and compilation.seconds)
-    if not half:
-        return PassImage(planes, channels, taken)
-    rest = [index for index, name in enumerate(channels) if not name.startswith(HALF)]
-    of_half = colour(planes, channels, f"{HALF}.")
-    return PassImage(planes[..., rest], [channels[index] for index in rest], taken, of_half)
-
-
-def _render(scene, sensor, integrator, spp, seed, parts):
-    """Render to the film of a sensor; return the samples per pixel, as the sampler rounds them."""
-    # Set before the render, as integrators such as `prb` clone the sampler
-    with _sample_count(sensor.sampler(), -(-spp // parts**2)) as of_film, garbage_kept():
-        dr.eval(mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=of_film))
-        dr.sync_thread()
-        return of_film * parts**2
-
-
-@dataclass
-class SharedStart:
-    """What the passes of a render share: `start`, an object of the integrator, None before the first pass. The scene
-    must not change while it is used. `rays`: least number of camera rays for which the start is made; 0 without a limit
-    of time, with a checkpoint, and on a cluster."""
-
-    start: object = None
-    rays: int = 0
-
-
-@contextmanager
-def _sharing(scene, sensor, integrator, this, first, shared, density, half, parts):
-    """Let the pass `this`, (samples per pixel, seed), use the start of the pass `first`, if the integrator shares it.
-
-    Makes the start if the first pass was rendered elsewhere, so that an image is the same on any number of workers.
-    """
-    if not hasattr(integrator, "pass_of"):
-        yield
-        return
-    with integrator.pass_of(shared, this == first, density, half, parts) as is_missing:
-        if is_missing:
-            with integrator.only_start():
-                _render(scene, sensor, integrator, *first, parts)
-        yield
 
 
 class Passes:
@@ -282,7 +121,7 @@ class Progressive(Passes):
         """Return whether the sampler keeps a number of samples per pixel, which some samplers round up, and whether
         pixels may have the different numbers of samples that the render has determined."""
         cells, multiple = self.parts**2, self.density.multiple
-        with _sample_count(self._scene.sensors()[self._sensor].sampler(), -(-spp // cells)) as rounded:
+        with sample_count(self._scene.sensors()[self._sensor].sampler(), -(-spp // cells)) as rounded:
             is_multiple = spp % multiple == 0 or spp < multiple or self.density.relative is None
             return cells * rounded == spp and is_multiple
 
@@ -333,17 +172,6 @@ class Progressive(Passes):
     def pixels(self):
         """Number of pixels of the image."""
         return int(np.prod(self._scene.sensors()[self._sensor].film().crop_size()))
-
-
-@contextmanager
-def _sample_count(sampler, spp):
-    """Set the samples per pixel of a sampler within the block; yield the number after rounding by the sampler."""
-    own = sampler.sample_count()
-    sampler.set_sample_count(spp)
-    try:
-        yield sampler.sample_count()
-    finally:
-        sampler.set_sample_count(own)
 
 
 def _shown(planes, channels):

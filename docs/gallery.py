@@ -22,8 +22,9 @@ sys.path.insert(0, str(ROOT))
 import compare  # noqa: E402  (the project's own, whatever folder this is called from)
 from comparison import command_line, images, references, tables  # noqa: E402
 from comparison.pictures import REFERENCE  # noqa: E402
-from comparison.rendering import Progressive, pass_seed  # noqa: E402
+from comparison.rendering import Progressive  # noqa: E402
 from comparison.scene_files import SceneFile  # noqa: E402
+from comparison.single_pass import pass_seed  # noqa: E402
 
 SCENES, WORK, PAGE = ROOT / "scenes", ROOT / "output" / "gallery", ROOT / "docs" / "gallery.md"
 PICTURES = PAGE.with_suffix("")

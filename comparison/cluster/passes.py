@@ -8,7 +8,8 @@ import math
 import time
 from collections import Counter
 
-from ..rendering import Passes, pass_seed
+from ..rendering import Passes
+from ..single_pass import pass_seed
 from . import worker
 from .pool import TASKS_PER_WORKER, Task
 

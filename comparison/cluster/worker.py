@@ -11,7 +11,7 @@ from pathlib import Path
 
 from distributed import get_worker
 
-from .. import machine, rendering
+from .. import machine, single_pass
 from ..command_line import explain, set_variant
 from ..worker import run
 from .compatibility import identity
@@ -46,15 +46,15 @@ def add_file(hash, content, dask_worker):
 def render_pass(bundle, sensor, spp, seed, first):
     """Render a pass of the scene of a `SceneBundle`; return a `PassImage`.
 
-    `first`: see `rendering.render_pass`. Raises FilesMissing for missing files, Interrupted for an unfinished pass, and
-    RenderError for other errors.
+    `first`: see `single_pass.render_pass`. Raises FilesMissing for missing files, Interrupted for an unfinished pass,
+    and RenderError for other errors.
     """
     with _LOCK:
         path = Store(get_worker().local_directory).place(bundle)
         try:
             scene, starts = _scene(bundle, path)
-            shared = starts.setdefault((sensor, first), rendering.SharedStart())
-            image = rendering.render_pass(scene, sensor, scene.integrator(), spp, seed, first, shared)
+            shared = starts.setdefault((sensor, first), single_pass.SharedStart())
+            image = single_pass.render_pass(scene, sensor, scene.integrator(), spp, seed, first, shared)
         except Exception as error:
             # Exceptions of Mitsuba and Dr.Jit may be impossible to unpickle on the client
             raise RenderError(explain(error)) from None

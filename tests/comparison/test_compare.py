@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import compare
-from comparison import counters, images, rendering, worker
+from comparison import counters, images, rendering, single_pass, worker
 from comparison.scene_files import SceneFile
 from tests.support.paths import CORNELL, ROOT
 from tests.support.scenes import cornell
@@ -104,19 +104,19 @@ def test_fingerprint_follows_everything_that_matters(tmp_path):
 
 
 def test_pass_seeds_differ_and_begin_with_the_seed():
-    seeds = [rendering.pass_seed(seed, index) for seed in (0, 1, 2) for index in range(100)]
+    seeds = [single_pass.pass_seed(seed, index) for seed in (0, 1, 2) for index in range(100)]
     assert seeds[::100] == [0, 1, 2]
     assert len(set(seeds)) == 300
     assert all(0 <= seed < 2**32 for seed in seeds)
 
 
 def test_pass_sizes():
-    assert rendering.largest_pass(10**9) == rendering.largest_pass(10**9, in_parts=True) == 1
-    assert rendering.largest_pass(2**16) == 32
-    assert rendering.largest_pass(2**16, in_parts=True) == 128
-    assert rendering.pass_sizes(100, 32) == [32, 32, 32, 4]
-    assert rendering.pass_sizes(3, 128) == [3]
-    assert rendering.pass_sizes(5, 2) == [2, 2, 1]
+    assert single_pass.largest_pass(10**9) == single_pass.largest_pass(10**9, in_parts=True) == 1
+    assert single_pass.largest_pass(2**16) == 32
+    assert single_pass.largest_pass(2**16, in_parts=True) == 128
+    assert single_pass.pass_sizes(100, 32) == [32, 32, 32, 4]
+    assert single_pass.pass_sizes(3, 128) == [3]
+    assert single_pass.pass_sizes(5, 2) == [2, 2, 1]
 
 
 def test_progressive_is_the_weighted_mean_of_its_passes():
@@ -126,7 +126,7 @@ def test_progressive_is_the_weighted_mean_of_its_passes():
         progressive.render(spp)
     refused = progressive.render(8, accept=lambda: False)
     assert refused is None
-    one, three = (mi.render(scene, seed=rendering.pass_seed(5, i), spp=spp).numpy() for i, spp in ((0, 1), (1, 3)))
+    one, three = (mi.render(scene, seed=single_pass.pass_seed(5, i), spp=spp).numpy() for i, spp in ((0, 1), (1, 3)))
     np.testing.assert_allclose(progressive.image, (one + 3.0 * three) / 4, rtol=1e-5)
     assert (progressive.spp, len(progressive.passes), progressive.channels) == (4, 2, ["R", "G", "B"])
     assert progressive.seconds > 0
@@ -149,7 +149,7 @@ def test_statistics_add_up():
         {"shadow_rays": 3, "seconds": {"trace": 1.0}, "lights": {"omni": 7}},
         {"shadow_rays": 4, "seconds": {"trace": 0.5, "cut": 1.0}, "lights": {"omni": 8}},
     ]
-    total = counters.total_statistics([rendering.Pass(0, 1, 1.0, one) for one in statistics])
+    total = counters.total_statistics([single_pass.Pass(0, 1, 1.0, one) for one in statistics])
     assert total == {"shadow_rays": 7, "seconds": {"trace": 1.5, "cut": 1.0}, "lights": {"omni": 8}}
     assert statistics[0]["seconds"] == {"trace": 1.0}
 
@@ -160,7 +160,7 @@ def test_what_describes_a_pass_is_that_of_the_largest():
         {"plan": "glossy", "share": 0.25, "lights": {"surface": 7}},
         {"plan": "too few samples"},
     ]
-    passes = [rendering.Pass(0, spp, 1.0, one) for spp, one in zip((1, 8, 2), statistics, strict=True)]
+    passes = [single_pass.Pass(0, spp, 1.0, one) for spp, one in zip((1, 8, 2), statistics, strict=True)]
     assert counters.total_statistics(passes) == {"plan": "glossy", "share": 0.75, "lights": {"surface": 7}}
 
 
@@ -174,7 +174,7 @@ def test_statistics_are_read_once_as_passes_come():
 
     totals, passes, found = counters.TotalStatistics(), [], []
     for spp in (4, 8, 2, 8):
-        passes.append(rendering.Pass(0, spp, 1.0, Read(rays=spp, plan=f"{spp}, {len(passes)}")))
+        passes.append(single_pass.Pass(0, spp, 1.0, Read(rays=spp, plan=f"{spp}, {len(passes)}")))
         found.append(totals.of(passes))
     assert len(read) == 4 and found[-1] == counters.total_statistics(passes) == {"rays": 22, "plan": "8, 3"}
     assert found[0] == {"rays": 4, "plan": "4, 0"}

@@ -3,7 +3,7 @@
 import mitsuba as mi
 import pytest
 
-from comparison import measuring, rendering, worker
+from comparison import measuring, rendering, single_pass, worker
 from tests.support.scenes import cornell
 from vpl.core.stages import Stage
 
@@ -21,13 +21,13 @@ class Recorded(rendering.Progressive):
     def render(self, spp, seed=None, is_probe=False):
         self.asked.append((spp, seed is not None))
         seconds = self._seconds.pop(0) if self._seconds else self._start + spp
-        self.passes.append(rendering.Pass(seed or 0, spp, seconds))
+        self.passes.append(single_pass.Pass(seed or 0, spp, seconds))
         return self.passes[-1]
 
 
 def test_kernels_of_every_size_of_pass_are_compiled_before_the_clock_runs():
     job = worker.Job("p", "path", "s.xml", "a.exr", spp=19)
-    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 9, 2.0)
+    progressive = Recorded(single_pass.MAXIMUM_PASS_SAMPLES // 9, 2.0)
     assert measuring.measure(progressive, job) == 2.0
     assert progressive.asked == [(5, True), (1, True), (5, True), (9, True), (9, False), (9, False), (1, False)]
     assert sum(one.spp for one in progressive.passes) == 19
@@ -46,7 +46,7 @@ class InParts(Recorded):
         pilot = 0.0 if self.passes else 2.0
         stages = {Stage.PILOT: pilot, Stage.TRACED: 0.01 * spp, Stage.CUTS: 0.0}
         statistics = {"seconds": stages, "pilots": int(pilot > 0)}
-        self.passes.append(rendering.Pass(seed or 0, spp, pilot + 0.1 + 0.01 * spp, statistics))
+        self.passes.append(single_pass.Pass(seed or 0, spp, pilot + 0.1 + 0.01 * spp, statistics))
         return self.passes[-1]
 
 
@@ -71,7 +71,7 @@ def test_passes_in_parts_are_those_of_a_render_by_time_and_include_a_pilot():
 
 def test_only_small_passes_compile_where_passes_are_long():
     job = worker.Job("p", "path", "s.xml", "a.exr", spp=16)
-    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 16, measuring.LONG_PASS + 1, measuring.LONG_PASS / 2)
+    progressive = Recorded(single_pass.MAXIMUM_PASS_SAMPLES // 16, measuring.LONG_PASS + 1, measuring.LONG_PASS / 2)
     measuring.measure(progressive, job)
     assert progressive.asked == [(4, True), (4, True), (16, False)]
 
@@ -95,7 +95,7 @@ def test_what_compiles_for_longer_than_the_budget_is_measured_warm():
     ],
 )
 def test_cold_images_hold_every_pass(effort, passes):
-    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 16, 6.0)
+    progressive = Recorded(single_pass.MAXIMUM_PASS_SAMPLES // 16, 6.0)
     assert measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", cold=True, **effort)) == 6
     assert progressive.asked == [(spp, False) for spp in passes]
     assert [one.spp for one in progressive.passes] == passes
@@ -131,7 +131,7 @@ def test_the_last_pass_fills_the_budget(budget, pass_spp, passes):
     ],
 )
 def test_passes_are_as_large_as_the_cost_of_starting_one_asks_for(budget, start, passes):
-    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 2048, start=float(start))
+    progressive = Recorded(single_pass.MAXIMUM_PASS_SAMPLES // 2048, start=float(start))
     measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget))
     assert [one.spp for one in progressive.passes] == passes and abs(progressive.seconds - budget) <= 2
 
@@ -146,6 +146,6 @@ def test_passes_may_turn_out_to_be_slower_or_faster():
 
 
 def test_cold_images_go_on_after_a_size_that_compiled():
-    progressive = Recorded(rendering.MAXIMUM_PASS_SAMPLES // 64, 2.0, 0.04, 2.0, 0.08, 0.16, 0.16)
+    progressive = Recorded(single_pass.MAXIMUM_PASS_SAMPLES // 64, 2.0, 0.04, 2.0, 0.08, 0.16, 0.16)
     measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", cold=True, budget=8.0))
     assert [spp for spp, _ in progressive.asked][:7] == [4, 4, 8, 8, 16, 16, 32]

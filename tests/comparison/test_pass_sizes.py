@@ -6,7 +6,7 @@ from collections import Counter
 import pytest
 
 from comparison.pass_sizes import PASS_SECONDS, PassSizes
-from comparison.rendering import MAXIMUM_PASS_SAMPLES, Pass
+from comparison.single_pass import MAXIMUM_PASS_SAMPLES, Pass
 from vpl.core.stages import Stage
 
 SQUARE = 256 * 256

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import manylights
-from comparison import convergence, rendering
+from comparison import convergence, rendering, single_pass
 from comparison import render as render_module
 from tests.support.paths import CORNELL, ROOT
 from tests.support.rendering import render_with_statistics
@@ -44,7 +44,9 @@ def test_a_render_of_one_pass_is_mitsubas(scene):
 def test_the_image_is_the_average_of_its_passes(scene):
     image, took = manylights.render(scene, spp=10, pass_spp=4, seed=3)
     assert (took.spp, took.passes) == (10, 3)
-    parts = [spp * mi.render(scene, spp=spp, seed=rendering.pass_seed(3, k)).numpy() for k, spp in enumerate((4, 4, 2))]
+    parts = [
+        spp * mi.render(scene, spp=spp, seed=single_pass.pass_seed(3, k)).numpy() for k, spp in enumerate((4, 4, 2))
+    ]
     np.testing.assert_allclose(image.numpy(), sum(parts) / 10, rtol=1e-5)
     assert took.error > 0
 
@@ -59,7 +61,7 @@ def test_passes_of_integrators_that_clone_the_sampler_have_the_samples_that_were
     assert (took.spp, took.passes) == (5, 2)
     prb = mi.load_dict({"type": "prb"})
     parts = [
-        spp * mi.render(scene, integrator=prb, spp=spp, seed=rendering.pass_seed(3, k)).numpy()
+        spp * mi.render(scene, integrator=prb, spp=spp, seed=single_pass.pass_seed(3, k)).numpy()
         for k, spp in enumerate((4, 1))
     ]
     np.testing.assert_allclose(image.numpy(), sum(parts) / 5, rtol=1e-5)
@@ -111,7 +113,7 @@ def test_integrators_are_given_by_name_or_as_they_are(scene):
     plugin = {"vpl_count": 200, "max_depth": 3}
     image, took = manylights.render(scene, mi.load_dict({"type": "vpl", **plugin}), spp=8, pass_spp=4)
     counted = [
-        render_with_statistics("vpl", scene, 4, rendering.pass_seed(0, k), **plugin)[1]["shadow_rays"] for k in (0, 1)
+        render_with_statistics("vpl", scene, 4, single_pass.pass_seed(0, k), **plugin)[1]["shadow_rays"] for k in (0, 1)
     ]
     assert took.statistics["shadow_rays"] == sum(counted)
 

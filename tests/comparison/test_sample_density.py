@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import manylights
-from comparison import fine_film, rendering
+from comparison import fine_film, rendering, single_pass
 from comparison.checkpoint import Checkpoint
 from comparison.pass_sizes import PASS_SECONDS, PROBE, PassSizes
 from comparison.sample_density import LEAST_SAMPLES, SampleDensity
@@ -129,7 +129,7 @@ def test_images_with_few_samples_in_a_pass_have_equal_numbers(monkeypatch):
     scene, plugin = cornell().load(), mi.load_dict({"type": "manylights", "denoised": True})
     progressive = rendering.Progressive(scene, 0, integrator=plugin, denoise=print)
     assert progressive.differs
-    monkeypatch.setattr(rendering, "MAXIMUM_PASS_SAMPLES", 7 * progressive.pixels // rendering.MORE_IN_PARTS)
+    monkeypatch.setattr(single_pass, "MAXIMUM_PASS_SAMPLES", 7 * progressive.pixels // single_pass.MORE_IN_PARTS)
     assert not progressive.differs
 
 
@@ -245,6 +245,6 @@ def test_passes_that_cost_more_than_expected_end_by_the_limit():
         seconds = 0.05 + 0.04 * spp * (1.8 if spp >= 24 else 1)
         stages = {"traced": seconds - 0.05} | ({"cuts": 0.0} if spp >= 24 else {})
         statistics = {"seconds": stages, "growth": [(4, 1.0 if spp >= 24 else 1.5)]}
-        passes.append(rendering.Pass(0, spp, seconds, statistics))
+        passes.append(single_pass.Pass(0, spp, seconds, statistics))
         elapsed += seconds
     assert 9 < elapsed < 10.5

@@ -6,7 +6,8 @@ import pytest
 
 import manylights
 from comparison.checkpoint import Checkpoint
-from comparison.rendering import Passes, Progressive, SharedStart, render_pass
+from comparison.rendering import Passes, Progressive
+from comparison.single_pass import SharedStart, render_pass
 from tests.support.rendering import plugin_with_model, render
 from tests.support.scenes import area_light, closed_box
 from tests.support.statistics import assert_same_mean

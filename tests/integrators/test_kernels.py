@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import integrators
-from comparison import rendering
+from comparison import single_pass
 from tests.support.marks import stress
 from tests.support.rendering import plugin_with_model
 from tests.support.scenes import area_light, closed_box
@@ -164,7 +164,7 @@ def test_pixels_with_different_numbers_of_samples_use_the_kernel_of_equal_number
         plugin = mi.load_dict({"type": "manylights", "max_depth": 4, "denoised": True})
         for numbers in (None, density, density * np.linspace(1, 3, film_shape[1])):
             dr.kernel_history_clear()
-            taken = rendering.render_pass(scene, 0, plugin, 8, 0, density=numbers).taken
+            taken = single_pass.render_pass(scene, 0, plugin, 8, 0, density=numbers).taken
             assert taken.has_lights == lit
             history = [one for one in dr.kernel_history() if one["type"] == dr.KernelType.JIT]
             launched.append(max(history, key=lambda one: one["operation_count"])["hash"])

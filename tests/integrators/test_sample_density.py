@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from comparison.fine_film import fine_film, merged
-from comparison.rendering import SharedStart, render_pass
+from comparison.single_pass import SharedStart, render_pass
 from tests.support.rendering import plugin_with_model
 from tests.support.scenes import area_light, closed_box, image, sensor, wall
 from tests.support.statistics import assert_same_mean

@@ -12,7 +12,7 @@ import pytest
 
 import compare
 import manylights
-from comparison import checkpoint, images, one_image, rendering
+from comparison import checkpoint, images, one_image, rendering, single_pass
 from comparison.cluster import compatibility, connection, passes, pool, runs, scene_travel
 from comparison.scene_files import SceneFile
 from comparison.worker import Job
@@ -130,7 +130,7 @@ def test_images_that_wait_for_another_one_have_bounded_memory(monkeypatch):
     waiting = [passes.DistributedPasses(workers, None, 0, 0, pixels, sampler, 4, spp=16) for _ in range(8)]
     for one in waiting:
         one.start()
-    image, begun = SimpleNamespace(taken=rendering.Pass(0, 4, 1.0)), 0
+    image, begun = SimpleNamespace(taken=single_pass.Pass(0, 4, 1.0)), 0
     for one in waiting[1:]:
         while task := one.next_task(0):
             one.done(task.name, image, "one")
@@ -325,7 +325,7 @@ def test_no_image_is_lost_by_its_checkpoint(ends, tmp_path, monkeypatch, capfd, 
 
 def pass_of(value):
     planes = np.full((4, 4, 3), value, np.float32)
-    return rendering.PassImage(planes, ["R", "G", "B"], rendering.Pass(0, 2, 1.0, {"count": np.int64(3)}))
+    return single_pass.PassImage(planes, ["R", "G", "B"], single_pass.Pass(0, 2, 1.0, {"count": np.int64(3)}))
 
 
 def test_a_checkpoint_that_is_saved_while_a_pass_is_added_is_of_those_before(tmp_path, monkeypatch):

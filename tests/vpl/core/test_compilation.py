@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from comparison import rendering
+from comparison import single_pass
 from tests.support.scenes import cornell
 from vpl.core.clock import Clock
 from vpl.core.compilation import compilation_measured, compiled_since_last, unrecorded
@@ -100,13 +100,13 @@ def test_first_passes_tell_their_compilation(number):
             return mi.Color3f(number * dr.sin(sampler.next_1d())), mi.Bool(True), []
 
     scene, plugin = cornell(16).load(), Constant(mi.Properties())
-    first, again = (rendering.render_pass(scene, 0, plugin, 4, seed).taken for seed in (0, 1))
+    first, again = (single_pass.render_pass(scene, 0, plugin, 4, seed).taken for seed in (0, 1))
     assert 0 < first.compile_seconds < first.seconds and again.compile_seconds == 0
     assert first.repeated_seconds == first.seconds - first.compile_seconds
-    later = rendering.render_pass(scene, 0, plugin, 4, 1, first=(4, 0)).taken
+    later = single_pass.render_pass(scene, 0, plugin, 4, 1, first=(4, 0)).taken
     assert later.compile_seconds is None and later.repeated_seconds == later.seconds
 
 
 def test_a_pass_that_compiles_longer_than_it_takes_has_no_negative_time():
     """Another thread may compile at the same time."""
-    assert rendering.Pass(0, 4, 1.0, {}, 1.5).repeated_seconds == 0
+    assert single_pass.Pass(0, 4, 1.0, {}, 1.5).repeated_seconds == 0
