@@ -173,8 +173,8 @@ def _sharing(scene, sensor, integrator, this, first, shared, density, half, part
 def sample_count(sampler, spp):
     """Set the samples per pixel of a sampler within the block; yield the number after rounding by the sampler."""
     own = sampler.sample_count()
-    sampler.setsample_count(spp)
+    sampler.set_sample_count(spp)
     try:
         yield sampler.sample_count()
     finally:
-        sampler.setsample_count(own)
+        sampler.set_sample_count(own)
