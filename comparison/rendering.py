@@ -2,6 +2,9 @@
 
 import numpy as np
 
+from vpl.core.sampling import derived_seed
+from vpl.split.pixel_rays import Continued
+
 from .convergence import ErrorEstimate
 from .fine_film import merged
 from .images import colour
@@ -11,6 +14,8 @@ from .single_pass import SharedStart, largest_pass, pass_seed, render_pass, samp
 # Camera rays for a second of a limit: a low estimate, so that the pilot of `manylights` takes little of the limit
 # (kitchen: 900 000 rays in a second on two cores)
 _RAYS_PER_SECOND = 100_000
+# Seed of the lattices that passes share, of the seed of the render
+_CONTINUED_STREAM = 0x5EC0
 
 
 class Passes:
@@ -108,14 +113,22 @@ class Progressive(Passes):
         sensor = self._scene.sensors()[self._sensor]
         density = self.density.of_pass(self.integrator, sensor, spp)
         half = is_probe and self.density.suits_probe(self.integrator, sensor, spp)
+        continued = None if density is None else self._continued(sensor)
         image = render_pass(
-            self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density, half, self.parts
+            self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density, half, self.parts,
+            continued,
         )  # fmt: skip
         if not accept():
             return None
         if half:
             self.density.learn(*(self.merged(one) for one in (image.planes, image.half)), image.channels)
         return self.add(image)
+
+    def _continued(self, sensor):
+        """Return the passes so far whose lattices a pass with different numbers of samples continues."""
+        # The first two passes determine the numbers, and small passes have equal ones
+        earlier = (one.spp for one in self.passes[2:] if self.density.suits(self.integrator, sensor, one.spp))
+        return Continued(sum(earlier), derived_seed(self.seed, _CONTINUED_STREAM))
 
     def accepts(self, spp):
         """Return whether the sampler keeps a number of samples per pixel, which some samplers round up, and whether

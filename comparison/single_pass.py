@@ -103,20 +103,22 @@ class PassImage:
 
 
 def render_pass(
-    scene, sensor, integrator, spp, seed, first=None, shared=None, density=None, half=False, parts=1
+    scene, sensor, integrator, spp, seed, first=None, shared=None, density=None, half=False, parts=1,
+    continued=None,
 ):  # fmt: skip
     """Render a pass of `spp` samples per pixel, which stratified samplers round up; return a `PassImage`.
 
     `sensor`: an index. `first`: (samples per pixel, seed) of the first pass of the render, by default this pass, which
     then measures compilation; the start that passes of `manylights` share depends on it. `shared`: the `SharedStart` of
-    the render. `density`, `half`: samples of each pixel over `spp`, and whether to return an image of every second
-    sample; see `PassRenderer.pass_of`. `parts`: the image is that of a fine film (fine_film.py), whose pixels have
-    equal numbers of samples, so that `spp` is rounded up.
+    the render. `density`, `half`, `continued`: samples of each pixel over `spp`, whether to return an image of every
+    second sample, and earlier samples; see `PassRenderer.pass_of`. `parts`: the image is that of a fine film
+    (fine_film.py), whose pixels have equal numbers of samples, so that `spp` is rounded up.
     """
     sensor, begin = scene.sensors()[sensor], time.perf_counter()
     shared = shared or SharedStart()
     with fine_film(sensor, parts):
-        sharing = _sharing(scene, sensor, integrator, (spp, seed), first or (spp, seed), shared, density, half, parts)
+        samples = {"density": density, "half": half, "continued": continued}
+        sharing = _sharing(scene, sensor, integrator, (spp, seed), first or (spp, seed), shared, parts, samples)
         # Later passes compile little, and measuring takes time
         with compilation_measured() if first is None else nullcontext() as compilation, sharing:
             spp = _render(scene, sensor, integrator, spp, seed, parts)
@@ -154,15 +156,16 @@ class SharedStart:
 
 
 @contextmanager
-def _sharing(scene, sensor, integrator, this, first, shared, density, half, parts):
+def _sharing(scene, sensor, integrator, this, first, shared, parts, samples):
     """Let the pass `this`, (samples per pixel, seed), use the start of the pass `first`, if the integrator shares it.
+    `samples`: arguments of `PassRenderer.pass_of` on the samples of the pass.
 
     Makes the start if the first pass was rendered elsewhere, so that an image is the same on any number of workers.
     """
     if not hasattr(integrator, "pass_of"):
         yield
         return
-    with integrator.pass_of(shared, this == first, density, half, parts) as is_missing:
+    with integrator.pass_of(shared, this == first, parts=parts, **samples) as is_missing:
         if is_missing:
             with integrator.only_start():
                 _render(scene, sensor, integrator, *first, parts)

@@ -19,7 +19,7 @@ import numpy as np
 from vpl.core.sampling import derived_seed
 from vpl.split.film_cells import FilmCells
 from vpl.split.lattice import Lattice
-from vpl.split.pixel_rays import MULTIPLE, PixelRays, RayNumbers
+from vpl.split.pixel_rays import MULTIPLE, Continued, PixelRays, RayNumbers
 
 # Mitsuba's default. A scene that names another sampler keeps it
 _REPLACED = "IndependentSampler"
@@ -75,17 +75,20 @@ class LatticeSampler(mi.Sampler):
     def _begin(self):
         lanes = self.wavefront_size()
         each, lane, self._calls = lanes // self.pixels, dr.arange(mi.UInt32, lanes), 0
+        seed, earlier = self._seed, None
         if self.cells:
-            places, sizes = self.cells.rays.places(lane), self.cells.rays.sizes
+            rays = self.cells.rays
+            places, sizes, earlier = rays.places(lane), rays.sizes, rays.earlier
+            seed = rays.continued.seed if rays.continued else seed
             in_cells = self.cells.places(lane)
-            self._in_cells = Lattice(in_cells, self.cells.sizes, self._seed)
+            self._in_cells = Lattice(in_cells, self.cells.sizes, seed, self.cells.earlier)
             here = self.cells.position(lane // dr.opaque(mi.UInt32, each))
             self._offset = self.cells.position(in_cells.pixel) - here
         else:
             places, sizes = RayNumbers.of_lanes(lane, each), (self.sample_count(),)
             # The passes of a render share the lattice of a pixel
             places = replace(places, number=places.number + dr.opaque(mi.UInt32, self._pass * each))
-        self._lattice = Lattice(places, sizes, self._seed)
+        self._lattice = Lattice(places, sizes, seed, earlier)
 
     def _next(self, lattice: Lattice | None = None):
         self._calls += 1
@@ -174,12 +177,14 @@ def has_free_order(sensor, has_box: bool = False) -> bool:
     return is_replaced(sensor) and (has_box or (film.rfilter().is_box_filter() and not film.sample_border()))
 
 
-def cells_of(film, spp: int, parts: int, density: np.ndarray | None = None) -> FilmCells | None:
+def cells_of(
+    film, spp: int, parts: int, density: np.ndarray | None = None, continued: Continued | None = None
+) -> FilmCells | None:  # fmt: skip
     """Cells of a ``film`` with ``parts``² pixels for each pixel of the image and ``spp`` samples for each pixel of the
     film; None if rays have the order of the film.
 
-    ``density`` (height, width): samples of the image's pixels over their mean, about; None: equal numbers.  Raises
-    ValueError for a density of another shape.
+    ``density`` (height, width): samples of the image's pixels over their mean, about; None: equal numbers;
+    ``continued``: earlier rays by this density.  Raises ValueError for a density of another shape.
     """
     if parts == 1 and density is None:
         return None
@@ -189,16 +194,18 @@ def cells_of(film, spp: int, parts: int, density: np.ndarray | None = None) -> F
         return FilmCells(PixelRays.uniform(width * height, samples), parts, width)
     if density.shape != (height, width):
         raise ValueError(f"density must have the shape of the image, {(height, width)}, got {density.shape}")
-    return FilmCells(PixelRays.by_density(density, samples), parts, width)
+    return FilmCells(PixelRays.by_density(density, samples, continued), parts, width)
 
 
 @contextmanager
-def stratified(sensor, spp: int, density: np.ndarray | None = None, parts: int = 1):
+def stratified(
+    sensor, spp: int, density: np.ndarray | None = None, parts: int = 1, continued: Continued | None = None
+):  # fmt: skip
     """Within the block, a sensor for ``sensor`` with stratified samples if its sampler is ``independent``.
 
     Yields ``sensor`` itself with another sampler, for a batch of sensors, and within a participating medium.  ``spp``:
-    samples of a pixel of the film; 0: as many as the sampler has; ``density``, ``parts``: see :func:`cells_of`, for
-    films with a box filter.
+    samples of a pixel of the film; 0: as many as the sampler has; ``density``, ``parts``, ``continued``: see
+    :func:`cells_of`, for films with a box filter.
     """
     if not is_replaced(sensor):
         yield sensor
@@ -211,7 +218,7 @@ def stratified(sensor, spp: int, density: np.ndarray | None = None, parts: int =
         lent = StratifiedSensor()
     try:
         spp = spp or sampler.sample_count()
-        lent.becomes(sensor, spp, cells_of(sensor.film(), spp, parts, density))
+        lent.becomes(sensor, spp, cells_of(sensor.film(), spp, parts, density, continued))
         yield lent
     finally:
         lent.becomes(None, 0)

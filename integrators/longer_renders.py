@@ -9,6 +9,7 @@ import numpy as np
 
 from vpl.core.arrays import NO_LIMIT
 from vpl.core.exclusive import exclusive
+from vpl.split.pixel_rays import Continued
 
 from .camera_samples import has_free_order, may_differ
 from .gathering import GatheringIntegrator
@@ -19,7 +20,7 @@ class RenderPass:
     """A pass of a longer render; by default a render of its own.
 
     ``shared``: object with the ``start`` of the passes, or None; ``makes_start``: whether this pass makes the start;
-    ``makes_image``; ``density``, ``half``, ``parts``: see :meth:`PassRenderer.pass_of`.
+    ``makes_image``; ``density``, ``half``, ``parts``, ``continued``: see :meth:`PassRenderer.pass_of`.
     """
 
     shared: object = None
@@ -28,6 +29,7 @@ class RenderPass:
     density: np.ndarray | None = None
     half: bool = False
     parts: int = 1
+    continued: Continued | None = None
 
 
 class PassRenderer(GatheringIntegrator):
@@ -41,7 +43,10 @@ class PassRenderer(GatheringIntegrator):
         return self.samples_per_pass == NO_LIMIT
 
     @contextmanager
-    def pass_of(self, shared, is_first: bool, density=None, half: bool = False, parts: int = 1):
+    def pass_of(
+        self, shared, is_first: bool, density=None, half: bool = False, parts: int = 1,
+        continued: Continued | None = None,
+    ):  # fmt: skip
         """Within the block, a render is a pass of a longer render and uses the start that its passes share.
 
         ``shared``: object with an attribute ``start``, None until the first pass is rendered, and ``rays``: least
@@ -51,12 +56,14 @@ class PassRenderer(GatheringIntegrator):
         all passes.  ``density`` (height, width): samples of each pixel of the image over their mean, about; None for
         equal numbers.  ``half``: whether the image has the mean of every second sample as channels of the layer
         :data:`vpl.split.film_cells.HALF`, with an even number of samples for each pixel of the film.  Both need
-        :meth:`may_differ`, and exclude each other.
+        :meth:`may_differ`, and exclude each other.  ``continued``: earlier passes with this density whose lattices the
+        samples continue; None for lattices of their own.  The density must not depend on these passes: their samples
+        tell where the next ones lie.
         """
         if half and density is not None:
             raise ValueError("half must be False where pixels have different numbers of samples, by a density")
         with exclusive(integrator=self):
-            self._pass = RenderPass(shared, is_first, density=density, half=half, parts=parts)
+            self._pass = RenderPass(shared, is_first, density=density, half=half, parts=parts, continued=continued)
             try:
                 yield shared.start is None and not is_first
             finally:
@@ -67,7 +74,7 @@ class PassRenderer(GatheringIntegrator):
         """Within the block, a render makes the start of its pass and no image."""
         before = self._pass
         # The start belongs to the first pass, whose pixels have equal numbers of samples
-        self._pass = replace(before, makes_start=True, makes_image=False, density=None, half=False)
+        self._pass = replace(before, makes_start=True, makes_image=False, density=None, half=False, continued=None)
         try:
             yield
         finally:

@@ -120,7 +120,8 @@ class ManyLightsIntegrator(PassRenderer):
     - Numbers of samples: with ``denoised``, the passes of ``manylights.render`` from the third on give a pixel from a
       quarter to four times the mean number of samples.  Two halves of the second pass are denoised apart, and show
       where noise remains.  Passes depend on earlier passes only and have a common weight for all pixels, so the mean of
-      the image is unchanged.  The sensor needs the samples of this plugin, and a film in the resolution of the image
+      the image is unchanged.  These passes share lattices, so that their samples are spread as those of one pass.
+      Renders of less than some 60 samples have equal numbers, and no such second pass.  The sensor needs the samples of this plugin, and a film in the resolution of the image
       a box filter.  Images that end by ``error``, passes of a given size, images by several workers and images above
       half a million pixels (a million in their own resolution) have equal numbers.
     - Masks: the image is that of ``prb``.  ``path`` (Mitsuba 3.9.1) shows black for samples whose path ends after it
@@ -246,8 +247,8 @@ class ManyLightsIntegrator(PassRenderer):
     def _render(self, scene, sensor, seed, spp, develop, evaluate):
         if self._layer_names:
             _require_unit_weight(sensor)
-        density, parts = self._pass.density, self.parts_of(sensor)
-        with stratified(sensor, spp, density, parts) if self.stratified else nullcontext(sensor) as chosen:
+        density, continued, parts = self._pass.density, self._pass.continued, self.parts_of(sensor)
+        with stratified(sensor, spp, density, parts, continued) if self.stratified else nullcontext(sensor) as chosen:
             return super()._render(scene, chosen, seed, spp, develop, evaluate)
 
     def _sample(self, scene, sampler, ray, active):

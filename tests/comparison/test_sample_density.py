@@ -79,7 +79,7 @@ def passes_of(monkeypatch, scene, integrator, **limits):
     seen, before = [], rendering.render_pass
 
     def spied(*arguments):
-        *_, density, half, _ = arguments
+        *_, density, half, _, _ = arguments
         seen.append((density is not None, half))
         return before(*arguments)
 
@@ -170,6 +170,28 @@ def test_an_interrupted_render_goes_on_with_its_numbers(tmp_path):
         manylights.render(scene, "manylights", checkpoint=checkpoints[0], progress=stop, **limits)
         manylights.render(scene, "manylights", checkpoint=checkpoints[1], **limits)
     assert seen[0] is None and seen[1] is None and seen[2] is not None and (seen[2] != 1).any()
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_passes_with_numbers_of_their_own_share_lattices(tmp_path, monkeypatch, interrupted):
+    """Each goes on after those before; the first two and a small last one have lattices of their own."""
+    scene, limits = cornell().load(), {"spp": 135, "denoise": True}
+    seen, before = [], rendering.render_pass
+
+    def spied(*arguments):
+        seen.append((arguments[3], arguments[-1]))
+        return before(*arguments)
+
+    monkeypatch.setattr(rendering, "render_pass", spied)
+    monkeypatch.setattr(single_pass, "MAXIMUM_PASS_SAMPLES", 16 * 16 * 32 // single_pass.MORE_IN_PARTS)
+    for most in (4, 100) if interrupted else (100,):
+        checkpoint = Checkpoint(tmp_path / "image.checkpoint.npz", {})
+        progress = lambda took, _, most=most: took.passes < most  # noqa: E731
+        manylights.render(scene, "manylights", checkpoint=checkpoint, progress=progress, **limits)
+    shared = [(spp, continued.earlier) for spp, continued in seen if continued]
+    assert [one for _, one in seen[:2]] == [None, None] and seen[-1][1] is None and len(shared) > 2
+    assert shared == [(spp, sum(size for size, _ in shared[:index])) for index, (spp, _) in enumerate(shared)]
+    assert len({continued.seed for _, continued in seen if continued}) == 1
 
 
 def test_a_seed_gives_the_same_image():

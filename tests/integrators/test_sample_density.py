@@ -9,7 +9,7 @@ from comparison.single_pass import SharedStart, render_pass
 from tests.support.rendering import plugin_with_model
 from tests.support.scenes import area_light, closed_box, image, sensor, wall
 from tests.support.statistics import assert_same_mean
-from vpl.split.pixel_rays import PixelRays
+from vpl.split.pixel_rays import Continued, PixelRays
 
 # Neither square nor symmetric, and as many pixels as a square of SIDE
 WIDTH, HEIGHT, SIDE, SPP = 16, 4, 8, 16
@@ -55,11 +55,12 @@ def plugin(lights=True, **more):
     return mi.load_dict({"type": "manylights", "denoised": True, "max_depth": 4, "virtual_lights": lights} | more)
 
 
-def render(scene, integrator, density=None, seed=0, spp=SPP, half=False, parts=1):
+def render(scene, integrator, density=None, seed=0, spp=SPP, half=False, parts=1, continued=None):
     """A first pass of a render: an array (height, width, channels), in the resolution of the image."""
     camera = scene.sensors()[0]
     filter = camera.film().rfilter()
-    with integrator.pass_of(SharedStart(), True, density, half, parts) as is_missing, fine_film(camera, parts):
+    one = integrator.pass_of(SharedStart(), True, density, half, parts, continued)
+    with one as is_missing, fine_film(camera, parts):
         assert not is_missing
         found = mi.render(scene, sensor=camera, integrator=integrator, spp=spp // parts**2, seed=seed)
         return merged(np.array(found, np.float64), parts, filter)
@@ -118,6 +119,31 @@ def test_the_mean_of_every_pixel_is_that_of_equal_numbers(lights, parts):
         return found, render(scene, integrator, None, 1000 + seed)
 
     assert_same_mean_of_pixels(pair)
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+@with_and_without_lights
+def test_passes_that_share_lattices_have_the_mean_of_equal_numbers(lights, parts):
+    """And in their mean less noise than passes with lattices of their own."""
+    scene, integrator = room(), plugin(lights)
+
+    def mean_of_passes(seed, shares):
+        passes = [Continued(number * SPP, seed) if shares else None for number in range(4)]
+        return np.mean(
+            [render(scene, integrator, DENSITY, 10 * seed + i, parts=parts, continued=x) for i, x in enumerate(passes)],
+            axis=0,
+        )
+
+    found = {shares: [] for shares in (True, False)}
+
+    def pair(seed):
+        for shares, images in found.items():
+            images.append(mean_of_passes(seed, shares))
+        return found[True][-1], render(scene, integrator, None, 1000 + seed)
+
+    assert_same_mean_of_pixels(pair, 16)
+    shared, own = (np.var(images, axis=0, ddof=1).mean() for images in found.values())
+    assert shared < own
 
 
 def test_images_of_several_parts_have_the_mean_of_equal_numbers(monkeypatch):

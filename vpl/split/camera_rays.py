@@ -12,23 +12,22 @@ from .contributions import LayerSums
 from .emitters.base import EmitterSampler
 from .lattice import Lattice
 from .path_tracer import Traced, trace_paths
-from .pixel_rays import RayNumbers
-from .view import FirstEdge, PathSettings, View
+from .pixel_rays import PixelRays, RayNumbers
+from .view import FirstEdge, PathSettings, Stream, View
 
 
 @dataclass(frozen=True)
 class CameraRays:
     """Some camera rays of a view.
 
-    ``ray``; ``active``; ``importance`` of radiance, for Russian roulette; ``places`` in pixels; ``sizes``: the
-    different numbers of rays of pixels.
+    ``ray``; ``active``; ``importance`` of radiance, for Russian roulette; ``places`` in pixels; ``rays`` of all pixels.
     """
 
     ray: mi.Ray3f
     active: mi.Bool
     importance: mi.Float
     places: RayNumbers
-    sizes: tuple[int, ...]
+    rays: PixelRays
 
     @classmethod
     def of(cls, view: View, lane: mi.UInt32) -> CameraRays:
@@ -38,14 +37,17 @@ class CameraRays:
         # All numbers of rays, and counted and chosen lanes, use the same kernel
         dr.eval(lane, places)
         importance = dr.gather(mi.Float, view.importance, places.pixel)
-        return cls(part, dr.gather(mi.Bool, view.active, lane), importance, places, view.rays.sizes)
+        return cls(part, dr.gather(mi.Bool, view.active, lane), importance, places, view.rays)
 
     def trace(
         self, scene, emitters: EmitterSampler, seed: int, settings: PathSettings, sums: LayerSums | None = None
     ) -> Traced:
         """Trace paths from the camera; ``sums`` by layer."""
         edge = FirstEdge.of_camera(self.ray, self.importance, self.active)
-        lattice = Lattice(self.places, self.sizes, derived_seed(seed, 0))
+        continued = self.rays.continued
+        # Parts of the image are others in other passes, so their seeds are, too
+        own_seed = derived_seed(continued.seed, Stream.IMAGE) if continued else derived_seed(seed, 0)
+        lattice = Lattice(self.places, self.rays.sizes, own_seed, self.rays.earlier)
         sampler = independent_sampler(derived_seed(seed, 1), dr.width(self.places.pixel))
         return trace_paths(scene, emitters, edge, lattice, sampler, settings, sums)
 

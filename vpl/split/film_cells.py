@@ -43,6 +43,11 @@ class FilmCells:
         return tuple(size // self.parts**2 for size in self.rays.sizes)
 
     @property
+    def earlier(self) -> tuple[int, ...] | None:
+        """Number of earlier rays of a cell for each of ``sizes``; None for lattices of their own."""
+        return self.rays.earlier and tuple(number // self.parts**2 for number in self.rays.earlier)
+
+    @property
     def mean(self) -> int:
         """Mean number of rays of a cell."""
         return self.rays.mean // self.parts**2

@@ -4,6 +4,11 @@ Rank-1 lattices with a random shift of the unit square, so every single number i
 Sloan and Joe 1994, "Lattice Methods for Multiple Integration"].  Each dimension, vertex and pixel takes the points in
 an independent random order: with a common order, products of two dimensions would have up to twice the variance of
 independent numbers.  Pixels may have different numbers of samples, see :mod:`vpl.split.pixel_rays`.
+
+Passes of a render may share the lattices of a pixel.  A pass then takes the next points of an extensible lattice: the
+first 2^m points are a lattice for each m [Cools, Kuo and Nuyens 2006, "Constructing embedded lattice rules for
+multivariate integration"], and the samples of all passes are spread like those of one.  Numbers of points that are no
+powers of two are spread less evenly than in a lattice of their own, but better than in several ones.
 """
 
 from __future__ import annotations
@@ -26,6 +31,8 @@ _MIXING = (0x7FEB352D, 0x846CA68B)
 _STEP = 0x9E3779B9
 # For vertices, 2^32 over the golden ratio and the root of 2, made odd: no small multiples of both steps are equal
 _VERTEX_STEP = 0x6FE0483D
+# Multiplier of the extensible lattice [Cools, Kuo and Nuyens 2006]: constructed for 2^10 to 2^20 points
+_EXTENSIBLE = 182667
 # Largest number of orders and of entries (1 MB) in the table, with a minimum of 1 order; two dimensions share an order
 # and a start with a probability of 1 / entries. Number of candidate multipliers of a lattice
 _ORDERS, _ENTRIES, _TRIED = 256, 1 << 18, 64
@@ -71,20 +78,43 @@ def _fraction(bits):
     return mi.Float(bits >> 8) * 2**-24
 
 
-class Lattice:
-    """Numbers for paths; ``places`` of the paths in pixels; ``sizes``: different numbers of paths in a pixel."""
+def _points(sizes: Sequence[int]):
+    """(For each of ``sizes``, points of its lattice in random orders, numbered; steps between the points along both
+    dimensions, units of 2^-32)."""
+    multipliers = [1] * len(sizes), [lattice_multiplier(size) for size in sizes]
+    steps = ([round(g * 2**32 / size) % 2**32 for g, size in zip(row, sizes, strict=True)] for row in multipliers)
+    return [_orders(size) for size in sizes], steps
 
-    def __init__(self, places: RayNumbers, sizes: Sequence[int], seed: int):
+
+def _next_points(sizes: Sequence[int], earlier: Sequence[int]):
+    """As :func:`_points`, for the points of the extensible lattice after the ``earlier`` ones: their places along the
+    first dimension, the bits of their numbers in reverse order [van der Corput 1935]."""
+    tables = [_bits_reversed(_orders(size) + np.uint32(first)) for size, first in zip(sizes, earlier, strict=True)]
+    return tables, ([step] * len(sizes) for step in (1, _EXTENSIBLE))
+
+
+def _bits_reversed(numbers: np.ndarray) -> np.ndarray:
+    """The 32 bits of ``numbers``, uint32, in reverse order."""
+    for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF)):
+        numbers = ((numbers >> shift) & mask) | ((numbers & mask) << shift)
+    return (numbers >> 16) | (numbers << 16)
+
+
+class Lattice:
+    """Numbers for paths; ``places`` of the paths in pixels; ``sizes``: different numbers of paths in a pixel;
+    ``earlier``: for each of them, the number of points that earlier passes took from lattices with the same ``seed``;
+    None for lattices of this pass alone."""
+
+    def __init__(self, places: RayNumbers, sizes: Sequence[int], seed: int, earlier: Sequence[int] | None = None):
         self._number = places.number
         # A good hash of the pixel, once for each path; cheap hashes derive the numbers of each vertex
         self._bits, _ = mi.sample_tea_32(places.pixel, dr.opaque(mi.UInt32, derived_seed(seed, 0)), HASH_ROUNDS)
-        tables = [_orders(size) for size in sizes]
+        tables, steps = _points(sizes) if earlier is None else _next_points(sizes, earlier)
         self._orders = upload(mi.UInt32, np.concatenate(tables))
         begins = np.cumsum([0, *(len(table) for table in tables[:-1])])
         rows = [len(table) // size for table, size in zip(tables, sizes, strict=True)]
-        # Steps between points of the lattice, in units of 2^-32
-        multipliers = [1] * len(sizes), [lattice_multiplier(size) for size in sizes]
-        steps = ([round(g * 2**32 / size) % 2**32 for g, size in zip(row, sizes, strict=True)] for row in multipliers)
+        # In the orders of the pass before, pairs of points of different dimensions would occur again
+        self._turn = dr.opaque(mi.UInt32, derived_seed(max(earlier), 1) if earlier else 0)
         self._samples, self._begin, self._rows, *self._steps = (
             # Two entries at least: Dr.Jit makes a table of one a constant, which would take another kernel
             dr.gather(mi.UInt32, upload(mi.UInt32, np.resize(list(values), max(len(sizes), 2))), places.level)
@@ -105,7 +135,7 @@ class Lattice:
         found = []
         bits = self._bits + vertex * _VERTEX_STEP
         for stream in range(4):
-            point = self._point(_mixed(bits, 3 * stream))
+            point = self._point(_mixed(bits + self._turn, 3 * stream))
             shift = _mixed(bits, 3 * stream + 1)
             numbers = [_fraction(point * self._steps[0] + shift)]
             if stream % 2:

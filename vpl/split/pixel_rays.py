@@ -42,16 +42,26 @@ class RayNumbers:
 
 
 @dataclass(frozen=True)
+class Continued:
+    """Rays of earlier passes whose lattices the rays of a pass continue: ``earlier``, their number in the mean over the
+    pixels, which is in proportion to the numbers of this pass; ``seed`` of the lattices of all these passes."""
+
+    earlier: int
+    seed: int
+
+
+@dataclass(frozen=True)
 class PixelRays:
     """Camera rays of pixels.
 
     ``mean`` number of rays; ``sizes``: the different numbers, ascending; ``level`` (pixels,) uint32: index of the
-    number of rays of each pixel in ``sizes``.
+    number of rays of each pixel in ``sizes``; ``continued``: earlier rays, None for lattices of their own.
     """
 
     mean: int
     sizes: tuple[int, ...]
     level: np.ndarray
+    continued: Continued | None = None
 
     @classmethod
     def uniform(cls, pixels: int, samples: int) -> PixelRays:
@@ -59,8 +69,9 @@ class PixelRays:
         return cls(samples, (samples,), np.zeros(pixels, np.uint32))
 
     @classmethod
-    def by_density(cls, density: np.ndarray, samples: int) -> PixelRays:
-        """Rays about in proportion to a positive ``density`` (pixels,), ``samples`` in the mean.
+    def by_density(cls, density: np.ndarray, samples: int, continued: Continued | None = None) -> PixelRays:
+        """Rays about in proportion to a positive ``density`` (pixels,), ``samples`` in the mean; ``continued``: earlier
+        rays by this density.
 
         Raises ValueError for ``samples`` that are not a positive multiple of :data:`MULTIPLE`.
         """
@@ -70,12 +81,17 @@ class PixelRays:
         # Without the levels that no pixel has: large numbers take long to tabulate
         used, level = np.unique(level, return_inverse=True)
         sizes = tuple(int(size) for size in _LEVELS[used] * samples)
-        return cls(samples, sizes, level.astype(np.uint32))
+        return cls(samples, sizes, level.astype(np.uint32), continued)
 
     @property
     def pixels(self) -> int:
         """Number of pixels."""
         return len(self.level)
+
+    @property
+    def earlier(self) -> tuple[int, ...] | None:
+        """Number of earlier rays for each of ``sizes``; None for lattices of their own."""
+        return self.continued and tuple(size * self.continued.earlier // self.mean for size in self.sizes)
 
     @property
     def count(self) -> int:
@@ -118,7 +134,7 @@ class PixelRays:
 
     def part(self, first: int, last: int) -> PixelRays:
         """The pixels from ``first`` up to, and without, ``last``."""
-        return PixelRays(self.mean, self.sizes, self.level[first:last])
+        return PixelRays(self.mean, self.sizes, self.level[first:last], self.continued)
 
     def parts(self, rays: int) -> list[tuple[int, int]]:
         """Ranges (first, last + 1) of pixels that together have about ``rays`` rays each, at least one pixel."""

@@ -1,5 +1,7 @@
 """Different numbers of camera rays in pixels: the numbers, the places of rays, and what depends on them."""
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -12,7 +14,7 @@ from tests.support.properties import examples
 from vpl.core.arrays import upload
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
 from vpl.split.lattice import Lattice
-from vpl.split.pixel_rays import PixelRays
+from vpl.split.pixel_rays import Continued, PixelRays
 
 RNG = np.random.default_rng(0)
 ONE_BRIGHT, ONE_DARK = np.full(77, 1e-3), np.full(77, 5.0)
@@ -291,3 +293,43 @@ def test_later_vertices_of_pixels_with_any_number_stand_for_all_of_them():
     share = levels[1] / np.where(of_draw > 0, of_draw, 1)[pixel]
     spread = (np.maximum(share, 1e-9) / seeds) ** 0.5
     assert (np.abs(mean - 1)[drawn] * share[drawn] < 5 * spread[drawn]).all()
+
+
+def continued_numbers(mean, passes, seed=7, vertex=3):
+    """Numbers (6, pixels, rays of all passes) of the pixels with the mean number of rays, and with twice as many."""
+    found = {1: [], 2: []}
+    for number in range(passes):
+        density = np.tile([1.0, 2.0, 0.5, 0.5], 512)
+        rays = PixelRays.by_density(density, mean, Continued(number * mean, seed))
+        places, own = rays.places(dr.arange(mi.UInt32, rays.count)), rays.numbers / mean
+        numbers = Lattice(places, rays.sizes, seed, rays.earlier).at(mi.UInt32(vertex))
+        numbers = np.concatenate([np.array(x).reshape(-1, rays.count) for x in numbers])
+        for times, taken in found.items():
+            pixels = np.flatnonzero(own == times)
+            index = rays.first[pixels][:, None] + np.arange(times * mean)
+            taken.append(numbers[:, index])
+    return {times: np.concatenate(taken, axis=2) for times, taken in found.items()}
+
+
+@pytest.mark.parametrize("passes", [1, 2, 4])
+def test_passes_share_a_lattice(passes):
+    """The numbers of all passes are one in each stratum, as those of a pass with as many rays."""
+    for numbers in continued_numbers(4, passes).values():
+        count = numbers.shape[2]
+        gaps = np.diff(np.sort(numbers, axis=2), axis=2, append=1 + numbers.min(2, keepdims=True))
+        assert np.allclose(gaps * count, 1, atol=1e-3)
+        for ray in (0, -1):
+            assert all(stats.kstest(dimension[:, ray], "uniform").pvalue > 1e-4 for dimension in numbers)
+
+
+def test_passes_pair_the_numbers_of_different_dimensions_anew():
+    """Otherwise a pass would repeat the paths of the pass before, moved a little."""
+    numbers = continued_numbers(16, 4)[1]
+    signs = np.where(numbers < 0.5, 1, -1)
+    for one, other in itertools.combinations(signs[[0, 1, 3, 4]], 2):
+        assert (one * other).mean(1).var() * numbers.shape[2] < 1.3
+
+
+def test_lattices_of_passes_with_other_seeds_are_independent():
+    one, other = (continued_numbers(16, 1, seed)[1].reshape(6, -1) for seed in (1, 2))
+    assert np.abs(np.corrcoef(one, other)[:6, 6:]).max() < 0.05
