@@ -121,9 +121,10 @@ class ManyLightsIntegrator(PassRenderer):
       quarter to four times the mean number of samples.  Two halves of the second pass are denoised apart, and show
       where noise remains.  Passes depend on earlier passes only and have a common weight for all pixels, so the mean of
       the image is unchanged.  These passes share lattices, so that their samples are spread as those of one pass.
-      Renders of less than some 60 samples have equal numbers, and no such second pass.  The sensor needs the samples of this plugin, and a film in the resolution of the image
-      a box filter.  Images that end by ``error``, passes of a given size, images by several workers and images above
-      half a million pixels (a million in their own resolution) have equal numbers.
+      Renders of less than some 60 samples have no such second pass and equal numbers.  The sensor needs the samples of
+      this plugin, and a film in the resolution of the image a box filter.  Images that end by ``error``, passes of a
+      given size, images by several workers and images above half a million pixels (a million in their own resolution)
+      have equal numbers.
     - Masks: the image is that of ``prb``.  ``path`` (Mitsuba 3.9.1) shows black for samples whose path ends after it
       passed only masks, so it is too dark where nothing is behind a mask.  With ``hide_emitters``, ``path`` hides an
       environment behind a mask, which ``manylights`` shows.  Alpha is that of ``path``.
