@@ -104,7 +104,7 @@ class PassSizes:
         return self._asked or "time"
 
     def _expected_samples(self, done, elapsed):
-        """Return the expected samples per pixel of the render, without virtual lights, after `done` samples."""
+        """Return the expected samples per pixel of the render, of which `done` are rendered."""
         left = [self._spp - done] if self._spp is not None else []
         if self._time is not None and self._line():
             left.append(self._filling(self._time - elapsed))

@@ -239,6 +239,24 @@ def test_a_pass_that_determines_numbers_has_a_quarter_of_the_samples_that_are_le
     assert passes[1].spp == (expected if expected >= LEAST_SAMPLES else spp - 4)
 
 
+@pytest.mark.parametrize("limits", [{"spp": 59}, {"time": 2.4}])
+def test_short_renders_have_no_pass_that_determines_numbers(limits):
+    """Of fewer than 60 samples, of which a sample takes 0.04 seconds."""
+    found = [
+        made_up_passes(256 * 128, 0.05, 0.04, 0.0, in_parts=True, probes=probes, **limits)[0]
+        for probes in (True, False)
+    ]
+    sizes, expected = ([one.spp for one in passes] for passes in found)
+    assert sizes == expected and 50 < sum(sizes) < 60
+
+
+@pytest.mark.parametrize("limits", [{"spp": 60}, {"time": 3.2}])
+def test_renders_of_sixty_samples_have_a_pass_that_determines_numbers(limits):
+    passes, _ = made_up_passes(256 * 128, 0.05, 0.04, 0.0, in_parts=True, probes=True, **limits)
+    rest = sum(one.spp for one in passes[1:])
+    assert LEAST_SAMPLES <= passes[1].spp <= PROBE * rest
+
+
 def test_a_slow_first_pass_does_not_end_a_render():
     passes, ended_by = made_up_passes(256 * 128, 0.05, 0.04, 6.0, 0.3, time=60.0, in_parts=True, probes=True)
     assert ended_by == "time" and passes[0].seconds > 6

@@ -45,9 +45,9 @@ class CameraRays:
         """Trace paths from the camera; ``sums`` by layer."""
         edge = FirstEdge.of_camera(self.ray, self.importance, self.active)
         continued = self.rays.continued
-        # Parts of the image are others in other passes, so their seeds are, too
-        own_seed = derived_seed(continued.seed, Stream.IMAGE) if continued else derived_seed(seed, 0)
-        lattice = Lattice(self.places, self.rays.sizes, own_seed, self.rays.earlier)
+        # The seed of a part of the image depends on the part, and passes have other parts
+        of_lattice = derived_seed(continued.seed, Stream.IMAGE) if continued else derived_seed(seed, 0)
+        lattice = Lattice(self.places, self.rays.sizes, of_lattice, self.rays.earlier)
         sampler = independent_sampler(derived_seed(seed, 1), dr.width(self.places.pixel))
         return trace_paths(scene, emitters, edge, lattice, sampler, settings, sums)
 
