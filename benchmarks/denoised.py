@@ -94,8 +94,11 @@ class Several(Rival):
 
 @dataclass
 class Way:
-    """``path`` with one sampler, denoised in one resolution: ``images``, a :class:`Several` that ``denoiser`` denoises
-    in ``fixed`` seconds.  :meth:`judge` sets their ``error`` and ``fall``, by which it falls where samples double."""
+    """``path`` with one sampler, denoised in one resolution.
+
+    ``images``: of ``path``; ``denoiser`` of the images, which takes ``fixed`` seconds.  Set by :meth:`judge`: ``error``
+    of the denoised images; ``fall``: factor by which the error falls where samples double.
+    """
 
     images: Several
     denoiser: Denoiser
@@ -153,7 +156,7 @@ def compare_one(name: str, width: int, seconds: float, passes: int) -> dict:
     """Print the denoised errors of a scene, and the relative times of ``path`` for equal error; returns the row."""
     scene = load(name, width)
     denoisers = {parts: _warm_denoiser(scene, seconds, parts) for parts in (1, PARTS)}
-    # Before they denoise other images, which adds to their seconds
+    # Each later image adds to the seconds of its denoiser
     fixed = {parts: denoiser.seconds for parts, denoiser in denoisers.items()}
     ways = [
         Way(Several(name, scene, sampler, width, seconds - fixed[parts], parts), denoisers[parts], fixed[parts])
