@@ -69,8 +69,8 @@ class Truth:
 class Several(Rival):
     """Images of ``path`` of about ``seconds``: means of as few passes as memory allows.
 
-    ``shorter``: an image of fewer samples for each of them, the first of its passes or a pass of about a quarter of the
-    samples; ``doublings``: of the samples of a shorter image up to those of an image.
+    ``shorter``: an image of fewer samples for each of them, the first of its passes or a pass of a ninth to a quarter
+    of the samples; ``doublings``: of the samples of a shorter image up to those of an image.
     """
 
     def __init__(self, name: str, scene, sampler: str, width: int, seconds: float, parts: int):

@@ -5,8 +5,8 @@ pay only from a certain size, and samples are stratified within a pass. Such a p
 the time of its start, and the last pass up to twice that. With a time limit of ten seconds a render has a small pass,
 one of about half of the time, and one that fills the rest.
 
-In images that will be denoised, the second pass may determine the samples of the pixels in later passes. It is then
-small, because its own pixels have equal numbers.
+In images that will be denoised, the second pass may determine the samples of the pixels in later passes, if some 60
+samples or more are expected in all. It is then small, because its own pixels have equal numbers.
 
 The first pass is small, as its cost is unknown. Sizes of passes that are not in parts, or end by error, are powers of
 two, from 4 if the number of pixels allows: Mitsuba compiles a single kernel for these sizes, but other kernels for
@@ -104,7 +104,8 @@ class PassSizes:
         return self._asked or "time"
 
     def _expected_samples(self, done, elapsed):
-        """Return the expected samples per pixel of the render, of which `done` are rendered."""
+        """Return the expected samples per pixel of the render, of which `done` are rendered: a low estimate where time
+        ends it and later passes may have virtual lights."""
         left = [self._spp - done] if self._spp is not None else []
         if self._time is not None and self._line():
             left.append(self._filling(self._time - elapsed))
