@@ -122,10 +122,8 @@ class PassSizes:
 
     def _of_the_rest(self, size, left):
         """Return the size of the next pass, about `size` samples, with `left` samples until the limit."""
-        if self.is_probe and PROBE * left >= self._least_probe:
+        if self.is_probe:
             return min(size, self._kept(int(PROBE * left)))
-        # No pass would follow
-        self.is_probe = False
         if self._any_size and left < 2 * size and left <= self._largest:
             return self._kept(left) if self._probes else left
         return min(size, left if self._fixed or left < USUAL else _power_of_two(left))

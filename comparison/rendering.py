@@ -115,8 +115,8 @@ class Progressive(Passes):
         half = is_probe and self.density.suits_probe(self.integrator, sensor, spp)
         continued = None if density is None else self._continued(sensor)
         image = render_pass(
-            self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density, half, self.parts,
-            continued,
+            self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density=density, half=half,
+            parts=self.parts, continued=continued,
         )  # fmt: skip
         if not accept():
             return None

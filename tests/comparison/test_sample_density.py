@@ -78,10 +78,9 @@ def passes_of(monkeypatch, scene, integrator, **limits):
     """(Whether a pass had numbers of its own, whether it made halves) of each pass of a render."""
     seen, before = [], rendering.render_pass
 
-    def spied(*arguments):
-        *_, density, half, _, _ = arguments
+    def spied(*arguments, density, half, **more):
         seen.append((density is not None, half))
-        return before(*arguments)
+        return before(*arguments, density=density, half=half, **more)
 
     monkeypatch.setattr(rendering, "render_pass", spied)
     manylights.render(scene, integrator, **limits)
@@ -178,9 +177,9 @@ def test_passes_with_numbers_of_their_own_share_lattices(tmp_path, monkeypatch, 
     scene, limits = cornell().load(), {"spp": 135, "denoise": True}
     seen, before = [], rendering.render_pass
 
-    def spied(*arguments):
-        seen.append((arguments[3], arguments[-1]))
-        return before(*arguments)
+    def spied(*arguments, continued, **more):
+        seen.append((arguments[3], continued))
+        return before(*arguments, continued=continued, **more)
 
     monkeypatch.setattr(rendering, "render_pass", spied)
     monkeypatch.setattr(single_pass, "MAXIMUM_PASS_SAMPLES", 16 * 16 * 32 // single_pass.MORE_IN_PARTS)

@@ -121,18 +121,23 @@ def test_the_mean_of_every_pixel_is_that_of_equal_numbers(lights, parts):
     assert_same_mean_of_pixels(pair)
 
 
+@pytest.mark.parametrize("rays_of_part", [None, SPP * WIDTH], ids=["one part", "several parts"])
 @pytest.mark.parametrize("parts", [1, 2])
 @with_and_without_lights
-def test_passes_that_share_lattices_have_the_mean_of_equal_numbers(lights, parts):
-    """And in their mean less noise than passes with lattices of their own."""
+def test_passes_that_share_lattices_have_the_mean_of_equal_numbers(monkeypatch, lights, parts, rays_of_part):
+    """And in their mean less noise than passes with lattices of their own, wherever the image is divided."""
     scene, integrator = room(), plugin(lights)
+    if rays_of_part:
+        monkeypatch.setattr("vpl.split.estimator._WAVEFRONT", (rays_of_part, rays_of_part))
 
     def mean_of_passes(seed, shares):
-        passes = [Continued(number * SPP, seed) if shares else None for number in range(4)]
-        return np.mean(
-            [render(scene, integrator, DENSITY, 10 * seed + i, parts=parts, continued=x) for i, x in enumerate(passes)],
-            axis=0,
-        )
+        sizes, images, done = (SPP, SPP, 2 * SPP), [], 0
+        for number, size in enumerate(sizes):
+            continued = Continued(done, seed) if shares else None
+            image = render(scene, integrator, DENSITY, 10 * seed + number, size, parts=parts, continued=continued)
+            images.append(size * image)
+            done += size
+        return sum(images) / done
 
     found = {shares: [] for shares in (True, False)}
 

@@ -12,22 +12,23 @@ from .contributions import LayerSums
 from .emitters.base import EmitterSampler
 from .lattice import Lattice
 from .path_tracer import Traced, trace_paths
-from .pixel_rays import PixelRays, RayNumbers
-from .view import FirstEdge, PathSettings, Stream, View
+from .pixel_rays import RayNumbers
+from .view import FirstEdge, PathSettings, View
 
 
 @dataclass(frozen=True)
 class CameraRays:
     """Some camera rays of a view.
 
-    ``ray``; ``active``; ``importance`` of radiance, for Russian roulette; ``places`` in pixels; ``rays`` of all pixels.
+    ``ray``; ``active``; ``importance`` of radiance, for Russian roulette; ``places`` in pixels; ``sizes``: the
+    different numbers of rays of pixels.
     """
 
     ray: mi.Ray3f
     active: mi.Bool
     importance: mi.Float
     places: RayNumbers
-    rays: PixelRays
+    sizes: tuple[int, ...]
 
     @classmethod
     def of(cls, view: View, lane: mi.UInt32) -> CameraRays:
@@ -37,24 +38,29 @@ class CameraRays:
         # All numbers of rays, and counted and chosen lanes, use the same kernel
         dr.eval(lane, places)
         importance = dr.gather(mi.Float, view.importance, places.pixel)
-        return cls(part, dr.gather(mi.Bool, view.active, lane), importance, places, view.rays)
+        return cls(part, dr.gather(mi.Bool, view.active, lane), importance, places, view.rays.sizes)
 
     def trace(
-        self, scene, emitters: EmitterSampler, seed: int, settings: PathSettings, sums: LayerSums | None = None
-    ) -> Traced:
-        """Trace paths from the camera; ``sums`` by layer."""
+        self, scene, emitters: EmitterSampler, seed: int, settings: PathSettings, sums: LayerSums | None = None,
+        lattice: Lattice | None = None,
+    ) -> Traced:  # fmt: skip
+        """Trace paths from the camera; ``sums`` by layer; ``lattice``: None for one of these rays alone."""
         edge = FirstEdge.of_camera(self.ray, self.importance, self.active)
-        continued = self.rays.continued
-        # The seed of a part of the image depends on the part, and passes have other parts
-        of_lattice = derived_seed(continued.seed, Stream.IMAGE) if continued else derived_seed(seed, 0)
-        lattice = Lattice(self.places, self.rays.sizes, of_lattice, self.rays.earlier)
+        if lattice is None:
+            lattice = Lattice(self.places, self.sizes, derived_seed(seed, 0))
         sampler = independent_sampler(derived_seed(seed, 1), dr.width(self.places.pixel))
         return trace_paths(scene, emitters, edge, lattice, sampler, settings, sums)
 
 
 def trace_camera_rays(
-    view: View, lane: mi.UInt32, settings: PathSettings, *stream: int, sums: LayerSums | None = None
-) -> Traced:
-    """Trace the camera rays ``lane`` of a view; ``stream``: of random numbers; ``sums`` by layer."""
-    seed = derived_seed(view.seed, *stream)
-    return CameraRays.of(view, lane).trace(view.scene, view.emitters, seed, settings, sums)
+    view: View, lane: mi.UInt32, settings: PathSettings, *stream: int, sums: LayerSums | None = None,
+    goes_on: bool = False,
+) -> Traced:  # fmt: skip
+    """Trace the camera rays ``lane`` of a view; ``stream``: of random numbers; ``sums`` by layer; ``goes_on``: whether
+    the paths continue the lattices of earlier passes, if the rays of the view do."""
+    rays, seed, lattice = CameraRays.of(view, lane), derived_seed(view.seed, *stream), None
+    if goes_on and view.rays.continued:
+        # By the first number of the stream alone: the others are those of parts of the image, which differ in each pass
+        shared = derived_seed(view.rays.continued.seed, stream[0])
+        lattice = Lattice(rays.places, rays.sizes, shared, view.rays.earlier)
+    return rays.trace(view.scene, view.emitters, seed, settings, sums, lattice)

@@ -193,7 +193,7 @@ def _traced_part(
 ) -> tuple[Traced, LitVertices | None]:  # fmt: skip
     """(Traced part of the camera rays ``lane`` of a part of the image; gather vertices that are lit)."""
     clock.begin(Stage.TRACED)
-    traced = trace_camera_rays(view, lane, settings, Stream.IMAGE, part.first, sums=sums)
+    traced = trace_camera_rays(view, lane, settings, Stream.IMAGE, part.first, sums=sums, goes_on=True)
     if not lights.all:
         return traced, None
     clock.begin(Stage.CLUSTERS)

@@ -89,7 +89,10 @@ def _points(sizes: Sequence[int]):
 def _next_points(sizes: Sequence[int], earlier: Sequence[int]):
     """As :func:`_points`, for the points of the extensible lattice after the ``earlier`` ones: their places along the
     first dimension, the bits of their numbers in reverse order [van der Corput 1935]."""
-    tables = [_bits_reversed(_orders(size) + np.uint32(first)) for size, first in zip(sizes, earlier, strict=True)]
+    tables = [
+        _bits_reversed(np.arange(first, first + size, dtype=np.uint32))[_orders(size)]
+        for size, first in zip(sizes, earlier, strict=True)
+    ]
     return tables, ([step] * len(sizes) for step in (1, _EXTENSIBLE))
 
 
