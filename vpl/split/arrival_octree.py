@@ -59,7 +59,9 @@ class ArrivalOctree:
     def __init__(self, position, normal, weight, scene_low, scene_size: float, generator):
         position = np.asarray(position, np.float64)
         low, extent = position.min(0), np.ptp(position, axis=0)
-        self.size = max(float(extent.max()), 1e-6 * scene_size) * generator.uniform(1.1, 2.0)
+        # Boxes of coinciding arrivals far from the origin need a margin that double precision resolves
+        resolved = float(np.spacing(np.abs(position).max())) * 2**LEVELS / _MARGIN
+        self.size = max(float(extent.max()), 1e-6 * scene_size, resolved) * generator.uniform(1.1, 2.0)
         self.low = low - generator.random(3) * (self.size - extent)
         self.scene_low, self.scene_size = np.asarray(scene_low, np.float64), float(scene_size)
         leaf = _leaves(self._finest(position))
