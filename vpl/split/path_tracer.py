@@ -28,6 +28,7 @@ import mitsuba as mi
 from ..core.arrays import LARGEST_VALUE, channel_mean, select_record
 from ..core.loops import recorded_once
 from ..direct.emitter_sampling import power_heuristic
+from ..points.camera_paths import SceneTraits
 from ..transport.carried_share import carried_share
 from ..transport.minorant import agrees, is_diffuse, minorant_of, side_of
 from .contributions import Contributions, LayerSums
@@ -164,18 +165,22 @@ def trace_paths(
         # ---------------------- Next-event estimation ----------------------
         chosen, place, lobe, turn = lattice.at(path.depth)
         path.scattered += dr.select(hit.smooth, 1, 0)
-        path.cell, member = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side), sampler.next_1d()
-        sample = emitters.sample(hit.si, path.cell, chosen, member, place, hit.smooth)
+        cell, member = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side), sampler.next_1d()
+        sample = emitters.sample(hit.si, cell, chosen, member, place, hit.smooth)
         # A single call: each call adds the code of every material to the kernel. A path that ends needs the sample only
         # to tell whether the surface counts in alpha
         toward, scatters = hit.si.to_local(sample.direction), path.active & ~hit.hidden & (hit.goes_on | ~path.valid)
         value, density, turned, bsdf_weight = hit.bsdf.eval_pdf_sample(context, hit.si, toward, lobe, turn, scatters)
-        lit = _lit(path, hit, sample, toward.z, value, density, weight, settings, sampler)
-        arriving = sample.arriving(scene, dr.max(dr.abs(lit)) > 0)
-        found.add(lit * arriving, path.depth + 2, sample.group, sampler.next_1d(), lane)
+        lit, beyond = _lit(path, hit, sample, toward.z, value, density, weight, settings, sampler)
+        edges = path.depth + 2
+        arriving, crossings = sample.arriving(
+            scene, emitters.traits, settings.max_depth - edges, dr.max(dr.abs(beyond)) > 0
+        )
+        lit = dr.select(crossings > 0, beyond, lit)
+        found.add(lit * arriving, edges + crossings, sample.group, sampler.next_1d(), lane)
 
         # ---------------------- BSDF sampling ----------------------
-        survival = _turn(path, hit, turned, bsdf_weight, gathers, weight)
+        survival = _turn(path, hit, turned, bsdf_weight, gathers, weight, cell, emitters.traits)
 
         # ---------------------- Russian roulette: residual of the direction, and throughput ----------------------
         _end_at_direction(path, hit, survival, settings, sampler.next_1d())
@@ -250,46 +255,58 @@ def _gather(path: Path, hit: Hit, settings: PathSettings, gathered: Gathered, sa
 
 
 def _lit(path: Path, hit: Hit, sample: EmitterSample, height, value, density, weight, settings: PathSettings, sampler):
-    """Factor of the sampled emitters' light: β f, minus the parts carried by virtual lights.
+    """Factors of the sampled emitters' light: β f, minus the parts carried by virtual lights; and the same for light
+    that passes null surfaces, which virtual lights that represent emitters do not carry.
 
     ``height``: cosine of the direction; ``value``, ``density``: of the BSDF; ``weight`` of the gather vertex.
     """
     full = path.throughput * mi.unpolarized_spectrum(value)
     cosine = dr.select(height * hit.side > 0, dr.abs(height), 0)
-    value = full - path.carried * cosine
+    value = beyond = full - path.carried * cosine
     if sample.nearness is not None:
         w = emitter_share(settings.emitters_squared_c, sample.nearness, cosine)
-        value -= dr.select(settings.emitters_carried, weight * (w * cosine), 0)
+        value = value - dr.select(settings.emitters_carried, weight * (w * cosine), 0)
         # Few shadow rays where the residual is small
         survival = residual_survival(value, full, settings.emitters_carried)
-        value = dr.select(sampler.next_1d() < survival, value / survival, 0)
+        survives = sampler.next_1d() < survival
+        value, beyond = (dr.select(survives, one / survival, 0) for one in (value, beyond))
     mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, density))
-    return dr.select(hit.smooth & (sample.density > 0), value * mis, 0)
+    mis = dr.select(hit.smooth & (sample.density > 0), mis, 0)
+    return value * mis, beyond * mis
 
 
-def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight):
+def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight, cell, traits: SceneTraits):
     """Continue along a BSDF sample ``bs`` with its weight; returns the survival probability by the residual.
 
-    ``gathers``, ``weight``: mask and weights of gather vertices, carried on by the path.
+    ``gathers``, ``weight``: mask and weights of gather vertices, carried on by the path; ``cell`` of the vertex.
+
+    A path that passes a null surface keeps the vertex and the density of its direction: next-event estimation passes
+    null surfaces as well.
     """
     full = path.throughput * mi.unpolarized_spectrum(bsdf_weight)
-    path.delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     # Like `path`, by the sampled direction, even if the path ends
     null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     path.valid |= path.active & hit.si.is_valid() & ~hit.hidden & ~null
-    path.cosine, path.density, path.eta = dr.abs(bs.wo.z), bs.pdf, path.eta * bs.eta
+    path.cosine, path.eta = dr.abs(bs.wo.z), path.eta * bs.eta
     # A Lambertian BSDF of value 1, times the cosine, over the density of the direction
-    lambertian = ~path.delta & (bs.wo.z * hit.side > 0) & (path.density > 0)
-    lambertian = dr.select(lambertian, path.cosine / path.density, 0)
+    lambertian = ~delta & (bs.wo.z * hit.side > 0) & (bs.pdf > 0)
+    lambertian = dr.select(lambertian, path.cosine / bs.pdf, 0)
     path.throughput = full - path.carried * lambertian
     # At diffuse surfaces the residual is the same in all directions, and has ended paths before
     judged = (dr.max(dr.abs(path.carried)) > 0) & ~hit.is_diffuse
     survival = residual_survival(path.throughput, full, judged)
     path.carried = weight * lambertian
-    onward = dr.select(gathers & ~path.delta, mi.UInt32(State.CONNECTING), mi.UInt32(State.PAST))
+    onward = dr.select(gathers & ~delta, mi.UInt32(State.CONNECTING), mi.UInt32(State.PAST))
     path.state = dr.select((path.state == State.SEEKING) & ~gathers, mi.UInt32(State.SEEKING), onward)
     path.ray = hit.si.spawn_ray(dr.select(hit.hidden, path.ray.d, hit.si.to_world(bs.wo)))
-    path.vertex = mi.Point3f(hit.si.p)
+    turns = mi.Bool(True)
+    if traits.null:
+        # Some materials do not tell what they transmit, and block shadow rays
+        told = mi.unpolarized_spectrum(hit.bsdf.eval_null_transmission(hit.si, null & path.active))
+        turns = ~(null & (dr.max(told) > 0))
+    path.vertex, path.cell = dr.select(turns, hit.si.p, path.vertex), dr.select(turns, cell, path.cell)
+    path.density, path.delta = dr.select(turns, bs.pdf, path.density), dr.select(turns, delta, path.delta)
     path.depth += dr.select(hit.goes_on, 1, 0)
     return survival
 

@@ -146,7 +146,11 @@ def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: i
     dr.eval(cell, ray, density, draw)
     # Many pixels see a light: with few of many emitters, its irradiance would vary visibly
     samples = _EMITTER_SAMPLES if emitters.lights is not None else 1
-    nearest, _, near_group = irradiance_from_emitters(scene, emitters, places, cell, samples, derived_seed(seed, 2))
+    # A path to an emitter has an edge and one more for each null surface
+    most = settings.max_depth - 1
+    dr.make_opaque(most)
+    near = irradiance_from_emitters(scene, emitters, places, cell, samples, most, derived_seed(seed, 2))
+    nearest = near.irradiance
     # The throughput starts with pi, the weight of a direction, which lets paths go on longer: with 1, lights would cost
     # 7% less and have 12% more variance (kitchen)
     edge = FirstEdge.of(places.position, ray, ones(count) * dr.pi, density, False, State.PAST, cell, 1.0, True)
@@ -158,8 +162,8 @@ def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: i
     is_nearest = draw * (level + more) < level
     one = dr.select(is_nearest, nearest, found.drawn)
     irradiance = dr.select(level + more > 0, one * (level + more) / dr.sum(dr.abs(one)), 0)
-    group = dr.select(is_nearest, near_group, found.group) + dr.opaque(mi.UInt32, 0, count)
-    return irradiance, dr.select(is_nearest, mi.UInt32(1), found.length), group
+    group = dr.select(is_nearest, near.group, found.group) + dr.opaque(mi.UInt32, 0, count)
+    return irradiance, dr.select(is_nearest, near.length, found.length), group
 
 
 class KeptLights:

@@ -5,6 +5,8 @@ oriented and environment lights, and each null surface counts as an edge of the 
 surfaces block point lights, spots and directional emitters, because ``path`` counts no path through null surfaces, and
 surface lights, because ``manylights`` traces the passing light.
 
+Shadow rays of ``manylights`` to emitters pass null surfaces in the same way (:mod:`vpl.split.emitters.base`).
+
 The modules of :mod:`vpl.direct` sample the remaining emitters and trace separate shadow rays.  Every surface blocks the
 separate shadow rays, and BSDF samples find the light through masks and glass, as in ``path``.
 """
@@ -51,23 +53,39 @@ def transmittance(scene, traits, kind: str, ray, most, active):
 
     ``most``: surfaces that it may pass, UInt32.  Lanes that are not ``active`` give 0.
     """
+    if not traits.null or kind in ("point", "spot", "surface", "directional"):
+        return unblocked(scene, traits, ray, active)
+    return passage(scene, traits, ray, most, active)[0]
+
+
+def unblocked(scene, traits, ray, active):
+    """1 where no surface blocks the ray, 0 elsewhere and in lanes that are not ``active``."""
     if traits.nearest_hits:
         blocked = scene.ray_intersect_preliminary(ray, active=active).is_valid()
     else:
         blocked = scene.ray_test(ray, active)
-    passed = mi.Float(1) & active & ~blocked
-    if not traits.null or kind in ("point", "spot", "surface", "directional"):
-        return passed
-    through = active & (passed == 0) & (most > 0)
+    return mi.Float(1) & active & ~blocked
+
+
+def passage(scene, traits, ray, most, active, open_to=True):
+    """Fraction of light reaching the ray's origin, and the number of null surfaces on the way, UInt32.
+
+    ``most``: surfaces that it may pass, UInt32; ``open_to``: lanes whose light may pass null surfaces.  Lanes that are
+    not ``active`` give 0.
+    """
+    passed = unblocked(scene, traits, ray, active)
+    through = active & (passed == 0) & (most > 0) & open_to
     if traits.open_scene is not None:
         # Few blocked rays meet an open surface at all, and a scene of only open surfaces is tested quickly
         through &= traits.open_scene.ray_test(ray, through)
-    return passed + _through_null_surfaces(scene, traits, ray, most, through)
+    share, crossings = _through_null_surfaces(scene, traits, ray, most, through)
+    return passed + share, crossings
 
 
 @dr.syntax
 def _through_null_surfaces(scene, traits, ray, most, active):
-    """Walk from surface to surface while surfaces let light pass unscattered, past ``most`` surfaces."""
+    """Walk from surface to surface while surfaces let light pass unscattered, past ``most`` surfaces: (fraction of the
+    light, number of surfaces passed)."""
     ray, left = mi.Ray3f(ray), mi.UInt32(most)
     active = mi.Bool(active)
     passed = dr.select(active, mi.UnpolarizedSpectrum(1), 0)
@@ -80,8 +98,8 @@ def _through_null_surfaces(scene, traits, ray, most, active):
         share = finite_or_zero(mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, crossed)))
         passed = dr.select(crossed, passed * share, passed)
         active = crossed & dr.any(passed > 0)
-        left -= 1
+        left -= dr.select(crossed, mi.UInt32(1), 0)
         onward = si.spawn_ray(ray.d)
         onward.maxt = ray.maxt - si.t
         ray = dr.select(active, onward, ray)
-    return passed
+    return passed, most - left

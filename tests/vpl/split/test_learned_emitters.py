@@ -15,6 +15,7 @@ from vpl.core.arrays import download, upload, upload_vectors
 from vpl.lights.light_set import LightSet
 from vpl.split.camera_rays import trace_camera_rays
 from vpl.split.emitters import cell_choice
+from vpl.split.emitters.base import Irradiance
 from vpl.split.emitters.cell_choice import CellChoice
 from vpl.split.emitters.learned import LearnedEmitters
 from vpl.split.gather_vertices import LitVertices
@@ -75,7 +76,7 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(emitter, learns):
     cell = emitters.cell(si.p, si.n)
     assert np.any(np.array(cell) == 0) and np.any(np.array(cell) > 0) == learns
     sample = emitters.sample(si, cell, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
-    weight = sample.arriving(scene, mi.Bool(True))
+    weight = sample.arriving(scene, emitters.traits, mi.UInt32(0), mi.Bool(True))[0]
     ray = si.spawn_ray(sample.direction)
     found = scene.ray_intersect(ray)
     met = emitters.met(si.p, cell, ray, found, mi.Bool(True), mi.Bool(True))
@@ -151,6 +152,13 @@ def test_neighbours_are_the_cells_that_face_the_same_way_in_the_cubes_around():
         assert set(found[cell]) - {0} == set(np.flatnonzero(near) + 1)
 
 
+def found_where(seen):
+    """Irradiance of 1 where a light is ``seen``, (n,), and of 1 everywhere without occlusion."""
+    count = len(seen)
+    arriving = upload_vectors(mi.Color3f, np.repeat(seen[:, None], 3, 1))
+    return Irradiance(arriving, upload(mi.Float, np.ones(count)), mi.UInt32(1), mi.UInt32(0))
+
+
 def test_what_neighbours_have_seen_is_drawn_more_often_than_what_nobody_has():
     rng = np.random.default_rng(1)
     position = rng.random((20_000, 3)).astype(np.float32)
@@ -160,7 +168,7 @@ def test_what_neighbours_have_seen_is_drawn_more_often_than_what_nobody_has():
         """The first source is seen everywhere, the second from one side, the third from nowhere."""
         x, number = download(places.position.x), download(source)
         seen = (number == 0) | ((number == 1) & (x < 0.45))
-        return upload_vectors(mi.Color3f, np.repeat(seen[:, None], 3, 1)), upload(mi.Float, np.ones(len(x))), None
+        return found_where(seen)
 
     assert choice.learn(position, np.tile(np.float32([[0, 0, 1]]), (len(position), 1)), 6000, 0, look)
     low, size = np.array(choice._cells.low)[0].item(), np.array(choice._cells.size).item()
@@ -180,7 +188,7 @@ def test_rays_that_are_traced_a_few_at_a_time_teach_the_same(monkeypatch):
     def look(places, source, seed):
         seeds.append(seed)
         seen = download(source) == 0
-        return upload_vectors(mi.Color3f, np.repeat(seen[:, None], 3, 1)), upload(mi.Float, np.ones(len(seen))), None
+        return found_where(seen)
 
     for most in (1 << 20, 100):
         monkeypatch.setattr(cell_choice, "_RAYS_AT_A_TIME", most)

@@ -14,6 +14,8 @@ from ...core.loops import recorded_once
 from ...core.sampling import independent_sampler
 from ...direct.emitter_sampling import power_heuristic
 from ...lights.emitter_groups import EmitterGroups
+from ...points.camera_paths import SceneTraits, scene_traits
+from ...transport.contribution import passage, unblocked
 from ..contributions import Contributions
 from ..emitter_lights import EmitterLights
 
@@ -42,10 +44,18 @@ class EmitterSample:
         weight = finite_or_zero(self.weight / probability)
         return replace(self, weight=weight, density=self.density * probability)
 
-    def arriving(self, scene, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """The weight where the emitter is visible, 0 elsewhere: traces a shadow ray for nonzero weights."""
+    def arriving(self, scene, traits: SceneTraits, most, active: mi.Bool):
+        """The weight times the fraction of the light that arrives, and the number of null surfaces on its way: traces a
+        shadow ray for nonzero weights.
+
+        ``most``: null surfaces that the light may pass, UInt32.  Null surfaces block points and directions, as in
+        ``path``.
+        """
         possible = active & (dr.max(self.weight) > 0) & (self.density > 0)
-        return dr.select(possible & ~scene.ray_test(self.ray, possible), self.weight, 0)
+        if not traits.null:
+            return dr.select(unblocked(scene, traits, self.ray, possible) > 0, self.weight, 0), mi.UInt32(0)
+        passed, crossings = passage(scene, traits, self.ray, most, possible, ~self.is_point)
+        return dr.select(possible, self.weight * passed, 0), crossings
 
 
 @dataclass
@@ -62,11 +72,13 @@ class MetEmitter:
 class EmitterSampler(Protocol):
     """Choice of emitters for next-event estimation.
 
-    ``lights``: virtual lights representing the emitters, or None; ``groups`` of the emitters, or None.
+    ``lights``: virtual lights representing the emitters, or None; ``groups`` of the emitters, or None; ``traits`` of
+    the scene.
     """
 
     lights: EmitterLights | None
     groups: EmitterGroups | None
+    traits: SceneTraits
 
     def cell(self, position: mi.Point3f, facing: mi.Normal3f) -> mi.UInt32:
         """Number of the spatial cell of each vertex; ``facing``: shading normal on the visible side."""
@@ -103,7 +115,7 @@ class UniformEmitters:
     lights = None
 
     def __init__(self, scene, groups: EmitterGroups | None = None):
-        self._scene, self.groups = scene, groups
+        self._scene, self.groups, self.traits = scene, groups, scene_traits(scene)
         emitters = scene.emitters()
         self._group = dr.opaque(mi.UInt32, groups.number(emitters[0]) if groups and emitters else 0)
 
@@ -163,30 +175,47 @@ class Places:
         return si
 
 
+@dataclass
+class Irradiance:
+    """Irradiance straight from emitters, one per lane, evaluated.
+
+    ``irradiance``: an unpolarized spectrum, weighted for multiple importance sampling with cosine-distributed
+    directions; ``unoccluded``: mean over channels, without the weight; ``length``: edges of the paths to the emitter,
+    one for each null surface and one more; ``group`` of the emitter.
+    """
+
+    irradiance: mi.UnpolarizedSpectrum
+    unoccluded: mi.Float
+    length: mi.UInt32
+    group: mi.UInt32
+
+
 @recorded_once
 @dr.syntax
-def irradiance_from_emitters(scene, emitters: EmitterSampler, places: Places, cell, samples: int, seed: int):
-    """Irradiance straight from emitters by next-event estimation with ``samples`` samples for each of the ``places``.
+def irradiance_from_emitters(
+    scene, emitters: EmitterSampler, places: Places, cell, samples: int, most: mi.UInt32, seed: int
+) -> Irradiance:
+    """Irradiance by next-event estimation with ``samples`` samples for each of the ``places``.
 
-    Returns, evaluated: the irradiance, an unpolarized spectrum, weighted for multiple importance sampling with
-    cosine-distributed directions; the mean over channels of the unoccluded irradiance, without the weight; and the
-    group of the emitter.  With groups, the irradiance has the colour of one sample, because its light belongs to one
-    group.  Virtual lights and learning samplers share this kernel, because compiling it takes a good part of a first
-    render.
+    ``most``: null surfaces that light may pass.  Where there are groups or null surfaces, the irradiance has the colour
+    of one sample, because light belongs to one group and has one length.  Virtual lights and learning samplers share
+    this kernel, because compiling it takes a good part of a first render.
     """
     si, sampler, number = places.interaction(), independent_sampler(seed, places.count), mi.UInt32(0)
     wanted = dr.opaque(mi.UInt32, samples)
     found, unoccluded = Contributions.none(places.count), dr.zeros(mi.Float, places.count)
-    while dr.hint(number < wanted, exclude=[scene, emitters, si, places, cell, wanted]):
+    draws = emitters.groups is not None or emitters.traits.null
+    while dr.hint(number < wanted, exclude=[scene, emitters, si, places, cell, wanted, most]):
         sample = emitters.sample(si, cell, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
         cosine = dr.maximum(dr.dot(places.facing, sample.direction), 0)
         mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, cosine * dr.inv_pi))
-        reached = dr.select(sample.density > 0, sample.arriving(scene, cosine > 0) * cosine * mis, 0)
-        draw = sampler.next_1d() if emitters.groups else mi.Float(0)
-        found.add(reached, mi.UInt32(1), sample.group, draw)
+        arriving, crossings = sample.arriving(scene, emitters.traits, most, cosine > 0)
+        reached = dr.select(sample.density > 0, arriving * cosine * mis, 0)
+        draw = sampler.next_1d() if draws else mi.Float(0)
+        found.add(reached, crossings + 1, sample.group, draw)
         unoccluded += channel_mean(sample.weight) * cosine
         number += 1
-    reached = (found.one if emitters.groups else found.radiance) / mi.Float(wanted)
-    unoccluded /= mi.Float(wanted)
-    dr.eval(reached, unoccluded, found.group)
-    return reached, unoccluded, found.group
+    reached = (found.one if draws else found.radiance) / mi.Float(wanted)
+    irradiance = Irradiance(reached, unoccluded / mi.Float(wanted), found.length, found.group)
+    dr.eval(irradiance)
+    return irradiance

@@ -109,8 +109,8 @@ class CellChoice:
         try:
             for first in range(0, vertices.cells, most):
                 cells = min(most, vertices.cells - first)
-                reached, unoccluded, _ = self._look(vertices, first, cells, derived_seed(seed, first), look)
-                looks.write(first * self.count, reached, unoccluded, self._learnable)
+                found = self._look(vertices, first, cells, derived_seed(seed, first), look)
+                looks.write(first * self.count, found.irradiance, found.unoccluded, self._learnable)
         finally:
             self._learns = dr.opaque(mi.Bool, False)
         power = arriving_power(looks, self.count, self._cells.neighbours())

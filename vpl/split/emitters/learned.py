@@ -18,6 +18,7 @@ from ...core.arrays import download, finite_or_zero, upload
 from ...core.registry import RegistryTable
 from ...direct.environment_regions import regions_of
 from ...lights.emitter_groups import EmitterGroups
+from ...points.camera_paths import SceneTraits, scene_traits
 from .base import EmitterSample, MetEmitter, irradiance_from_emitters
 from .cell_choice import CellChoice
 
@@ -25,14 +26,18 @@ from .cell_choice import CellChoice
 _REGIONS, _COLUMNS = 256, 512
 # Fraction of the samples with Mitsuba's probabilities: a cell may see emitters invisible from the pilot vertices
 _USUAL_SHARE = 0.2
+# Null surfaces on the way to an emitter, at most, while emitters are learned: a bound of the time. The veils of the
+# scene veils are 16
+_MOST = 32
 
 
 class CellEmitters:
-    """Shared part of the samplers with a :class:`CellChoice`; ``_scene``, ``choice``, ``groups``: set by the
-    subclass."""
+    """Shared part of the samplers with a :class:`CellChoice`; ``_scene``, ``choice``, ``groups``, ``traits``: set by
+    the subclass."""
 
     choice: CellChoice
     groups: EmitterGroups | None
+    traits: SceneTraits
 
     def cell(self, position, facing):
         """See :meth:`vpl.split.emitters.base.EmitterSampler.cell`."""
@@ -46,7 +51,7 @@ class CellEmitters:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.learn`."""
 
         def look(places, cell, seed: int):
-            return irradiance_from_emitters(self._scene, self, places, cell, 1, seed)
+            return irradiance_from_emitters(self._scene, self, places, cell, 1, dr.opaque(mi.UInt32, _MOST), seed)
 
         return self.choice.learn(position, normal, rays, seed, look)
 
@@ -73,7 +78,7 @@ class LearnedEmitters(CellEmitters):
     def __init__(self, scene, groups: EmitterGroups | None = None):
         order = _reproducible_order(scene.emitters())
         emitters = [scene.emitters()[number] for number in order]
-        self._scene, self._count, self.groups = scene, len(emitters), groups
+        self._scene, self._count, self.groups, self.traits = scene, len(emitters), groups, scene_traits(scene)
         self._emitters = dr.gather(mi.EmitterPtr, scene.emitters_dr(), upload(mi.UInt32, order))
         dr.eval(self._emitters)
         # Emitters with a weight of 0 are never sampled, as in Mitsuba
