@@ -96,7 +96,8 @@ def throughput_survival(largest, eta, applies):
 def best_multiple(
     expected: np.ndarray, brought: np.ndarray, edges: np.ndarray, paths: int, variance: float, model: CostModel
 ) -> float:
-    """The multiple m of rule 2 with the least variance × cost at second vertices; infinite where none pays.
+    """The multiple m of rule 2 with the least variance × cost at second vertices; where none pays, the least multiple
+    that hardly raises the variance, which still ends the paths that bring next to nothing; infinite without one.
 
     ``expected`` (n,): expected contributions with m = 1 of the paths with a second vertex; ``brought`` (n,): actual
     contributions, both relative to the image; ``edges`` (n,): edges beyond the second vertex; ``paths``: total number
@@ -106,6 +107,7 @@ def best_multiple(
     single path decides where pilots are small.  Of fewer than 1000 paths, none is left out.
     """
     best, least = np.inf, model.roulette_gain * variance * (model.first_edges + edges.sum() / paths)
+    harmless = np.inf
     kept = max(len(brought) - model.left_out(paths), 0)
     for multiple in _MULTIPLES:
         survival = np.clip(multiple * expected, model.least_survival, 1)
@@ -113,4 +115,6 @@ def best_multiple(
         product = of_multiple * (model.first_edges + np.sum(edges * survival) / paths)
         if product < least:
             best, least = multiple, product
-    return float(best)
+        if 0 < of_multiple <= (1 + model.roulette_rise) * variance:
+            harmless = min(harmless, multiple)
+    return float(best if np.isfinite(best) else harmless)

@@ -89,7 +89,8 @@ def learning_pilot(view: View) -> tuple[Pilot, bool]:
         return pilot, False
     again = Pilot.trace(view, ViewLights())
     before, after = (relative_errors(x.radiance - x.seen, pilot.brightness, view.model) for x in (pilot, again))
-    if is_certain_rise(before, view.model.learned_cost * after, view.model):
+    cost = view.model.learned_sky_cost if view.emitters.learns_sky else view.model.learned_cost
+    if is_certain_rise(before, cost * after, view.model):
         view.emitters.forget()
         return pilot, False
     return again, True

@@ -24,7 +24,27 @@ def test_paths_end_where_they_bring_little_and_cost_much():
     assert multiple * 0.01 < 0.2
     # Rare paths carry all of the noise, and cannot be told in advance
     rare = np.where(np.arange(10_000) % 100 == 0, 10.0, 0.0)
-    assert best_multiple(np.ones(10_000), rare, edges, 10_000, 1.0, MODEL) == np.inf
+    multiple = best_multiple(np.ones(10_000), rare, edges, 10_000, 1.0, MODEL)
+    assert multiple >= 1
+
+
+def test_where_roulette_does_not_pay_only_paths_that_bring_next_to_nothing_end():
+    """A tenth of the paths bring hardly any light, and have few edges."""
+    bright = np.arange(10_000) % 10 > 0
+    brought, edges = np.where(bright, 1.0, 0.02), np.where(bright, 5, 1)
+    multiple = best_multiple(brought, brought, edges, 10_000, 1.0, MODEL)
+    survival = np.clip(multiple * brought, MODEL.least_survival, 1)
+    saved = 1 - (MODEL.first_edges + np.mean(edges * survival)) / (MODEL.first_edges + edges.mean())
+    assert 0 < saved < 1 - MODEL.roulette_gain
+    rise = np.mean(brought**2 * (1 / survival - 1))
+    assert 0 <= rise <= MODEL.roulette_rise
+    # Paths end at all, and those that bring much go on
+    assert (survival[~bright] < 1).all() and (survival[bright] == 1).all()
+
+
+def test_no_path_ends_in_a_black_image():
+    dark = np.zeros(100)
+    assert best_multiple(dark, dark, np.ones(100, int), 100, 0.0, MODEL) == np.inf
 
 
 def test_a_single_path_does_not_decide():

@@ -73,12 +73,13 @@ class EmitterSampler(Protocol):
     """Choice of emitters for next-event estimation.
 
     ``lights``: virtual lights representing the emitters, or None; ``groups`` of the emitters, or None; ``traits`` of
-    the scene.
+    the scene; ``learns_sky``: whether regions of the environment are learned.
     """
 
     lights: EmitterLights | None
     groups: EmitterGroups | None
     traits: SceneTraits
+    learns_sky: bool
 
     def cell(self, position: mi.Point3f, facing: mi.Normal3f) -> mi.UInt32:
         """Number of the spatial cell of each vertex; ``facing``: shading normal on the visible side."""
@@ -112,7 +113,7 @@ class EmitterSampler(Protocol):
 class UniformEmitters:
     """Mitsuba's own choice, of at most one emitter.  There is nothing to learn."""
 
-    lights = None
+    lights, learns_sky = None, False
 
     def __init__(self, scene, groups: EmitterGroups | None = None):
         self._scene, self.groups, self.traits = scene, groups, scene_traits(scene)

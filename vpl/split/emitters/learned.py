@@ -35,6 +35,8 @@ class CellEmitters:
     """Shared part of the samplers with a :class:`CellChoice`; ``_scene``, ``choice``, ``groups``, ``traits``: set by
     the subclass."""
 
+    learns_sky = False
+
     choice: CellChoice
     groups: EmitterGroups | None
     traits: SceneTraits
@@ -89,6 +91,7 @@ class LearnedEmitters(CellEmitters):
         self._regions = None
         if weight[of_environment].any():
             self._regions = regions_of(self._environment, _REGIONS, _COLUMNS)
+        self.learns_sky = self._regions is not None
         registry = download(dr.reinterpret_array(mi.UInt32, self._emitters))
         self._number_of = RegistryTable(registry, np.arange(1, self._count + 1))
         # A number for each source: the regions belong to the group of the environment
