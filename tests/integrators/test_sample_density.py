@@ -33,9 +33,10 @@ def lights_cost_nothing():
         yield
 
 
-def room(film=FILM):
+def room(film=FILM, **camera):
     """A closed box with walls of different colours and a lamp."""
     description = closed_box({"lamp": area_light()})
+    description["sensor"] |= camera
     description["sensor"]["film"] |= film
     return mi.load_dict(description)
 
@@ -287,14 +288,14 @@ def test_halves_are_of_every_second_sample():
 @pytest.mark.parametrize("film", [{}, {"rfilter": {"type": "gaussian"}}], ids=["box", "gaussian"])
 @with_and_without_lights
 def test_the_mean_of_every_pixel_of_a_fine_film_is_that_of_a_usual_one(lights, film):
-    scene, integrator = room(FILM | film), plugin(lights)
+    # Only the back wall, which is smooth: at corners, the steps of a filter change a pixel by 1.5%
+    scene, integrator = room(FILM | film, fov=45), plugin(lights)
 
     def pair(seed):
         found = render(scene, integrator, None, seed, parts=2)
         assert (integrator.statistics.get("light_paths", 0) > 0) == lights
         return found, render(scene, integrator, None, 1000 + seed)
 
-    # Walls are smooth, so that the steps of the filter do not matter
     assert_same_mean_of_pixels(pair)
 
 
