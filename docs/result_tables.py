@@ -107,7 +107,7 @@ TABLES = {
         order="speedup",
     ),
     "views": Table({"": ("manylights_views",)}, (Column("ratio", ratio="speedup"),), first="scene, view"),
-    "own": Table({"": ("manylights_own", "manylights_lamp_grid")}, (Column("ratio", ratio="speedup"),)),
+    "own": Table({"": ("manylights_own",)}, (Column("ratio", ratio="speedup"),)),
     "timed10": Table(
         {"": ("manylights_timed10",)},
         (
