@@ -21,7 +21,7 @@ SHEETS = {
     "torn": TORN,
     "glass": {"type": "thindielectric"},
     "blend": {"type": "blendbsdf", "weight": 0.4, "a": TORN, "b": {"type": "diffuse"}},
-    # Does not tell what it transmits, so that shadow rays end at it
+    # A bump map reports no transmission, so that shadow rays end at it
     "bumps": {
         "type": "bumpmap",
         "bump": BUMPS,
@@ -101,6 +101,15 @@ def test_shadow_rays_pass_as_many_surfaces_as_allowed():
 def test_scenes_without_null_surfaces_have_plain_shadow_rays():
     assert not emitter_sampler(mi.load_dict(closed_box(EMITTERS["rectangle"]())), 100).traits.null
     assert emitter_sampler(mi.load_dict(veiled_room()), 100).traits.null
+
+
+def test_scenes_with_instances_have_plain_shadow_rays(lights_cost_nothing):
+    """Mitsuba hides the materials of instances; the light is found all the same."""
+    group = {"type": "shapegroup", "sheet": wall([0, 0, 0], [1, 0, 0], -90, 1.0, bsdf=TORN)}
+    instance = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    scene = mi.load_dict(closed_box({"lamp": area_light()}, 12, group=group, sheet=instance))
+    assert not emitter_sampler(scene, 100).traits.null
+    assert_image_of_prb(scene, 5)
 
 
 @pytest.mark.parametrize("material", ["mask", "thindielectric"])
