@@ -21,13 +21,13 @@ from ..emitter_lights import EmitterLights
 
 
 def shadow_traits(scene) -> SceneTraits:
-    """Traits of a scene for shadow rays to emitters: without null surfaces in scenes with instances.
+    """Traits of a scene for shadow rays to emitters, which pass null surfaces only where these are known.
 
     Mitsuba hides the materials of instances.  If every surface might transmit light, every blocked ray would look up
     the material of what blocks it.  Paths find all light through null surfaces there, as in ``path``.
     """
     traits = scene_traits(scene)
-    return replace(traits, null=False) if traits.open_shapes is None else traits
+    return replace(traits, null=bool(traits.open_shapes))
 
 
 @dataclass
