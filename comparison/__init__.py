@@ -3,7 +3,7 @@
 `scene_files`   parse a scene file, change its integrator or size, load it
 `rendering`     average passes with different seeds, for samples or seconds
 `counters`      sums of the integrators' counters over passes
-`render`, `pass_sizes`, `convergence`, `interruption`
+`render`, `pass_sizes`, `timed_sizes`, `convergence`, `interruption`
                 render until a time or an error: pass sizes, error estimate, Ctrl-C
 `checkpoint`    state of an unfinished render
 `one_image`, `batch`

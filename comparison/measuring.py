@@ -4,8 +4,9 @@ from itertools import count
 
 import numpy as np
 
-from .pass_sizes import FIRST_SAMPLES, PassSizes
+from .pass_sizes import FIRST_SAMPLES
 from .single_pass import pass_seed, pass_sizes
+from .timed_sizes import sizes_of
 
 LONG_PASS = 60.0  # seconds; with given samples, passes longer than this are warmed up by small passes alone
 WARM_SPP = 4  # Mitsuba compiles different kernels below this number, and for numbers other than powers of two
@@ -54,7 +55,7 @@ def measure(progressive, job):
 
 def _render_in_time(progressive, budget, seeds=None):
     """Render passes in parts within a `budget` in seconds, of the sizes that `render` uses with a limit of time."""
-    sizes = PassSizes.of(progressive, time=budget)
+    sizes = sizes_of(progressive, time=budget)
     while not isinstance(spp := sizes.next(progressive.passes, progressive.seconds), str):
         progressive.render(spp, next(seeds) if seeds else None, is_probe=sizes.is_probe)
 

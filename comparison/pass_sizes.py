@@ -1,24 +1,18 @@
-"""Samples per pixel of the next pass of a render: passes take about two seconds, in parts about ten.
+"""Samples per pixel of the next pass of a render.
 
-Passes in parts take long, as they can be stopped between parts, and large passes are the most efficient: virtual lights
-pay only from a certain size, and samples are stratified within a pass. Such a pass takes about ten seconds, or twice
-the time of its start, and the last pass up to twice that. With a time limit of ten seconds a render has a small pass,
-one of about half of the time, and one that fills the rest.
+Without a limit of time the sizes follow from the numbers of pixels and samples alone, so that equal seeds make equal
+images on any machine. The first pass is small, so that an image appears soon. Later passes in parts, which can be
+stopped between parts, are as large as memory allows: large passes are the most efficient, as virtual lights pay only
+from a certain size, and samples are stratified within a pass. Other passes have as many samples as all passes before
+them, so that a render never waits for a pass for much longer than it has run. Renders that end by error have at least
+eight passes of similar sizes. With a limit of time the speed of the machine counts as well (timed_sizes.py).
 
 In images that will be denoised, the second pass may determine the samples of the pixels in later passes, if some 60
 samples or more are expected in all. It is then small, because its own pixels have equal numbers.
 
-The first pass is small, as its cost is unknown. Sizes of passes that are not in parts, or end by error, are powers of
-two, from 4 if the number of pixels allows: Mitsuba compiles a single kernel for these sizes, but other kernels for
-sizes between, and, with some film filters, below 4. Each later pass has the size of the pass before it, or grows by a
-factor that the measured time allows. Compilation is measured and does not count. Even so, the first pass with a kernel
-takes up to twice as long as later ones, so its time is an upper bound of the cost: growing by it is safe. Shrinking
-requires a second pass of equal size; so does growth that risks twice the time, for passes that are slow to start.
-
-Passes in parts report the time of their start, so that one pass tells the cost of any size, and sizes from the second
-pass on may be any number: `manylights` needs a single further kernel for them. A second pass may have virtual lights
-where the small first pass has none, and cost more. Up to the largest size for which the first pass predicts the cost,
-it may take all of the remaining time; beyond this size, half. A pass that determines samples takes less.
+Sizes of passes that are not in parts, or end by error, are powers of two, from 4 if the number of pixels allows:
+Mitsuba compiles a single kernel for these sizes, but other kernels for sizes between, and, with some film filters,
+below 4. Sizes of passes in parts may be any number: `manylights` needs a single further kernel for them.
 """
 
 import math
@@ -26,99 +20,66 @@ import math
 from .sample_density import LEAST_SAMPLES
 from .single_pass import largest_pass
 
-PASS_SECONDS = 2.0
-PART_SECONDS, LEAST_REST = 10.0, 1.0  # of a pass in parts; minimum ratio of its rest to its start, which has priority
-LEAST_GAIN = 1 / 16  # minimum size of a last pass with virtual lights, as a fraction of the intended size
-LIT = 2.0  # usual cost of a sample with virtual lights over that without, at most: small passes have no lights
-UNSURE = 1.1  # cost over a predicted one, at most: measured are 0.67 to 1.11 (decisions.md)
-DOUBT = 0.5  # fraction of the remaining time for a second pass, which may have lights and cost more than expected
-DIFFERENT = 1.08  # usual cost of a sample where pixels have different numbers: there are more at edges and on glass
-# Least samples per pixel of a render with such a pass. Error of images of 40 and 80 samples with one, over that of a
-# single pass, which is stratified as a whole and may have virtual lights (decisions.md): 1.11 and 0.98
-LEAST_PROBED = 60
-PROBE = 0.25  # fraction of the remaining time, or samples, for a second pass that determines the samples of the pixels
-LONGEST = 2.0  # times the wanted seconds: longer passes shrink
-CHANGED = 1.5  # ratio of the times of two passes of equal size at which earlier times are discarded
-MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of extrapolated times
 USUAL = 4  # samples per pixel; all powers of two from here have the same kernels
 FIRST_SAMPLES = 2**19  # maximum pixel samples of a first pass, unless one per pixel is more
-KERNEL_SECONDS = 0.1  # to compile the kernel of the first size that is no power of two, if the first pass compiled any
-LEAST_SHARE = 0.1  # minimum fraction of a pass's time that is assumed proportional to its samples
 PARTS = 8  # with an error limit, a pass has at most this fraction, 1/8, of the samples so far
+# Least samples per pixel of a render with a pass that determines samples. Error of images of 40 and 80 samples with
+# one, over that of a single pass, which is stratified as a whole and may have virtual lights (decisions.md): 1.11, 0.98
+LEAST_PROBED = 60
+PROBE = 0.25  # fraction of the remaining samples, or time, for a pass that determines the samples of the pixels
 
 
 class PassSizes:
-    """Sizes of the passes of an image of `pixels` pixels, up to `spp` samples per pixel and `time` seconds; both may be
-    None. `fixed`: size of all passes except the last, or None. `many`: at least eight passes of similar sizes, for an
-    estimate of the error. `in_parts`: whether passes are rendered in parts.
-    `accepts`: whether the sampler keeps a number of samples per pixel. `probes`: whether the second pass determines the
-    samples of the pixels in later passes; its samples are then a multiple of `multiple`. `least`: minimum size."""
+    """Sizes of the passes of an image of `pixels` pixels, up to `spp` samples per pixel (None: no limit).
+
+    `fixed`: size of all passes except the last, or None. `many`: at least eight passes of similar sizes, for an
+    estimate of the error. `in_parts`: whether passes are rendered in parts. `accepts`: whether the sampler keeps a
+    number of samples per pixel. `probes`: whether the second pass determines the samples of the pixels in later passes;
+    its samples are then a multiple of `multiple`. `least`: minimum size.
+    """
 
     def __init__(
-        self, pixels, spp=None, time=None, fixed=None, many=False, in_parts=False, accepts=lambda spp: True,
-        probes=False, multiple=1, least=1,
+        self, pixels, spp=None, fixed=None, many=False, in_parts=False, accepts=lambda spp: True, probes=False,
+        multiple=1, least=1,
     ):  # fmt: skip
-        self._spp, self._time, self._fixed, self._many, self._in_parts = spp, time, fixed, many, in_parts
+        self._spp, self._fixed, self._many, self._in_parts = spp, fixed, many, in_parts
         self._any_size = in_parts and not many and not fixed  # after the first pass, not only powers of two
         self._accepts, self._probes = accepts, probes and self._any_size
         self.is_probe = False  # whether the last pass that was asked for determines the samples of pixels
         self._minimum, self._multiple, self._least_probe = least, multiple, max(LEAST_SAMPLES, multiple)
-        self._largest = max(_power_of_two(largest_pass(pixels, in_parts)), least)
+        self._largest = max(power_of_two(largest_pass(pixels, in_parts)), least)
         self._least = max(USUAL if USUAL * pixels <= FIRST_SAMPLES else 1, least)
-        self._current, self._seconds, self._asked = fixed or self._least, {}, None
-        self._known = {}  # size -> seconds of the last pass; not of the first pass, which is slower
-        self._starts = {}  # size -> seconds to start the last pass, of passes that report them
-        self._lit = False  # whether a pass had virtual lights
-        self._predicted = []  # (largest size, cost of a sample over those so far, at most) of ranges of sizes
-        self._kernel_seconds = 0.0  # expected compilation of the next pass
-        self._dearer = 1.0  # expected cost of a sample of the next pass over that of known passes
-        self._before = None  # number of passes from a checkpoint; None until the first call
 
-    @classmethod
-    def of(cls, progressive, spp=None, time=None, fixed=None, many=False):
-        """Sizes of the passes of a `rendering.Progressive`."""
-        return cls(
-            progressive.pixels, spp, time, fixed, many, progressive.in_parts, progressive.accepts, progressive.differs,
-            progressive.density.probe_multiple, progressive.parts**2,
-        )  # fmt: skip
-
-    def next(self, passes, elapsed):
+    def next(self, passes, elapsed=0.0):
         """Return the samples per pixel of the pass after `passes` (list of `Pass`) and `elapsed` seconds, or the limit
         that ends the render: "spp" or "time"."""
         done = sum(one.spp for one in passes)
-        if self._before is None:
-            self._before = len(passes)
-            self._asked = passes[-1].spp if passes else None
-        if passes:
-            self._learn(passes[-1], done, is_first=len(passes) == self._before + 1)
         if self._spp is not None and done >= self._spp:
             return "spp"
-        self._dearer = DIFFERENT if self.is_probe else 1.0
         self.is_probe = self._probes and len(passes) == 1 and self._expected_samples(done, elapsed) >= LEAST_PROBED
         size = self._size(passes, done, elapsed)
         if self.is_probe and size < self._least_probe:
             # Too few for the halves of a pass: a pass of the usual size
             self.is_probe = False
             size = self._size(passes, done, elapsed)
-        self._asked = size - size % self._multiple if self.is_probe else size
-        return self._asked or "time"
+        return (size - size % self._multiple if self.is_probe else size) or "time"
 
     def _expected_samples(self, done, elapsed):
-        """Return the expected samples per pixel of the render, of which `done` are rendered: a low estimate where time
-        ends it and later passes may have virtual lights."""
-        left = [self._spp - done] if self._spp is not None else []
-        if self._time is not None and self._line():
-            left.append(self._filling(self._time - elapsed))
-        return done + min(left, default=math.inf)
+        """Return the expected samples per pixel of the render, of which `done` are rendered."""
+        return math.inf if self._spp is None else self._spp
 
     def _size(self, passes, done, elapsed):
-        """Return the size of the next pass, 0 if the time ends the render."""
-        size = self._current
-        if self._spp is not None:
-            size = self._of_the_rest(size, self._spp - done)
-        if self._time is not None and passes:
-            size = self._in_time(size, self._time - elapsed)
-        return size
+        """Return the size of the next pass."""
+        size = self._intended(done)
+        return size if self._spp is None else self._of_the_rest(size, self._spp - done)
+
+    def _intended(self, done):
+        """Return the size of a pass after `done` samples, whatever is left."""
+        if self._fixed or not done:
+            return self._fixed or self._least
+        if self._any_size:
+            return self._largest
+        return min(max(self._least, power_of_two(done / PARTS if self._many else done)), self._largest)
 
     def _of_the_rest(self, size, left):
         """Return the size of the next pass, about `size` samples, with `left` samples until the limit."""
@@ -126,105 +87,10 @@ class PassSizes:
             return min(size, self._kept(int(PROBE * left)))
         if self._any_size and left < 2 * size and left <= self._largest:
             return self._kept(left) if self._probes else left
-        return min(size, left if self._fixed or left < USUAL else _power_of_two(left))
-
-    def _learn(self, last, done, is_first):
-        """Record the time of the `last` pass, and choose the size of later passes."""
-        repeated, seconds = self._asked in self._seconds, last.repeated_seconds
-        self._kernel_seconds = KERNEL_SECONDS if is_first and last.compile_seconds != 0 else 0.0
-        if last.start_seconds is not None:
-            self._starts[self._asked] = last.start_seconds
-            self._lit |= last.has_lights
-            if last.growth:
-                costs = [UNSURE * cost if cost > 1 else 1.0 for _, cost in last.growth]
-                sizes = [round(times * self._asked) for times, _ in last.growth]
-                self._predicted = list(zip(sizes, costs, strict=True))
-        self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
-        if not is_first:
-            before = self._known.get(self._asked, seconds)
-            if not 1 / CHANGED < seconds / max(before, 1e-6) < CHANGED:
-                self._known.clear()  # the speed of the machine has changed
-            self._known[self._asked] = seconds
-        if self._fixed or self._asked != self._current:
-            return
-        wanted, line = self._wanted(), self._in_parts and self._line()
-        if repeated and seconds > LONGEST * wanted:
-            self._current = max(self._minimum, _power_of_two(self._current * wanted / seconds))
-            return
-        grown = self._grown(seconds, wanted, repeated, line)
-        grown = min(grown, self._largest, _power_of_two(max(1, done / PARTS)) if self._many else self._largest)
-        if grown > self._current and (self._in_parts or grown >= min(USUAL, self._largest)):
-            self._current = grown
-
-    def _grown(self, seconds, wanted, repeated, line):
-        """Return the size of a pass of at most `wanted` seconds, from the `seconds` of a pass of the current size."""
-        if line:
-            if self._any_size:
-                return self._kept(self._filling(wanted))
-            start, each = line
-            each *= self._last_cost if self._may_be_lit else 1.0
-            return min(_power_of_two((wanted - start) / each), MOST_GROWTH * self._current)
-        grown = _power_of_two(self._current * wanted / max(seconds, 1e-6))
-        if repeated and seconds < wanted:
-            # Without this, a pass with a dominant start would never grow
-            times = MOST_GROWTH if seconds < wanted / 2 else 2
-            grown = max(grown, times * self._current)
-        return grown
-
-    def _in_time(self, size, left):
-        """Return the size, about `size` samples, of a pass within `left` seconds.
-
-        If there is none, return the least size if `left` is at least half of its time, otherwise 0; also 0 if a last
-        pass in parts would be far smaller than usual.
-        """
-        least = size if self._fixed else min(size, self._least)
-        whole, predicted = left, 0
-        if self.is_probe:
-            left = PROBE * min(left, PART_SECONDS)
-        elif self._any_size and self._may_be_lit:
-            left, predicted = DOUBT * left, self._predicted[-1][0] if self._predicted else 0
-        if self._any_size and self._line():
-            filling = max(self._filling(left), min(self._filling(whole), predicted))
-            # Without virtual lights, small passes are as good as large ones
-            if self._known and filling < (LEAST_GAIN * size if self._lit else least):
-                return 0
-            certain = self._kept(self._certain(filling))
-            # A single last pass, instead of several ever smaller ones
-            if least <= certain <= self._largest and filling < (size if self._spp else 2 * size):
-                return certain
-        while size > least and self._expected(size) > left:
-            size = max(least, _power_of_two(size - 1))
-        return size if self._expected(size) <= max(2 * left, whole) else 0
-
-    @property
-    def _may_be_lit(self):
-        """Whether the next pass may be the first one with virtual lights, and its cost is not known."""
-        return not self._known and not self._lit
-
-    def _cost_of(self, size):
-        """Return the expected cost of a sample of a pass with virtual lights, over those so far."""
-        return next((cost for most, cost in self._predicted if size <= most), self._last_cost)
-
-    @property
-    def _last_cost(self):
-        return self._predicted[-1][1] if self._predicted else LIT
-
-    def _filling(self, seconds):
-        """Return the largest size of a pass of some `seconds`, by its expected cost."""
-        start, each = self._line()
-        affordable = (seconds - self._kernel_seconds - start) / (self._dearer * each)
-        ranges = [*self._predicted, (math.inf, self._last_cost)] if self._may_be_lit else [(math.inf, 1.0)]
-        found = before = 0
-        for most, cost in ranges:
-            size = int(min(affordable / cost, most))
-            # The cost is that of sizes beyond the range before
-            found, before = size if size > before else found, most
-        return found
-
-    def _certain(self, size):
-        """Return the largest size up to `size` that takes no longer than expected if its pass has virtual lights."""
-        known = max(self._known, default=0)
-        return int(size if self._lit or not known else min(size, max(known, size / self._cost_of(size))))
+        if self._any_size and size < left < 2 * size:
+            # No small pass at the end
+            return self._kept(-(-left // 2))
+        return min(size, left if self._fixed or left < USUAL else power_of_two(left))
 
     def _kept(self, size):
         """Return the largest size up to `size` that the sampler keeps."""
@@ -232,46 +98,7 @@ class PassSizes:
             size -= 1
         return size
 
-    def _wanted(self):
-        """Return the intended seconds of a pass."""
-        if not self._in_parts:
-            return PASS_SECONDS
-        line = self._line()
-        return max(PART_SECONDS, (1 + LEAST_REST) * line[0]) if line else PART_SECONDS
 
-    def _expected(self, size):
-        """Return the expected seconds of a pass: those of an earlier pass of this size, or by `_line`, or, if that is
-        None, proportional to the size."""
-        if size in self._seconds:
-            return self._seconds[size]
-        line = self._line()
-        if not line:
-            large, longest = max((self._known or self._seconds).items())
-            line = 0.0, longest / large
-        start, each = line
-        return start + each * size * (self._cost_of(size) if self._starts and self._may_be_lit else 1.0)
-
-    def _line(self):
-        """Return the seconds to start a pass, and the seconds per sample per pixel of known passes; None if unknown.
-
-        From the shortest start that passes report, or else from the largest size and the least one within
-        `MOST_GROWTH` of it.
-        """
-        large = max(self._known or self._starts, default=0)
-        longest = self._known.get(large) or self._seconds.get(large)
-        if large in self._starts:
-            each = max((longest - self._starts[large]) / large, LEAST_SHARE * longest / large)
-            # Some passes learn for all passes of their size. Larger passes than the first one may have virtual lights
-            start = min(self._starts[size] for size in (self._known.keys() & self._starts.keys()) or self._starts)
-            return start, each
-        small = min((size for size in self._known if MOST_GROWTH * size >= large), default=0)
-        if small == large:
-            return None
-        each = (longest - self._known[small]) / (large - small)
-        each = min(max(each, LEAST_SHARE * longest / large), longest / large)
-        return longest - each * large, each
-
-
-def _power_of_two(number):
+def power_of_two(number):
     """Return the largest power of two up to a number, at least 1."""
     return 2 ** math.floor(math.log2(number)) if number >= 1 else 1

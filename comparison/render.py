@@ -24,9 +24,9 @@ from .ending import Ending
 from .features import Layers, channels_of, features_of
 from .fine_film import usual_parts
 from .interruption import Interruption
-from .pass_sizes import PassSizes
 from .rendering import Progressive
 from .scene_files import SceneFile
+from .timed_sizes import sizes_of
 
 LIMITS = ("spp", "time")  # end a render regardless of its error
 
@@ -80,8 +80,9 @@ def render(
     layers: Sequence[str] = (),
 ) -> tuple[mi.TensorXf, Took]:
     """Render a scene in passes; return the image, a `mi.TensorXf` of shape (height, width, channels) as of `mi.render`,
-    and the cost (`Took`). Passes take about two seconds, with `manylights` about ten, the last one up
-    to twenty.
+    and the cost (`Took`). Without a limit of `time` the sizes of passes depend on the image alone (pass_sizes.py), so
+    that equal seeds make equal images. With one, passes take about two seconds, with `manylights` about ten, the last
+    one up to twenty.
 
     `scene`: a `mi.Scene`, or the path of a scene file. `integrator`: a `mi.Integrator` or the name of a plugin, by
     default the scene's. `sensor`: an index, or "all" for a list of (image, cost) over all sensors. The first limit that
@@ -136,7 +137,7 @@ def render(
     limits = {} if checkpoint else {"seconds": time, "spp": spp}
     progressive = Progressive(scene, seed, sensor, integrator, chooses, denoiser.parts if denoiser else 1, **limits)
     reserved = denoiser.expected_seconds if denoiser else 0.0
-    sizes = PassSizes.of(progressive, spp, time and time - reserved, pass_spp, error is not None)
+    sizes = sizes_of(progressive, spp, time and time - reserved, pass_spp, error is not None)
     ending = Ending(spp, time and time - reserved, error, reserved)
     if checkpoint:
         begin -= checkpoint.restore(progressive)

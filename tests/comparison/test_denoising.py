@@ -12,8 +12,8 @@ import pytest
 import compare
 import manylights
 from comparison import images
+from comparison import render as rendering_module
 from comparison.denoising import Denoiser
-from comparison.pass_sizes import PassSizes
 from tests.support.comparisons import results_of
 from tests.support.marks import stress
 from tests.support.paths import CORNELL
@@ -80,13 +80,13 @@ def test_a_quality_chooses_the_network():
 
 def test_time_includes_denoising(monkeypatch):
     """What the filter will take is reserved."""
-    told, original = [], PassSizes.of
+    told, original = [], rendering_module.sizes_of
 
     def sizes(progressive, spp, time, *more):
         told.append(time)
         return original(progressive, spp, time, *more)
 
-    monkeypatch.setattr(PassSizes, "of", sizes)
+    monkeypatch.setattr(rendering_module, "sizes_of", sizes)
     manylights.render(cornell().load(), time=1, denoise=True)
     assert 0 < told[0] < 1
 

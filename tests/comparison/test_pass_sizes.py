@@ -5,8 +5,9 @@ from collections import Counter
 
 import pytest
 
-from comparison.pass_sizes import PASS_SECONDS, PassSizes
+from comparison.pass_sizes import PassSizes
 from comparison.single_pass import MAXIMUM_PASS_SAMPLES, Pass
+from comparison.timed_sizes import PASS_SECONDS, TimedSizes
 from vpl.core.stages import Stage
 
 SQUARE = 256 * 256
@@ -15,7 +16,8 @@ SQUARE = 256 * 256
 def render(pixels, start, each, compilation=3.0, more=None, slow=None, **limits):
     """Passes that take `start` seconds and `each` per sample, three times that from number `slow` on, and once for each
     kernel `compilation`, or `more` but for the first: (passes, why the render ended)."""
-    sizes, passes, elapsed, kernels = PassSizes(pixels, **limits), [], 0.0, set()
+    sizes = (TimedSizes if "time" in limits else PassSizes)(pixels, **limits)
+    passes, elapsed, kernels = [], 0.0, set()
     while len(passes) < 2000:
         spp = sizes.next(passes, elapsed)
         if isinstance(spp, str):
@@ -50,16 +52,34 @@ def test_passes_take_about_two_seconds_and_repeat(start, each):
 
 
 def test_passes_that_take_long_are_as_small_as_can_be():
-    passes, _ = render(SQUARE, 1.0, 5.0, spp=64)
+    passes, _ = render(SQUARE, 1.0, 5.0, time=400)
     assert passes[0].spp == passes[1].spp == 4
     assert {one.spp for one in passes[2:]} == {1}
+
+
+@pytest.mark.parametrize("limits", [{"spp": 1000}, {"spp": 300, "many": True}])
+@pytest.mark.parametrize("in_parts", [False, True])
+def test_without_a_limit_of_time_the_speed_of_the_machine_does_not_matter(limits, in_parts):
+    fast, slow = (
+        [one.spp for one in render(SQUARE, each, each, in_parts=in_parts, **limits)[0]] for each in (0.001, 10.0)
+    )
+    assert fast == slow and len(fast) > 2
+
+
+@pytest.mark.parametrize("spp", [16, 32, 100, 999])
+def test_no_pass_has_more_samples_than_all_before_it(spp):
+    passes, done = render(SQUARE, 0.1, 0.1, spp=spp)[0], 0
+    for one in passes:
+        assert one.spp <= max(4, done)
+        done += one.spp
+    assert len(passes) <= 2 * math.log2(spp) + spp * SQUARE / MAXIMUM_PASS_SAMPLES
 
 
 def test_large_images_begin_with_one_sample():
     passes, _ = render(1 << 21, 0.1, 0.2, spp=20)
     assert [one.spp for one in passes] == [1] * 20
     passes, _ = render(1 << 19, 0.1, 0.1, compilation=0.1, spp=20)
-    assert [one.spp for one in passes] == [1, 4, 4, 4, 4, 3]
+    assert [one.spp for one in passes] == [1, 1, 2, 4, 4, 4, 4]
 
 
 @pytest.mark.parametrize("start", [0.7, 1.4, 2.4])
@@ -84,7 +104,7 @@ def test_in_parts_passes_take_about_ten_seconds_from_the_third_on(start, each):
 @pytest.mark.parametrize("time", [3, 10])
 def test_in_parts_a_short_render_has_one_small_pass_and_few_large_ones(time, lit):
     """Samples of passes above 20 cost `lit` times those of smaller ones, as with virtual lights."""
-    sizes, passes, elapsed = PassSizes(SQUARE // 2, time=time, in_parts=True), [], 0.0
+    sizes, passes, elapsed = TimedSizes(SQUARE // 2, time, in_parts=True), [], 0.0
     while not isinstance(spp := sizes.next(passes, elapsed), str):
         traced = 0.05 * spp * (lit if spp > 20 else 1)
         stages = {Stage.TRACED: traced} | ({Stage.CUTS: 0.0} if lit > 1 and spp > 20 else {})
@@ -106,7 +126,7 @@ def test_in_parts_large_images_use_the_time(start, each):
 def test_in_parts_costly_lights_hardly_exceed_the_time(lit, time):
     """Samples of passes above 8 cost `lit` times those of smaller ones, and kernels of lights compile for half a
     second."""
-    sizes, passes, elapsed = PassSizes(SQUARE // 2, time=time, in_parts=True), [], 0.0
+    sizes, passes, elapsed = TimedSizes(SQUARE // 2, time, in_parts=True), [], 0.0
     while not isinstance(spp := sizes.next(passes, elapsed), str):
         has_lights = lit > 1 and spp > 8
         first = has_lights and not any(one.has_lights for one in passes)
@@ -212,7 +232,7 @@ def test_sizes_that_are_given_stay():
 def test_in_parts_shared_work_of_the_first_pass_is_not_expected_again(stage):
     found = []
     for shared in (0.0, 3.0):
-        sizes = PassSizes(SQUARE // 2, time=10 + shared, in_parts=True)
+        sizes = TimedSizes(SQUARE // 2, 10 + shared, in_parts=True)
         stages = {stage: shared, Stage.TRACED: 0.4, Stage.CUTS: 0.0}
         first = Pass(0, sizes.next([], 0.0), 0.6 + shared, {"seconds": stages, "pilots": 1})
         found.append(sizes.next([first], first.seconds))
@@ -230,7 +250,7 @@ def test_in_parts_measurements_of_a_later_pass_are_not_expected_again():
 def test_compilation_that_is_measured_does_not_count(in_parts):
     found = []
     for compilation in (0.5, 5.0):
-        sizes = PassSizes(SQUARE // 2, time=10 + compilation, in_parts=in_parts)
+        sizes = TimedSizes(SQUARE // 2, 10 + compilation, in_parts=in_parts)
         statistics = {"seconds": {Stage.TRACED: 0.3, Stage.CUTS: 0.0, Stage.COMPILE: compilation}} if in_parts else {}
         first = Pass(0, sizes.next([], 0.0), 0.4 + compilation, statistics, compilation)
         assert first.repeated_seconds == pytest.approx(0.4)
@@ -242,7 +262,7 @@ def test_compilation_that_is_measured_does_not_count(in_parts):
 def second_size(growth=(), compiled=0.0, time=10.0, **limits):
     """Size of the second pass, after one of 4 samples that takes 0.4 s without compilation, of which 0.1 s are a start,
     and predicts the costs `growth` of 16, 32, ... samples; the rest of `time` is left."""
-    sizes = PassSizes(SQUARE // 2, time=time, in_parts=True, **limits)
+    sizes = TimedSizes(SQUARE // 2, time, in_parts=True, **limits)
     costs = [(4 * 2**index, cost) for index, cost in enumerate(growth)]
     statistics = {"seconds": {Stage.TRACED: 0.3}} | ({"growth": costs} if costs else {})
     first = Pass(0, sizes.next([], 0.0), 0.4 + (compiled or 0), statistics, compiled)
@@ -273,7 +293,7 @@ def test_in_parts_costs_may_be_predicted_for_several_sizes():
 
 def test_in_parts_samples_after_a_probe_are_expected_to_cost_more():
     """Samples of pixels with different numbers cost 8% more."""
-    sizes, passes, elapsed = PassSizes(SQUARE // 2, time=10, in_parts=True, probes=True), [], 0.0
+    sizes, passes, elapsed = TimedSizes(SQUARE // 2, 10, in_parts=True, probes=True), [], 0.0
     while not isinstance(spp := sizes.next(passes, elapsed), str):
         traced = (0.05 if len(passes) < 2 else 0.054) * spp
         passes.append(Pass(0, spp, 0.1 + traced, {"seconds": {Stage.TRACED: traced, Stage.CUTS: 0.0}}, 0.0))
@@ -290,7 +310,7 @@ def test_in_parts_time_for_kernels_is_left_if_the_first_pass_compiled_or_was_not
 @pytest.mark.parametrize("in_parts", [False, True])
 def test_a_pass_of_a_given_size_begins_if_half_of_it_fits(in_parts):
     for time, size in ((8, 8), (6, "time")):
-        sizes = PassSizes(SQUARE, time=time, fixed=8, in_parts=in_parts)
+        sizes = TimedSizes(SQUARE, time, fixed=8, in_parts=in_parts)
         assert sizes.next([], 0.0) == 8
         first = Pass(0, 8, 4.5, {"seconds": {Stage.TRACED: 4.0}} if in_parts else {})
         assert sizes.next([first], 4.5) == size

@@ -7,8 +7,9 @@ import pytest
 import manylights
 from comparison import fine_film, rendering, single_pass
 from comparison.checkpoint import Checkpoint
-from comparison.pass_sizes import PASS_SECONDS, PROBE, PassSizes
+from comparison.pass_sizes import PROBE
 from comparison.sample_density import LEAST_SAMPLES, SampleDensity
+from comparison.timed_sizes import PASS_SECONDS, TimedSizes
 from tests.comparison.test_pass_sizes import render as made_up_passes
 from tests.support.scenes import area_light, closed_box, cornell
 from tests.support.statistics import assert_same_mean
@@ -278,7 +279,7 @@ def test_given_sizes_of_passes_are_kept():
 
 
 def test_passes_that_cost_more_than_expected_end_by_the_limit():
-    sizes, passes, elapsed = PassSizes(256 * 128, time=10, in_parts=True, probes=True), [], 0.0
+    sizes, passes, elapsed = TimedSizes(256 * 128, 10, in_parts=True, probes=True), [], 0.0
     while not isinstance(spp := sizes.next(passes, elapsed), str):
         # Virtual lights from 24 samples on, whose cost is 1.2 times the predicted one
         seconds = 0.05 + 0.04 * spp * (1.8 if spp >= 24 else 1)
