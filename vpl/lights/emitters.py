@@ -168,6 +168,40 @@ def registered_shapes(scene) -> list:
     return [(int(index), shape) for index, shape in zip(registry, scene.shapes(), strict=True)]
 
 
+def instances(scene) -> list:
+    """(Registry index, shape) of the instances of shape groups."""
+    return [row for row in registered_shapes(scene) if row[1].class_name() == "Instance"]
+
+
+def nested_shapes(scene) -> list:
+    """(Registry index, shape) of every shape of the shape groups, which rays report in place of instances."""
+    groups = [shape for shape in _children(scene) if shape.class_name().startswith("ShapeGroup")]
+    return [(_registry_index(shape), shape) for group in groups for shape in _children(group)]
+
+
+def shapes_of_hits(scene) -> list:
+    """(Registry index, shape) of every shape that surface interactions have."""
+    return [row for row in registered_shapes(scene) if row[1].class_name() != "Instance"] + nested_shapes(scene)
+
+
+def _children(parent) -> list:
+    """Shapes that a Mitsuba object holds directly.  A scene does not list those of its groups."""
+    found = []
+
+    # Needs a variant, which is not set yet where the module is imported
+    class Callback(mi.TraversalCallback):
+        def put(self, name, value, flags, cpptype=None):
+            if isinstance(value, mi.Shape):
+                found.append(value)
+
+    parent.traverse(Callback())
+    return found
+
+
+def _registry_index(shape) -> int:
+    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+
+
 def _can_be_sampled(shape) -> bool:
     return shape.is_mesh() or shape.class_name() in SAMPLED_SHAPES
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..core.arrays import channel_mean, finite_or_zero
 from ..core.registry import RegistryTable
-from .emitters import registered_shapes
+from .emitters import shapes_of_hits
 
 # Class names in Mitsuba's printed form
 _MAPS = ("BumpMap[", "NormalMap[")
@@ -30,33 +30,27 @@ _DIFFUSE_DENSITY = 1.001 / np.pi
 
 def perturbed_shapes(scene) -> tuple[int, ...]:
     """Registry indices of the shapes with a bump or normal map."""
-    return tuple(index for index, shape in registered_shapes(scene) if any(name in str(shape.bsdf()) for name in _MAPS))
+    return tuple(index for index, shape in shapes_of_hits(scene) if any(name in str(shape.bsdf()) for name in _MAPS))
 
 
 @dataclass(init=False)
 class Perturbed:
-    """Shapes with a bump or normal map.
+    """Shapes with a bump or normal map; ``exist``: whether the scene has any.
 
-    ``exist``: whether the scene has any; ``everywhere``: whether every surface counts as perturbed, because shapes
-    inside shape groups cannot be distinguished.  A dataclass, because Dr.Jit's frozen functions require one.
+    A dataclass, because Dr.Jit's frozen functions require one.
     """
 
     exist: bool
-    everywhere: bool
     _table: RegistryTable | None
 
     def __init__(self, scene):
         shapes = perturbed_shapes(scene)
-        groups = (shape for shape in scene.shapes() if shape.class_name() in ("Instance", "ShapeGroup"))
-        self.everywhere = any(name in str(shape) for shape in groups for name in _MAPS)
-        self.exist = self.everywhere or len(shapes) > 0
+        self.exist = len(shapes) > 0
         self._table = RegistryTable(shapes, 1) if shapes else None
 
     def at(self, si, active):
         """Whether ``si`` lies on a shape with a bump or normal map."""
-        if self.everywhere or self._table is None:
-            return mi.Bool(self.everywhere)
-        return self._table.at(si.shape, active) == 1
+        return self._table.at(si.shape, active) == 1 if self.exist else mi.Bool(False)
 
 
 @dataclass

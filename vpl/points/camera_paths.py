@@ -17,7 +17,7 @@ from ..core.arrays import add_at, channel_mean, download, finite_or_zero, ones, 
 from ..core.morton import morton_order
 from ..core.registry import RegistryTable
 from ..core.sampling import derived_seed, independent_sampler
-from ..lights.emitters import Emitters, registered_shapes
+from ..lights.emitters import Emitters, instances, nested_shapes, shapes_of_hits
 from ..lights.perturbed import perturbed_shapes
 
 # Least probability of the delta and of the smooth lobes, unless their reflectance is zero
@@ -32,10 +32,10 @@ class SceneTraits:
 
     ``delta``, ``null``, ``smooth``, ``glossy``, ``transmissive``: whether any BSDF has such a lobe; ``perturbed``:
     registry indices of shapes with bump or normal maps; ``open_shapes``: registry indices of shapes that transmit light
-    unscattered, None for every shape; ``open_scene``: a scene of the open shapes alone, None if ``open_shapes`` is None
-    or empty, and on CUDA, where a kernel can trace rays in one scene only; ``nearest_hits``: whether a shadow ray
-    searches its nearest hit, as a path does.  On spheres of more than some hundred units, Mitsuba's test for any hit
-    reports the surface at the origin of a ray more often.
+    unscattered, and of every instance if a group has such a shape; ``open_scene``: a scene of the open shapes alone,
+    None if there are none, if a group has one, and on CUDA, where a kernel can trace rays in one scene only;
+    ``nearest_hits``: whether a shadow ray searches its nearest hit, as a path does.  On spheres of more than some
+    hundred units, Mitsuba's test for any hit reports the surface at the origin of a ray more often.
     """
 
     delta: bool
@@ -44,13 +44,16 @@ class SceneTraits:
     glossy: bool
     transmissive: bool
     perturbed: tuple[int, ...]
-    open_shapes: tuple[int, ...] | None
+    open_shapes: tuple[int, ...]
     open_scene: mi.Scene | None
     nearest_hits: bool = False
 
-    def is_null(self, shape):
-        """Whether shapes (a pointer array) may transmit light unscattered."""
-        return mi.Bool(True) if self.open_shapes is None else shape_in(shape, self.open_shapes)
+    def is_null(self, hit):
+        """Whether the shapes of preliminary intersections may transmit light unscattered.
+
+        In an instance, these do not tell the shape of the group.
+        """
+        return shape_in(hit.shape, self.open_shapes) | shape_in(hit.instance, self.open_shapes)
 
 
 def shape_in(shape, indices: tuple[int, ...]):
@@ -99,15 +102,13 @@ class CameraPaths:
 
 
 def scene_traits(scene) -> SceneTraits:
-    """Union of the flags of a scene's BSDFs; scenes with instances have every flag, because Mitsuba hides theirs."""
-    flags, open_shapes, instances = 0, {}, False
-    for index, shape in registered_shapes(scene):
-        bsdf = shape.bsdf()
-        if bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null):
+    """Union of the flags of a scene's BSDFs."""
+    flags, open_shapes = 0, {}
+    for index, shape in shapes_of_hits(scene):
+        found = int(shape.bsdf().flags())
+        if found & int(mi.BSDFFlags.Null):
             open_shapes[index] = shape
-        flags |= int(bsdf.flags()) if bsdf is not None else ~0
-        if shape.class_name() in ("Instance", "ShapeGroup"):
-            flags, instances = ~0, True
+        flags |= found
 
     def have(flag):
         return bool(flags & int(flag))
@@ -115,9 +116,12 @@ def scene_traits(scene) -> SceneTraits:
     kinds = mi.BSDFFlags
     transmissive = have(int(kinds.DiffuseTransmission) | int(kinds.GlossyTransmission))
     lobes = (have(kind) for kind in (kinds.Delta, kinds.Null, kinds.Smooth, kinds.Glossy))
-    listed, open_scene = None if instances else tuple(open_shapes), None
-    if listed and dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
-        open_scene = mi.load_dict({"type": "scene", **{f"open_{index}": open_shapes[index] for index in listed}})
+    open_instances, open_scene = [], None
+    if open_shapes.keys() & dict(nested_shapes(scene)).keys():
+        open_instances = [index for index, _ in instances(scene)]
+    elif open_shapes and dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
+        open_scene = mi.load_dict({"type": "scene", **{f"open_{index}": one for index, one in open_shapes.items()}})
+    listed = *open_shapes, *open_instances
     return SceneTraits(*lobes, transmissive, perturbed_shapes(scene), listed, open_scene)
 
 

@@ -120,8 +120,6 @@ def _refusal(view: View, virtual_lights: bool) -> str:
     """Reason against virtual lights, independent of the pilot; an empty string if lights are possible."""
     if not virtual_lights:
         return "virtual_lights is off"
-    if view.perturbed.everywhere:
-        return "bump or normal maps are in shape groups"
     if view.rules.max_depth <= 2 and not _may_carry_emitters(view):
         return "no light is indirect at this max_depth"
     return ""

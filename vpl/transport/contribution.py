@@ -92,7 +92,7 @@ def _through_null_surfaces(scene, traits, ray, most, active):
     while dr.hint(active, exclude=[traits]):
         hit = scene.ray_intersect_preliminary(ray, active=active)
         # Surfaces are usually opaque: only the remaining surfaces need a full intersection record
-        crossed = active & hit.is_valid() & (left > 0) & traits.is_null(hit.shape)
+        crossed = active & hit.is_valid() & (left > 0) & traits.is_null(hit)
         passed = dr.select(active & hit.is_valid() & ~crossed, 0, passed)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, crossed)
         share = finite_or_zero(mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, crossed)))

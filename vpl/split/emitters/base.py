@@ -20,16 +20,6 @@ from ..contributions import Contributions
 from ..emitter_lights import EmitterLights
 
 
-def shadow_traits(scene) -> SceneTraits:
-    """Traits of a scene for shadow rays to emitters, which pass null surfaces only where these are known.
-
-    Mitsuba hides the materials of instances.  If every surface might transmit light, every blocked ray would look up
-    the material of what blocks it.  Paths find all light through null surfaces there, as in ``path``.
-    """
-    traits = scene_traits(scene)
-    return replace(traits, null=bool(traits.open_shapes))
-
-
 @dataclass
 class EmitterSample:
     """Sampled directions to emitters, one per lane.
@@ -126,7 +116,7 @@ class UniformEmitters:
     lights, learns_sky = None, False
 
     def __init__(self, scene, groups: EmitterGroups | None = None):
-        self._scene, self.groups, self.traits = scene, groups, shadow_traits(scene)
+        self._scene, self.groups, self.traits = scene, groups, scene_traits(scene)
         emitters = scene.emitters()
         self._group = dr.opaque(mi.UInt32, groups.number(emitters[0]) if groups and emitters else 0)
 

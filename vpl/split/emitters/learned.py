@@ -18,8 +18,8 @@ from ...core.arrays import download, finite_or_zero, upload
 from ...core.registry import RegistryTable
 from ...direct.environment_regions import regions_of
 from ...lights.emitter_groups import EmitterGroups
-from ...points.camera_paths import SceneTraits
-from .base import EmitterSample, MetEmitter, irradiance_from_emitters, shadow_traits
+from ...points.camera_paths import SceneTraits, scene_traits
+from .base import EmitterSample, MetEmitter, irradiance_from_emitters
 from .cell_choice import CellChoice
 
 # Regions of the environment; columns of the radiance table for building regions
@@ -80,7 +80,7 @@ class LearnedEmitters(CellEmitters):
     def __init__(self, scene, groups: EmitterGroups | None = None):
         order = _reproducible_order(scene.emitters())
         emitters = [scene.emitters()[number] for number in order]
-        self._scene, self._count, self.groups, self.traits = scene, len(emitters), groups, shadow_traits(scene)
+        self._scene, self._count, self.groups, self.traits = scene, len(emitters), groups, scene_traits(scene)
         self._emitters = dr.gather(mi.EmitterPtr, scene.emitters_dr(), upload(mi.UInt32, order))
         dr.eval(self._emitters)
         # Emitters with a weight of 0 are never sampled, as in Mitsuba

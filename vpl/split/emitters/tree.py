@@ -18,9 +18,9 @@ from ...lights.emitters import Emitters, registered_shapes
 from ...lights.light_set import largest_below, moments_below
 from ...lights.light_tree import BOX_MAX, BOX_MIN, INTENSITY, build_light_tree
 from ...lights.virtual_lights import DeviceLights, VirtualLights, spot_falloff
-from ...points.camera_paths import emitted_towards
+from ...points.camera_paths import emitted_towards, scene_traits
 from ..emitter_lights import EmitterLights, has_true_normals
-from .base import EmitterSample, MetEmitter, shadow_traits
+from .base import EmitterSample, MetEmitter
 from .cell_choice import CellChoice
 from .learned import CellEmitters
 
@@ -161,7 +161,7 @@ class TreeEmitters(CellEmitters):
 
     def __init__(self, scene, emitters: Emitters, rays: int, groups: EmitterGroups | None = None):
         self._scene, self._emitters, self._environment = scene, emitters, emitters.environment
-        self.traits = shadow_traits(scene)
+        self.traits = scene_traits(scene)
         self.groups = groups
         omni = VirtualLights.concatenate([emitters.points, emitters.spots])
         # A single kernel for both: the cone of a point emitter holds every direction
