@@ -23,7 +23,7 @@ SAMPLES = (16, 64, 256)
 # Groups of stages in the table
 GROUPS = {
     "start_seconds": (Stage.SCENE, Stage.PILOT, Stage.LIGHTS, Stage.TREE),
-    "traced_seconds": (Stage.TRACED,),
+    "traced_seconds": (Stage.RECORDED, Stage.TRACED),
     "gathered_seconds": (Stage.CLUSTERS, Stage.CUTS),
 }
 

@@ -13,7 +13,8 @@ from .stages import Stage, tell
 class Clock:
     """Seconds by stage; the first stage begins at once.
 
-    A stage ends when the next one begins or the clock is stopped, and the device has finished.  A listener
+    A stage ends when the next one begins or the clock is stopped, and the device has finished, unless it is handed
+    over: the device then works for the next stage.  A listener
     (:func:`vpl.core.stages.listening`) is told of each stage.  Within
     :func:`vpl.core.compilation.compilation_measured`, the compilation of kernels is a stage of its own.
     """
@@ -21,6 +22,8 @@ class Clock:
     def __init__(self, stage: Stage):
         self.seconds: dict[str, float] = {}
         self._stage: Stage | None = None
+        # (Stage, seconds) of stages that were handed over: reading compile times waits for the device
+        self._handed: list[tuple[Stage, float]] = []
         self.begin(stage)
 
     def begin(self, stage: Stage) -> None:
@@ -29,15 +32,25 @@ class Clock:
         tell(stage)
         self._stage, self._start = stage, perf_counter()
 
+    def hand_over(self, stage: Stage) -> None:
+        """End the current stage, and let another one begin with the kernels that the device is running."""
+        self._handed.append((self._stage, perf_counter() - self._start))
+        self._stage = None
+        self.begin(stage)
+
     def stop(self) -> None:
         """End the current stage."""
-        if self._stage is not None:
-            dr.sync_thread()
-            spent = perf_counter() - self._start
-            # Less than the stage: other threads may compile at the same time
-            compiled = min(compiled_since_last(), spent)
-            self.add({self._stage: spent - compiled} | ({Stage.COMPILE: compiled} if compiled else {}))
-            self._stage = None
+        if self._stage is None:
+            return
+        dr.sync_thread()
+        ended = [*self._handed, (self._stage, perf_counter() - self._start)]
+        left = compiled_since_last()
+        for stage, spent in ended:
+            # Less than the stages: other threads may compile at the same time
+            compiled = min(left, spent)
+            left -= compiled
+            self.add({stage: spent - compiled} | ({Stage.COMPILE: compiled} if compiled else {}))
+        self._stage, self._handed = None, []
 
     def add(self, seconds: dict[str, float]) -> None:
         """Add times of stages that were measured elsewhere."""

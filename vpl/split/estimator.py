@@ -192,8 +192,9 @@ def _traced_part(
     sums: LayerSums | None, clock: Clock,
 ) -> tuple[Traced, LitVertices | None]:  # fmt: skip
     """(Traced part of the camera rays ``lane`` of a part of the image; gather vertices that are lit)."""
-    clock.begin(Stage.TRACED)
+    clock.begin(Stage.RECORDED)
     traced = trace_camera_rays(view, lane, settings, Stream.IMAGE, part.first, sums=sums, goes_on=True)
+    clock.hand_over(Stage.TRACED)
     if not lights.all:
         return traced, None
     clock.begin(Stage.CLUSTERS)

@@ -1,6 +1,7 @@
 """The time of compilation: measured apart from the stages of a render, and only on request."""
 
 from concurrent.futures import ThreadPoolExecutor
+from time import sleep
 
 import drjit as dr
 import mitsuba as mi
@@ -58,6 +59,18 @@ def test_a_clock_tells_compilation_apart_from_the_stage(number):
     launch(number + 1)
     clock.stop()
     assert list(clock.seconds) == [Stage.TRACED]
+
+
+def test_a_stage_that_is_handed_over_includes_compilation_but_not_the_work_of_the_device(number):
+    with compilation_measured() as compilation:
+        clock = Clock(Stage.RECORDED)
+        launch(number)
+        clock.hand_over(Stage.TRACED)
+        sleep(0.05)
+        clock.stop()
+    assert clock.seconds[Stage.COMPILE] == compilation.seconds > 0.001
+    assert list(clock.seconds) == [Stage.RECORDED, Stage.COMPILE, Stage.TRACED]
+    assert clock.seconds[Stage.RECORDED] < 0.05 <= clock.seconds[Stage.TRACED]
 
 
 def test_the_history_of_a_caller_is_left_alone(number):
