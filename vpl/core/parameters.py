@@ -46,6 +46,11 @@ def parameters_of(node, below: bool = True) -> Parameters:
     return found
 
 
+def children_of(node, kind: type) -> list:
+    """Objects of a class directly below an object."""
+    return [value for _, value, _ in _members(node) if isinstance(value, kind)]
+
+
 def matrix_of(transform, columns: Sequence[int] = range(4)) -> np.ndarray:
     """Matrix of a transformation of one lane, or some of its columns, (4, columns) float64."""
     # Reading a number takes a microsecond, which counts for thousands of emitters
@@ -71,8 +76,7 @@ def fingerprint(nodes) -> str:
 
 def fingerprint_without_camera(scene) -> str:
     """Hash (hexadecimal) of a scene without the sensors and the integrator."""
-    objects = (value for _, value, _ in _members(scene) if isinstance(value, mi.Object))
-    return fingerprint(one for one in objects if not isinstance(one, mi.Sensor | mi.Integrator))
+    return fingerprint(one for one in children_of(scene, mi.Object) if not isinstance(one, mi.Sensor | mi.Integrator))
 
 
 def _digest(node, known: dict) -> bytes:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..core.arrays import LARGEST_VALUE, download, finite_or_zero, rgb_to_spectrum, upload, usable
 from ..core.compilation import unrecorded
-from ..core.parameters import matrix_of, numbers, parameters_of
+from ..core.parameters import children_of, matrix_of, numbers, parameters_of
 from ..core.registry import RegistryTable
 from .spheres import SphereRows
 from .virtual_lights import VirtualLights
@@ -175,27 +175,14 @@ def instances(scene) -> list:
 
 def nested_shapes(scene) -> list:
     """(Registry index, shape) of every shape of the shape groups, which rays report in place of instances."""
-    groups = [shape for shape in _children(scene) if shape.class_name().startswith("ShapeGroup")]
-    return [(_registry_index(shape), shape) for group in groups for shape in _children(group)]
+    # A scene does not list its groups
+    groups = [shape for shape in children_of(scene, mi.Shape) if shape.class_name().startswith("ShapeGroup")]
+    return [(_registry_index(shape), shape) for group in groups for shape in children_of(group, mi.Shape)]
 
 
 def shapes_of_hits(scene) -> list:
     """(Registry index, shape) of every shape that surface interactions have."""
     return [row for row in registered_shapes(scene) if row[1].class_name() != "Instance"] + nested_shapes(scene)
-
-
-def _children(parent) -> list:
-    """Shapes that a Mitsuba object holds directly.  A scene does not list those of its groups."""
-    found = []
-
-    # Needs a variant, which is not set yet where the module is imported
-    class Callback(mi.TraversalCallback):
-        def put(self, name, value, flags, cpptype=None):
-            if isinstance(value, mi.Shape):
-                found.append(value)
-
-    parent.traverse(Callback())
-    return found
 
 
 def _registry_index(shape) -> int:
