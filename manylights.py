@@ -9,11 +9,11 @@ scene with another integrator, or with a participating medium, keeps its integra
 Variants that the integrator does not support are refused.
 
 The first limit that is reached ends an image: --spp samples per pixel, --time seconds, or a relative standard error of
-at most --error in 95% of the pixels. The command prints the limit, and warns if an --error was not reached. Passes take
-about two seconds, or about ten if starting a pass is slow. Their average is written about every ten seconds, at the
-end, and after Ctrl-C. The first pass has the seed --seed, pass k a hash of the seed and k. An EXR file has all
-channels, and metadata about the render; a PNG file is tone-mapped. With --denoise, FILE.exr is joined by
-FILE.denoised.exr, and a PNG file shows the denoised image.
+at most --error in 95% of the pixels. The command prints the limit, and warns if an --error was not reached. With
+--time, passes take about two seconds, or about ten if starting a pass is slow. The average of the passes is written
+about every ten seconds, at the end, and after Ctrl-C. The first pass has the seed --seed, pass k a hash of the seed and
+k. An EXR file has all channels, and metadata about the render; a PNG file is tone-mapped. With --denoise, FILE.exr is
+joined by FILE.denoised.exr, and a PNG file shows the denoised image.
 
 --workers renders passes on several processes or machines (docs/cluster.md). Several scenes, --frames with {frame} in
 the values of -D, and --sensor all make several images in turn; a failure is reported and does not stop the rest.
@@ -124,8 +124,8 @@ def parse(arguments):
              "'lamps=lamp*,bulb; sky=env' (manylights only)")  # fmt: skip
     add("-s", "--seed", type=command_line.seed, default=0, metavar="N", help="seed (default: 0)")
     add("--pass-spp", type=positive(int), metavar="N",
-        help="samples per pixel of a pass (default: for passes of two to ten seconds; with --workers, by the size of "
-             "the image)")  # fmt: skip
+        help="samples per pixel of a pass (default: by the size of the image; with --time, for passes of two to ten "
+             "seconds)")  # fmt: skip
     add("--workers", type=workers, metavar="N|ADDRESS",
         help="render passes on N local processes, or on the workers of a Dask scheduler such as tcp://HOST:8786 (pip "
              "install 'manylights[cluster]'; docs/cluster.md)")  # fmt: skip

@@ -1,11 +1,11 @@
 """Samples per pixel of the next pass of a render.
 
-Without a limit of time the sizes follow from the numbers of pixels and samples alone, so that equal seeds make equal
-images on any machine. The first pass is small, so that an image appears soon. Later passes in parts, which can be
-stopped between parts, are as large as memory allows: large passes are the most efficient, as virtual lights pay only
-from a certain size, and samples are stratified within a pass. Other passes have as many samples as all passes before
-them, so that a render never waits for a pass for much longer than it has run. Renders that end by error have at least
-eight passes of similar sizes. With a limit of time the speed of the machine counts as well (timed_sizes.py).
+Without a limit of time the sizes follow from the numbers of pixels and samples alone, so that the image does not depend
+on the speed of the machine. The first pass is small, so that an image appears soon. Later passes in parts, which can be
+stopped between parts, have the largest size: large passes are the most efficient, as virtual lights pay only from a
+certain size, and samples are stratified within a pass. Later passes that are not in parts have as many samples as all
+passes before them, so that they take about as long as the render so far. Renders that end by error have at least eight
+passes of similar sizes. With a limit of time the speed of the machine counts as well (timed_sizes.py).
 
 In images that will be denoised, the second pass may determine the samples of the pixels in later passes, if some 60
 samples or more are expected in all. It is then small, because its own pixels have equal numbers.
@@ -50,9 +50,9 @@ class PassSizes:
         self._largest = max(power_of_two(largest_pass(pixels, in_parts)), least)
         self._least = max(USUAL if USUAL * pixels <= FIRST_SAMPLES else 1, least)
 
-    def next(self, passes, elapsed=0.0):
-        """Return the samples per pixel of the pass after `passes` (list of `Pass`) and `elapsed` seconds, or the limit
-        that ends the render: "spp" or "time"."""
+    def next(self, passes, elapsed):
+        """Return the samples per pixel of the pass after `passes` (list of `Pass`) and `elapsed` seconds, or "spp" if
+        this limit ends the render."""
         done = sum(one.spp for one in passes)
         if self._spp is not None and done >= self._spp:
             return "spp"
@@ -62,7 +62,7 @@ class PassSizes:
             # Too few for the halves of a pass: a pass of the usual size
             self.is_probe = False
             size = self._size(passes, done, elapsed)
-        return (size - size % self._multiple if self.is_probe else size) or "time"
+        return size - size % self._multiple if self.is_probe else size
 
     def _expected_samples(self, done, elapsed):
         """Return the expected samples per pixel of the render, of which `done` are rendered."""
@@ -78,8 +78,8 @@ class PassSizes:
         if self._fixed or not done:
             return self._fixed or self._least
         if self._any_size:
-            return self._largest
-        return min(max(self._least, power_of_two(done / PARTS if self._many else done)), self._largest)
+            return self._kept(self._largest)
+        return min(power_of_two(max(done / PARTS if self._many else done, USUAL)), self._largest)
 
     def _of_the_rest(self, size, left):
         """Return the size of the next pass, about `size` samples, with `left` samples until the limit."""
@@ -88,8 +88,8 @@ class PassSizes:
         if self._any_size and left < 2 * size and left <= self._largest:
             return self._kept(left) if self._probes else left
         if self._any_size and size < left < 2 * size:
-            # No small pass at the end
-            return self._kept(-(-left // 2))
+            # No small pass at the end, if the sampler keeps a half
+            return next(filter(self._accepts, range(-(-left // 2), size)), size)
         return min(size, left if self._fixed or left < USUAL else power_of_two(left))
 
     def _kept(self, size):

@@ -116,13 +116,18 @@ class Progressive(Passes):
         continued = None if density is None else self._continued(sensor)
         image = render_pass(
             self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density=density, half=half,
-            parts=self.parts, continued=continued,
+            parts=self.parts, continued=continued, measures=self._may_compile,
         )  # fmt: skip
         if not accept():
             return None
         if half:
             self.density.learn(*(self.merged(one) for one in (image.planes, image.half)), image.channels)
         return self.add(image)
+
+    @property
+    def _may_compile(self):
+        """Whether the next pass may compile much: it is the first one, or the pass before it compiled kernels."""
+        return not self.passes or bool(self.passes[-1].compile_seconds)
 
     def _continued(self, sensor):
         """Return the passes so far whose lattices a pass with different numbers of samples continues."""

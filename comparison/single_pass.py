@@ -104,23 +104,24 @@ class PassImage:
 
 def render_pass(
     scene, sensor, integrator, spp, seed, first=None, shared=None, density=None, half=False, parts=1,
-    continued=None,
+    continued=None, measures=None,
 ):  # fmt: skip
     """Render a pass of `spp` samples per pixel, which stratified samplers round up; return a `PassImage`.
 
-    `sensor`: an index. `first`: (samples per pixel, seed) of the first pass of the render, by default this pass, which
-    then measures compilation; the start that passes of `manylights` share depends on it. `shared`: the `SharedStart` of
-    the render. `density`, `half`, `continued`: samples of each pixel over `spp`, whether to return an image of every
-    second sample, and earlier samples; see `PassRenderer.pass_of`. `parts`: the image is that of a fine film
-    (fine_film.py), whose pixels have equal numbers of samples, so that `spp` is rounded up.
+    `sensor`: an index. `first`: (samples per pixel, seed) of the first pass of the render, by default this pass; the
+    start that passes of `manylights` share depends on it. `shared`: the `SharedStart` of the render. `density`, `half`,
+    `continued`: samples of each pixel over `spp`, whether to return an image of every second sample, and earlier
+    samples; see `PassRenderer.pass_of`. `parts`: the image is that of a fine film (fine_film.py), whose pixels have
+    equal numbers of samples, so that `spp` is rounded up. `measures`: whether to measure compilation, which takes time;
+    by default in a first pass.
     """
     sensor, begin = scene.sensors()[sensor], time.perf_counter()
     shared = shared or SharedStart()
     with fine_film(sensor, parts):
         samples = {"density": density, "half": half, "continued": continued}
         sharing = _sharing(scene, sensor, integrator, (spp, seed), first or (spp, seed), shared, parts, samples)
-        # Later passes compile little, and measuring takes time
-        with compilation_measured() if first is None else nullcontext() as compilation, sharing:
+        measures = first is None if measures is None else measures
+        with compilation_measured() if measures else nullcontext() as compilation, sharing:
             spp = _render(scene, sensor, integrator, spp, seed, parts)
         seconds = time.perf_counter() - begin
         # The film, as the image of `mi.render` lacks names, and channels of nested integrators

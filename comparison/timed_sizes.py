@@ -61,7 +61,7 @@ class TimedSizes(PassSizes):
         self._before = None  # number of passes from a checkpoint; None until the first call
 
     def next(self, passes, elapsed):
-        """See `PassSizes.next`."""
+        """See `PassSizes.next`; "time" if the time ends the render."""
         if self._before is None:
             self._before = len(passes)
             self._asked = passes[-1].spp if passes else None
@@ -69,7 +69,7 @@ class TimedSizes(PassSizes):
             self._learn(passes[-1], sum(one.spp for one in passes), is_first=len(passes) == self._before + 1)
         self._dearer = DIFFERENT if self.is_probe else 1.0
         self._asked = super().next(passes, elapsed)
-        return self._asked
+        return self._asked or "time"
 
     def _expected_samples(self, done, elapsed):
         """See `PassSizes`: a low estimate where time ends the render and later passes may have virtual lights."""

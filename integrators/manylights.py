@@ -128,7 +128,7 @@ class ManyLightsIntegrator(PassRenderer):
     - Light through masks and thin glass: shadow rays to area emitters and environments pass these surfaces, as far as
       ``max_depth`` allows, and multiple importance sampling combines them with the paths that find the same light.
       Where such light is rare, shadow rays take up to a tenth more time for little.  Light through other glass,
-      from points and in single directions is found as in ``path``.
+      and light from points and in single directions, is found as in ``path``.
     - Masks: the image is that of ``prb``.  ``path`` (Mitsuba 3.9.1) shows black for samples whose path ends after it
       passed only masks, so it is too dark where nothing is behind a mask.  With ``hide_emitters``, ``path`` hides an
       environment behind a mask, which ``manylights`` shows.  Alpha is that of ``path``.

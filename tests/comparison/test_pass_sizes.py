@@ -16,7 +16,7 @@ SQUARE = 256 * 256
 def render(pixels, start, each, compilation=3.0, more=None, slow=None, **limits):
     """Passes that take `start` seconds and `each` per sample, three times that from number `slow` on, and once for each
     kernel `compilation`, or `more` but for the first: (passes, why the render ended)."""
-    sizes = (TimedSizes if "time" in limits else PassSizes)(pixels, **limits)
+    sizes = (TimedSizes if limits.get("time") else PassSizes)(pixels, **limits)
     passes, elapsed, kernels = [], 0.0, set()
     while len(passes) < 2000:
         spp = sizes.next(passes, elapsed)
@@ -34,9 +34,9 @@ def render(pixels, start, each, compilation=3.0, more=None, slow=None, **limits)
 
 
 @pytest.mark.parametrize("spp", [*range(1, 20), 64, 100, 1023])
-@pytest.mark.parametrize("each", [0.001, 0.3, 40.0])
-def test_samples_are_those_that_were_asked_for(spp, each):
-    passes, ended_by = render(SQUARE, 0.1, each, spp=spp)
+@pytest.mark.parametrize("limits, each", [({}, 1.0), ({"time": 1e9}, 0.001), ({"time": 1e9}, 40.0)])
+def test_samples_are_those_that_were_asked_for(spp, limits, each):
+    passes, ended_by = render(SQUARE, 0.1, each, spp=spp, **limits)
     assert sum(one.spp for one in passes) == spp and ended_by == "spp"
 
 
@@ -75,11 +75,24 @@ def test_no_pass_has_more_samples_than_all_before_it(spp):
     assert len(passes) <= 2 * math.log2(spp) + spp * SQUARE / MAXIMUM_PASS_SAMPLES
 
 
+@pytest.mark.parametrize("spp, sizes", [(100, [4, 96]), (184, [4, 96, 84]), (180, [4, 88, 88]), (140, [4, 72, 64])])
+def test_in_parts_a_rest_above_the_largest_size_is_halved_if_the_sampler_keeps_halves(spp, sizes):
+    """Pixels have numbers of samples in multiples of 8, and a pass at most 128 samples."""
+    passes, _ = render(4 * MAXIMUM_PASS_SAMPLES // 128, 0.1, 0.1, spp=spp, in_parts=True, accepts=lambda n: n % 8 == 0)
+    assert [one.spp for one in passes] == sizes
+
+
+def test_in_parts_every_size_is_one_that_the_sampler_keeps():
+    kept = [round(n**2) for n in range(1, 40)]
+    passes, ended_by = render(SQUARE, 0.1, 0.1, spp=1000, in_parts=True, accepts=lambda n: n in kept)
+    assert ended_by == "spp" and all(one.spp in kept for one in passes[:-1])
+
+
 def test_large_images_begin_with_one_sample():
     passes, _ = render(1 << 21, 0.1, 0.2, spp=20)
     assert [one.spp for one in passes] == [1] * 20
     passes, _ = render(1 << 19, 0.1, 0.1, compilation=0.1, spp=20)
-    assert [one.spp for one in passes] == [1, 1, 2, 4, 4, 4, 4]
+    assert [one.spp for one in passes] == [1, 4, 4, 4, 4, 3]
 
 
 @pytest.mark.parametrize("start", [0.7, 1.4, 2.4])
@@ -244,6 +257,11 @@ def test_in_parts_measurements_of_a_later_pass_are_not_expected_again():
     one = Pass(0, 8, 1.0, {"seconds": stages, "pilots": 0, "measured": 1})
     assert one.repeated_seconds == pytest.approx(0.7) and one.start_seconds == pytest.approx(0.3)
     assert Pass(0, 8, 1.0, {"seconds": stages, "pilots": 0, "measured": 0}).repeated_seconds == 1.0
+
+
+def test_in_parts_the_time_to_record_belongs_to_the_start():
+    stages = {Stage.RECORDED: 0.1, Stage.TRACED: 0.6, Stage.CUTS: 0.2}
+    assert Pass(0, 8, 1.0, {"seconds": stages}).start_seconds == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("in_parts", [False, True])

@@ -230,14 +230,18 @@ def test_unknown_properties_are_refused():
         mi.load_dict({"type": "lightcuts", "vpl_cuont": 5})
 
 
-def test_a_medium_is_refused_by_name(capfd):
+@pytest.mark.parametrize("of", ["the scene", "a group"])
+def test_a_medium_is_refused_by_name(of, capfd):
     scene = closed_box({"lamp": area_light()})
     scene["fog"] = {
         "type": "sphere", "radius": 0.3, "bsdf": {"type": "null"}, "interior": {"type": "homogeneous", "albedo": 0.5}
     }  # fmt: skip
+    if of == "a group":
+        scene |= {"group": {"type": "shapegroup", "fog": scene.pop("fog")}}
+        scene["instance"] = {"type": "instance", "of": {"type": "ref", "id": "group"}}
     with pytest.raises(RuntimeError) as error:
         render(mi.load_dict(scene), "lightcuts")
-    said = 'shape 0 ("fog", Sphere) bounds a participating medium'
+    said = '("fog", Sphere) bounds a participating medium'
     assert said in str(error.value.__cause__)
     # `mi.render` raises a different error, without the cause
     assert said in "".join(capfd.readouterr())

@@ -1,5 +1,6 @@
 """``manylights`` behind masks and thin glass: shadow rays of emitters pass them, and the mean stays that of ``prb``."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -110,6 +111,25 @@ def test_shadow_rays_pass_instances_of_null_surfaces_alone(material, lights_cost
     scene = mi.load_dict(closed_box({"lamp": area_light()}, 12, group=group, sheet=instance))
     assert emitter_sampler(scene, 100).traits.null == (material is TORN)
     assert_image_of_prb(scene, 5)
+
+
+def test_only_instances_of_groups_with_null_surfaces_are_passed():
+    group = {"type": "shapegroup", "sheet": wall([0, 0, 0], [1, 0, 0], -90, 1.0)}
+    open_group = {"type": "shapegroup", "sheet": wall([0, 0, 0], [1, 0, 0], -90, 1.0, bsdf=TORN)}
+    scene = mi.load_dict({
+        "type": "scene", "one": group, "other": open_group, "own": wall([0, 1, 0], [1, 0, 0], -90, 1.0, bsdf=TORN),
+        "of_one": {"type": "instance", "of": {"type": "ref", "id": "one"}},
+        "of_other": {"type": "instance", "of": {"type": "ref", "id": "other"}},
+    })  # fmt: skip
+    traits, instances = scene_traits(scene), {shape.id(): shape for shape in scene.shapes()}
+
+    def is_listed(shape):
+        return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) in traits.open_shapes
+
+    assert traits.null and not traits.glossy
+    assert [is_listed(instances[name]) for name in ("of_one", "of_other", "own")] == [False, True, True]
+    # The scene's own sheet, that of the open group, and its instance
+    assert len(traits.open_shapes) == 3
 
 
 @pytest.mark.parametrize("material", ["mask", "thindielectric"])

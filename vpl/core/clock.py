@@ -13,8 +13,8 @@ from .stages import Stage, tell
 class Clock:
     """Seconds by stage; the first stage begins at once.
 
-    A stage ends when the next one begins or the clock is stopped, and the device has finished, unless it is handed
-    over: the device then works for the next stage.  A listener
+    A stage ends when the next one begins or the clock is stopped, and the device has finished.  A stage that is handed
+    over ends at once: the device works for the next stage.  A listener
     (:func:`vpl.core.stages.listening`) is told of each stage.  Within
     :func:`vpl.core.compilation.compilation_measured`, the compilation of kernels is a stage of its own.
     """
@@ -22,7 +22,7 @@ class Clock:
     def __init__(self, stage: Stage):
         self.seconds: dict[str, float] = {}
         self._stage: Stage | None = None
-        # (Stage, seconds) of stages that were handed over: reading compile times waits for the device
+        # (Stage, seconds) of stages that were handed over, with compilation, which only a device at rest tells
         self._handed: list[tuple[Stage, float]] = []
         self.begin(stage)
 

@@ -55,7 +55,7 @@ class Stage(StrEnum):
 
     # ---- The split of `manylights`
     LIGHTS = "lights"  # surface lights find their irradiance
-    RECORDED = "recorded"  # the kernel of paths is put together: as long for few paths as for many
+    RECORDED = "recorded"  # the kernel of paths is put together, for the first part of an image
     TRACED = "traced"  # the remainder that virtual lights do not carry
     CLUSTERS = "clusters"  # gather vertices of pixels are clustered
     CUTS = "cuts"  # their light cuts are chosen, shaded and traced

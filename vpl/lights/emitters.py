@@ -21,6 +21,7 @@ from ..core.registry import RegistryTable
 from .spheres import SphereRows
 from .virtual_lights import VirtualLights
 
+_INSTANCE = "Instance"  # class name of instances of shape groups
 # Shapes, besides meshes, that Mitsuba can sample by area (curves, for example, cannot)
 SAMPLED_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
 # Time to record a call of one shape object, in calls of one shape by pointer
@@ -168,21 +169,36 @@ def registered_shapes(scene) -> list:
     return [(int(index), shape) for index, shape in zip(registry, scene.shapes(), strict=True)]
 
 
-def instances(scene) -> list:
-    """(Registry index, shape) of the instances of shape groups."""
-    return [row for row in registered_shapes(scene) if row[1].class_name() == "Instance"]
+@dataclass(frozen=True)
+class Instanced:
+    """A shape group: (registry index, shape) of its ``shapes``, which surface interactions have in place of those of
+    the group's ``instances``."""
 
+    shapes: list
+    instances: list
 
-def nested_shapes(scene) -> list:
-    """(Registry index, shape) of every shape of the shape groups, which rays report in place of instances."""
-    # A scene does not list its groups
-    groups = [shape for shape in children_of(scene, mi.Shape) if shape.class_name().startswith("ShapeGroup")]
-    return [(_registry_index(shape), shape) for group in groups for shape in children_of(group, mi.Shape)]
+    @classmethod
+    def of(cls, scene) -> list[Instanced]:
+        """Groups of a scene with instances.  Mitsuba 3.9.1 accepts groups as children of a scene only, and lists them
+        nowhere else."""
+        instances = [row for row in registered_shapes(scene) if row[1].class_name() == _INSTANCE]
+        if not instances:
+            return []
+        groups = [shape for shape in children_of(scene, mi.Shape) if shape.class_name().startswith("ShapeGroup")]
+        return [
+            cls(
+                [(_registry_index(shape), shape) for shape in children_of(group, mi.Shape)],
+                # Mitsuba tells the group of an instance in its printed form alone
+                [row for row in instances if f'name = "{group.id()}"' in str(row[1])],
+            )
+            for group in groups
+        ]
 
 
 def shapes_of_hits(scene) -> list:
     """(Registry index, shape) of every shape that surface interactions have."""
-    return [row for row in registered_shapes(scene) if row[1].class_name() != "Instance"] + nested_shapes(scene)
+    nested = [row for group in Instanced.of(scene) for row in group.shapes]
+    return [row for row in registered_shapes(scene) if row[1].class_name() != _INSTANCE] + nested
 
 
 def _registry_index(shape) -> int:

@@ -17,7 +17,7 @@ from ..core.arrays import add_at, channel_mean, download, finite_or_zero, ones, 
 from ..core.morton import morton_order
 from ..core.registry import RegistryTable
 from ..core.sampling import derived_seed, independent_sampler
-from ..lights.emitters import Emitters, instances, nested_shapes, shapes_of_hits
+from ..lights.emitters import Emitters, Instanced, shapes_of_hits
 from ..lights.perturbed import perturbed_shapes
 
 # Least probability of the delta and of the smooth lobes, unless their reflectance is zero
@@ -32,7 +32,7 @@ class SceneTraits:
 
     ``delta``, ``null``, ``smooth``, ``glossy``, ``transmissive``: whether any BSDF has such a lobe; ``perturbed``:
     registry indices of shapes with bump or normal maps; ``open_shapes``: registry indices of shapes that transmit light
-    unscattered, and of every instance if a group has such a shape; ``open_scene``: a scene of the open shapes alone,
+    unscattered, and of instances of groups with such shapes; ``open_scene``: a scene of the open shapes alone,
     None if there are none, if a group has one, and on CUDA, where a kernel can trace rays in one scene only;
     ``nearest_hits``: whether a shadow ray searches its nearest hit, as a path does.  On spheres of more than some
     hundred units, Mitsuba's test for any hit reports the surface at the origin of a ray more often.
@@ -51,9 +51,10 @@ class SceneTraits:
     def is_null(self, hit):
         """Whether the shapes of preliminary intersections may transmit light unscattered.
 
-        In an instance, these do not tell the shape of the group.
+        On the CPU, an intersection with an instance has no shape, so any shape of an open group may have been hit.
         """
-        return shape_in(hit.shape, self.open_shapes) | shape_in(hit.instance, self.open_shapes)
+        table = RegistryTable(self.open_shapes, 1)
+        return (table.at(hit.shape) == 1) | (table.at(hit.instance) == 1)
 
 
 def shape_in(shape, indices: tuple[int, ...]):
@@ -116,10 +117,9 @@ def scene_traits(scene) -> SceneTraits:
     kinds = mi.BSDFFlags
     transmissive = have(int(kinds.DiffuseTransmission) | int(kinds.GlossyTransmission))
     lobes = (have(kind) for kind in (kinds.Delta, kinds.Null, kinds.Smooth, kinds.Glossy))
-    open_instances, open_scene = [], None
-    if open_shapes.keys() & dict(nested_shapes(scene)).keys():
-        open_instances = [index for index, _ in instances(scene)]
-    elif open_shapes and dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
+    open_groups = [one for one in Instanced.of(scene) if any(index in open_shapes for index, _ in one.shapes)]
+    open_instances, open_scene = [index for one in open_groups for index, _ in one.instances], None
+    if open_shapes and not open_groups and dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
         open_scene = mi.load_dict({"type": "scene", **{f"open_{index}": one for index, one in open_shapes.items()}})
     listed = *open_shapes, *open_instances
     return SceneTraits(*lobes, transmissive, perturbed_shapes(scene), listed, open_scene)
@@ -127,7 +127,7 @@ def scene_traits(scene) -> SceneTraits:
 
 def refuse_media(scene) -> None:
     """Raise a ValueError with the name of the first shape that bounds a participating medium."""
-    for number, shape in enumerate(scene.shapes()):
+    for number, (_, shape) in enumerate(shapes_of_hits(scene)):
         if shape.is_medium_transition():
             raise ValueError(
                 f'shape {number} ("{shape.id()}", {shape.class_name()}) bounds a participating medium; '

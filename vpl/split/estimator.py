@@ -192,7 +192,8 @@ def _traced_part(
     sums: LayerSums | None, clock: Clock,
 ) -> tuple[Traced, LitVertices | None]:  # fmt: skip
     """(Traced part of the camera rays ``lane`` of a part of the image; gather vertices that are lit)."""
-    clock.begin(Stage.RECORDED)
+    # The time of the first part alone does not grow with the number of samples
+    clock.begin(Stage.TRACED if part.first else Stage.RECORDED)
     traced = trace_camera_rays(view, lane, settings, Stream.IMAGE, part.first, sums=sums, goes_on=True)
     clock.hand_over(Stage.TRACED)
     if not lights.all:

@@ -10,7 +10,7 @@ from tests.support.scenes import wall
 from vpl.core.arrays import download, upload_vectors
 from vpl.lights.emission import bounding_box
 from vpl.split.arrival_octree import ArrivalOctree
-from vpl.split.line_hits import hits_of
+from vpl.split.line_hits import has_large_curves, hits_of
 from vpl.split.line_sampling import Lines, LineSampler
 
 
@@ -83,3 +83,14 @@ def test_a_line_crosses_a_ball_twice(size):
     length = dr.repeat(mi.Float(3 * size), count)
     lines = Lines(upload_vectors(mi.Point3f, origin), direction, length, -box, 2 * box)
     assert hits_of(scene, lines, 3 * size, 1).count == 2 * count
+
+
+@pytest.mark.parametrize("shape, expected", [({"type": "cube"}, False), ({"type": "sphere"}, True)])
+@pytest.mark.parametrize("grouped", [False, True])
+def test_large_curves_are_no_meshes_in_groups_or_outside(shape, expected, grouped):
+    size = mi.ScalarTransform4f().scale(1e5)
+    scene = {"type": "scene", "shape": {**shape, "to_world": size}}
+    if grouped:
+        instance = {"type": "instance", "of": {"type": "ref", "id": "group"}, "to_world": size}
+        scene = {"type": "scene", "group": {"type": "shapegroup", "shape": shape}, "instance": instance}
+    assert has_large_curves(mi.load_dict(scene)) == expected
