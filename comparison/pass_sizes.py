@@ -3,9 +3,9 @@
 Without a limit of time the sizes follow from the numbers of pixels and samples alone, so that the image does not depend
 on the speed of the machine. The first pass is small, so that an image appears soon. Later passes in parts, which can be
 stopped between parts, have the largest size: large passes are the most efficient, as virtual lights pay only from a
-certain size, and samples are stratified within a pass. Later passes that are not in parts have as many samples as all
-passes before them, so that they take about as long as the render so far. Renders that end by error have at least eight
-passes of similar sizes. With a limit of time the speed of the machine counts as well (timed_sizes.py).
+certain size, and samples are stratified within a pass. Passes that are not in parts double the number of samples, so
+that each takes about as long as all passes before it. Renders that end by error have at least eight passes of similar
+sizes. With a limit of time the speed of the machine counts as well (timed_sizes.py).
 
 In images that will be denoised, the second pass may determine the samples of the pixels in later passes, if some 60
 samples or more are expected in all. It is then small, because its own pixels have equal numbers.
