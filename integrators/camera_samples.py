@@ -75,12 +75,13 @@ class LatticeSampler(mi.Sampler):
     def _begin(self):
         lanes = self.wavefront_size()
         each, lane, self._calls = lanes // self.pixels, dr.arange(mi.UInt32, lanes), 0
-        seed, earlier = self._seed, None
+        seed, earlier, cells = self._seed, None, 1
         if self.cells:
             rays = self.cells.rays
             places, sizes, earlier = rays.places(lane), rays.sizes, rays.earlier
             seed = rays.continued.seed if rays.continued else seed
             in_cells = self.cells.places(lane)
+            cells = rays.cells
             self._in_cells = Lattice(in_cells, self.cells.sizes, seed, self.cells.earlier)
             here = self.cells.position(lane // dr.opaque(mi.UInt32, each))
             self._offset = self.cells.position(in_cells.pixel) - here
@@ -88,7 +89,7 @@ class LatticeSampler(mi.Sampler):
             places, sizes = RayNumbers.of_lanes(lane, each), (self.sample_count(),)
             # The passes of a render share the lattice of a pixel
             places = replace(places, number=places.number + dr.opaque(mi.UInt32, self._pass * each))
-        self._lattice = Lattice(places, sizes, seed, earlier)
+        self._lattice = Lattice(places, sizes, seed, earlier, cells)
 
     def _next(self, lattice: Lattice | None = None):
         self._calls += 1
@@ -191,10 +192,10 @@ def cells_of(
     width, height = (film_size(film) // parts).tolist()
     samples = spp * parts**2
     if density is None:
-        return FilmCells(PixelRays.uniform(width * height, samples), parts, width)
+        return FilmCells(replace(PixelRays.uniform(width * height, samples), cells=parts**2), parts, width)
     if density.shape != (height, width):
         raise ValueError(f"density must have the shape of the image, {(height, width)}, got {density.shape}")
-    return FilmCells(PixelRays.by_density(density, samples, continued), parts, width)
+    return FilmCells(replace(PixelRays.by_density(density, samples, continued), cells=parts**2), parts, width)
 
 
 @contextmanager

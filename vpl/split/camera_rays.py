@@ -21,7 +21,7 @@ class CameraRays:
     """Some camera rays of a view.
 
     ``ray``; ``active``; ``importance`` of radiance, for Russian roulette; ``places`` in pixels; ``sizes``: the
-    different numbers of rays of pixels.
+    different numbers of rays of pixels; ``cells`` of the film in a pixel.
     """
 
     ray: mi.Ray3f
@@ -29,6 +29,7 @@ class CameraRays:
     importance: mi.Float
     places: RayNumbers
     sizes: tuple[int, ...]
+    cells: int
 
     @classmethod
     def of(cls, view: View, lane: mi.UInt32) -> CameraRays:
@@ -38,7 +39,7 @@ class CameraRays:
         # All numbers of rays, and counted and chosen lanes, use the same kernel
         dr.eval(lane, places)
         importance = dr.gather(mi.Float, view.importance, places.pixel)
-        return cls(part, dr.gather(mi.Bool, view.active, lane), importance, places, view.rays.sizes)
+        return cls(part, dr.gather(mi.Bool, view.active, lane), importance, places, view.rays.sizes, view.rays.cells)
 
     def trace(
         self, scene, emitters: EmitterSampler, seed: int, settings: PathSettings, sums: LayerSums | None = None,
@@ -47,7 +48,7 @@ class CameraRays:
         """Trace paths from the camera; ``sums`` by layer; ``lattice``: None for one of these rays alone."""
         edge = FirstEdge.of_camera(self.ray, self.importance, self.active)
         if lattice is None:
-            lattice = Lattice(self.places, self.sizes, derived_seed(seed, 0))
+            lattice = Lattice(self.places, self.sizes, derived_seed(seed, 0), cells=self.cells)
         sampler = independent_sampler(derived_seed(seed, 1), dr.width(self.places.pixel))
         return trace_paths(scene, emitters, edge, lattice, sampler, settings, sums)
 
@@ -62,5 +63,5 @@ def trace_camera_rays(
     if goes_on and view.rays.continued:
         # By the first number of the stream alone: the others are those of parts of the image, which differ in each pass
         shared = derived_seed(view.rays.continued.seed, stream[0])
-        lattice = Lattice(rays.places, rays.sizes, shared, view.rays.earlier)
+        lattice = Lattice(rays.places, rays.sizes, shared, view.rays.earlier, rays.cells)
     return rays.trace(view.scene, view.emitters, seed, settings, sums, lattice)

@@ -13,8 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.loops import recorded_once
-from ..core.sampling import HASH_ROUNDS
-from .pixel_rays import PixelRays, RayNumbers
+from .pixel_rays import PixelRays, RayNumbers, turn_of_cells
 
 # Name of the channels of an image with the mean of every second ray of a cell
 HALF = "every second"
@@ -58,20 +57,16 @@ class FilmCells:
         return self.parts == 1 and not self.rays.differ
 
     def places(self, lane: mi.UInt32) -> RayNumbers:
-        """Places of the rays ``lane`` (UInt32) in cells: ``pixel`` is the cell.
-
-        Successive rays of a pixel belong to different cells, in an order that is random for each pixel and each round.
-        With a regular order, virtual lights of few samples are gathered in a regular pattern, which a denoiser keeps.
-        """
+        """Places of the rays ``lane`` (UInt32) in cells: ``pixel`` is the cell."""
         places = self.rays.places(lane)
         if self.parts == 1:
             return places
         parts, cells = (dr.opaque(mi.UInt32, number) for number in (self.parts, self.parts**2))
-        part = (places.number + _turn(places.pixel, places.number // cells)) % cells
+        part, number = places.in_cells(cells)
         width = dr.opaque(mi.UInt32, self.width)
         row = places.pixel // width * parts + part // parts
         column = places.pixel % width * parts + part % parts
-        return RayNumbers(row * (width * parts) + column, places.number // cells, places.level)
+        return RayNumbers(row * (width * parts) + column, number, places.level)
 
     def position(self, cell: mi.UInt32) -> mi.Point2f:
         """Position of a cell in the film, in cells."""
@@ -142,9 +137,4 @@ def _sums(values, pixel, part, rays, first, cells):
 
 def _number(pixel: mi.UInt32, part: mi.UInt32, turn: mi.UInt32, cells: mi.UInt32) -> mi.UInt32:
     """Number in the pixel of the ray that a cell, ``part`` of ``cells``, gets in round ``turn``."""
-    return turn * cells + (part + cells - _turn(pixel, turn) % cells) % cells
-
-
-def _turn(pixel: mi.UInt32, turn: mi.UInt32) -> mi.UInt32:
-    """Random numbers by which the order of a pixel's cells is rotated, for every round of its rays over the cells."""
-    return mi.sample_tea_32(pixel, turn, HASH_ROUNDS)[0] >> 8
+    return turn * cells + (part + cells - turn_of_cells(pixel, turn) % cells) % cells

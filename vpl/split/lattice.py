@@ -5,6 +5,10 @@ Sloan and Joe 1994, "Lattice Methods for Multiple Integration"].  Each dimension
 an independent random order: with a common order, products of two dimensions would have up to twice the variance of
 independent numbers.  Pixels may have different numbers of samples, see :mod:`vpl.split.pixel_rays`.
 
+Where a pixel has several cells of the film, each cell takes points that are spread as a lattice of their own: a residue
+class of the lattice of the pixel.  Denoisers work on cells, and on the lattice of the pixel alone the points of a cell
+would be a random choice.
+
 Passes of a render may share the lattices of a pixel.  A pass then takes the next points of an extensible lattice: the
 first 2^m points are a lattice for each m [Cools, Kuo and Nuyens 2006, "Constructing embedded lattice rules for
 multivariate integration"], and the samples of all passes are spread like those of one.  Numbers of points that are no
@@ -47,15 +51,22 @@ def _mixed(bits, stream: int):
 
 
 @lru_cache(maxsize=64)
-def lattice_multiplier(count: int) -> int:
+def lattice_multiplier(count: int, cells: int = 1) -> int:
     """Multiplier g of the lattice (i, g i) / ``count`` modulo 1.
 
     Of the candidates nearest to the golden ratio, the one with the least P_2, the worst-case error over smooth periodic
-    functions [Sloan and Joe 1994, section 4.2].
+    functions [Sloan and Joe 1994, section 4.2]; with several ``cells``, the least product of P_2 for the pixel and for
+    a cell.
     """
     candidates = np.arange(1, max(count, 2))
     candidates = candidates[np.gcd(candidates, count) == 1]
     nearest = np.argsort(np.abs(candidates * (1 + 5**0.5) / 2 - count), kind="stable")[:_TRIED]
+    errors = np.prod([_worst_errors(size, candidates[nearest]) for size in {count, count // cells}], axis=0)
+    return int(candidates[nearest][np.argmin(errors)])
+
+
+def _worst_errors(count: int, multipliers: np.ndarray) -> np.ndarray:
+    """P_2 of the lattices with some multipliers."""
     number = np.arange(count)
 
     def kernel(numerator):
@@ -63,34 +74,41 @@ def lattice_multiplier(count: int) -> int:
         return 1 + 2 * np.pi**2 * (x * x - x + 1 / 6)
 
     along = kernel(number)
-    errors = [np.mean(along * kernel(number * g % count)) for g in candidates[nearest]]
-    return int(candidates[nearest][np.argmin(errors)])
+    return np.array([np.mean(along * kernel(number * g % count)) - 1 for g in multipliers.tolist()])
 
 
 @lru_cache(maxsize=16)
-def _orders(count: int) -> np.ndarray:
-    """Random permutations of ``count`` points, in sequence; fixed, like a hash function."""
-    rows = np.tile(np.arange(count, dtype=np.uint32), (max(min(_ORDERS, _ENTRIES // count), 1), 1))
-    return np.random.default_rng(0).permuted(rows, axis=1).reshape(-1)
+def _orders(count: int, cells: int, first_step: int, cell_step: int) -> np.ndarray:
+    """Random orders of ``count`` points, in sequence; fixed, like a hash function.
+
+    An order has the points of one of the ``cells`` after those of another one: its points have numbers in steps of
+    ``first_step``, from a multiple of ``cell_step`` on.
+    """
+    orders, each, random = max(min(_ORDERS, _ENTRIES // count), 1), count // cells, np.random.default_rng(0)
+    points = random.permuted(np.tile(np.arange(each, dtype=np.uint32), (orders * cells, 1)), axis=1)
+    starts = random.permuted(np.tile(np.arange(cells, dtype=np.uint32), (orders, 1)), axis=1)
+    return (points * np.uint32(first_step) + starts.reshape(-1, 1) * np.uint32(cell_step)).reshape(-1)
 
 
 def _fraction(bits):
     return mi.Float(bits >> 8) * 2**-24
 
 
-def _points(sizes: Sequence[int]):
+def _points(sizes: Sequence[int], cells: int):
     """(For each of ``sizes``, points of its lattice in random orders, numbered; steps between the points along both
     dimensions, units of 2^-32)."""
-    multipliers = [1] * len(sizes), [lattice_multiplier(size) for size in sizes]
+    multipliers = [1] * len(sizes), [lattice_multiplier(size, cells) for size in sizes]
     steps = ([round(g * 2**32 / size) % 2**32 for g, size in zip(row, sizes, strict=True)] for row in multipliers)
-    return [_orders(size) for size in sizes], steps
+    # Every `cells`-th point belongs to the same cell
+    return [_orders(size, cells, cells, 1) for size in sizes], steps
 
 
-def _next_points(sizes: Sequence[int], earlier: Sequence[int]):
+def _next_points(sizes: Sequence[int], earlier: Sequence[int], cells: int):
     """As :func:`_points`, for the points of the extensible lattice after the ``earlier`` ones: their places along the
-    first dimension, the bits of their numbers in reverse order [van der Corput 1935]."""
+    first dimension, the bits of their numbers in reverse order [van der Corput 1935].  Successive points, which are
+    spread best, belong to the same cell."""
     tables = [
-        _bits_reversed(np.arange(first, first + size, dtype=np.uint32))[_orders(size)]
+        _bits_reversed(np.arange(first, first + size, dtype=np.uint32))[_orders(size, cells, 1, size // cells)]
         for size, first in zip(sizes, earlier, strict=True)
     ]
     return tables, ([step] * len(sizes) for step in (1, _EXTENSIBLE))
@@ -106,22 +124,26 @@ def _bits_reversed(numbers: np.ndarray) -> np.ndarray:
 class Lattice:
     """Numbers for paths; ``places`` of the paths in pixels; ``sizes``: different numbers of paths in a pixel;
     ``earlier``: for each of them, the number of points that earlier passes took from lattices with the same ``seed``;
-    None for lattices of this pass alone."""
+    None for lattices of this pass alone; ``cells`` of the film that a pixel has, with equal numbers of paths."""
 
-    def __init__(self, places: RayNumbers, sizes: Sequence[int], seed: int, earlier: Sequence[int] | None = None):
-        self._number = places.number
+    def __init__(
+        self, places: RayNumbers, sizes: Sequence[int], seed: int, earlier: Sequence[int] | None = None, cells: int = 1
+    ):  # fmt: skip
+        self._cells = dr.opaque(mi.UInt32, cells)
+        self._cell, self._number = places.in_cells(self._cells)
         # A good hash of the pixel, once for each path; cheap hashes derive the numbers of each vertex
         self._bits, _ = mi.sample_tea_32(places.pixel, dr.opaque(mi.UInt32, derived_seed(seed, 0)), HASH_ROUNDS)
-        tables, steps = _points(sizes) if earlier is None else _next_points(sizes, earlier)
+        tables, steps = _points(sizes, cells) if earlier is None else _next_points(sizes, earlier, cells)
         self._orders = upload(mi.UInt32, np.concatenate(tables))
         begins = np.cumsum([0, *(len(table) for table in tables[:-1])])
         rows = [len(table) // size for table, size in zip(tables, sizes, strict=True)]
         # In the orders of the pass before, pairs of points of different dimensions would occur again
         self._turn = dr.opaque(mi.UInt32, derived_seed(max(earlier), 1) if earlier else 0)
-        self._samples, self._begin, self._rows, *self._steps = (
+        each = [size // cells for size in sizes]
+        self._samples, self._each, self._begin, self._rows, *self._steps = (
             # Two entries at least: Dr.Jit makes a table of one a constant, which would take another kernel
             dr.gather(mi.UInt32, upload(mi.UInt32, np.resize(list(values), max(len(sizes), 2))), places.level)
-            for values in (sizes, begins, rows, *steps)
+            for values in (sizes, each, begins, rows, *steps)
         )
 
     @classmethod
@@ -149,8 +171,10 @@ class Lattice:
         return tuple(found)
 
     def _point(self, bits):
-        """Number of the point of a sample: random ``bits`` choose an order and a start in the order."""
-        order, begin = dr.mul_hi(bits, self._rows), dr.mul_hi(bits * self._rows, self._samples)
-        place = begin + self._number
-        place = dr.select(place < self._samples, place, place - self._samples)
-        return dr.gather(mi.UInt32, self._orders, self._begin + order * self._samples + place)
+        """Number of the point of a sample: random ``bits`` choose an order, and starts among cells and in a cell."""
+        order, bits = dr.mul_hi(bits, self._rows), bits * self._rows
+        cell, bits = dr.mul_hi(bits, self._cells) + self._cell, bits * self._cells
+        place = dr.mul_hi(bits, self._each) + self._number
+        cell = dr.select(cell < self._cells, cell, cell - self._cells)
+        place = dr.select(place < self._each, place, place - self._each)
+        return dr.gather(mi.UInt32, self._orders, self._begin + order * self._samples + cell * self._each + place)

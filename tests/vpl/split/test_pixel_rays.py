@@ -14,7 +14,7 @@ from tests.support.properties import examples
 from vpl.core.arrays import upload
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
 from vpl.split.lattice import Lattice
-from vpl.split.pixel_rays import Continued, PixelRays
+from vpl.split.pixel_rays import Continued, PixelRays, RayNumbers
 
 RNG = np.random.default_rng(0)
 ONE_BRIGHT, ONE_DARK = np.full(77, 1e-3), np.full(77, 5.0)
@@ -205,6 +205,38 @@ def test_numbers_of_a_pixel_are_those_of_an_image_with_equal_numbers():
         expected = lattice_numbers(PixelRays.uniform(rays.pixels, size), 7, 3).reshape(6, rays.pixels, size)
         own = rays.numbers == size
         assert (numbers[:, own[pixel]].reshape(6, -1, size) == expected[:, own]).all()
+
+
+@pytest.mark.parametrize("earlier", [None, 0, 64])
+@pytest.mark.parametrize("cells", [1, 4, 16])
+def test_numbers_of_every_cell_and_of_every_pixel_are_one_in_each_stratum(cells, earlier):
+    """Of 64 rays of a pixel; ``earlier``: rays of the pixel in earlier passes, None for a lattice of the pass alone."""
+    pixels, size = 512, 64
+    places = RayNumbers.of_lanes(dr.arange(mi.UInt32, pixels * size), size)
+    cell = np.array(places.in_cells(mi.UInt32(cells))[0]).reshape(pixels, size)
+    lattice = Lattice(places, (size,), 7, None if earlier is None else (earlier,), cells)
+    # Without the second numbers of pairs: their strata in parts of the extensible lattice are not equal
+    numbers = [np.array(x).reshape(-1, pixels, size)[0] for x in lattice.at(mi.UInt32(3))]
+    for dimension in numbers:
+        order = np.lexsort([dimension, cell])
+        of_cells = np.take_along_axis(dimension, order, axis=1).reshape(pixels * cells, size // cells)
+        for own in (np.sort(dimension, axis=1), of_cells):
+            gaps = np.diff(own, axis=1, append=1 + own[:, :1])
+            assert np.allclose(gaps * own.shape[1], 1, atol=1e-3)
+        # Each ray has a uniform number
+        assert all(stats.kstest(dimension[:, ray], "uniform").pvalue > 1e-4 for ray in (0, -1))
+
+
+def test_the_points_of_a_cell_are_spread_in_two_dimensions():
+    """In a box of a half by a half: the variance of counts over that of random points."""
+    pixels, size, found = 4096, 64, {}
+    places = RayNumbers.of_lanes(dr.arange(mi.UInt32, pixels * size), size)
+    cell = np.array(places.in_cells(mi.UInt32(4))[0]).reshape(pixels, size)
+    for cells in (1, 4):
+        pair = np.array(Lattice(places, (size,), 7, None, cells).at(mi.UInt32(3))[1]).reshape(2, pixels, size)
+        inside = (np.abs(pair - 0.5) < 0.25).all(0) & (cell == 2)
+        found[cells] = inside.sum(1).var() / (16 * (1 / 4) * (3 / 4))
+    assert found[4] < 0.2 and found[1] > 0.6, found
 
 
 def test_orders_of_pixels_and_dimensions_are_independent():
