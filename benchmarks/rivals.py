@@ -37,8 +37,8 @@ def load(name: str, width: int):
     text = file.read_text()
     sensor = re.search(r"<sensor.*?</sensor>", text, re.DOTALL).group()
     other = sensor.replace('<sampler type="independent"', f'<sampler type="{SAMPLERS[1]}"')
-    # Identifiers must be unique
-    other = re.sub(r' id="[^"]*"', "", other)
+    # Identifiers and names of objects must be unique
+    other = re.sub(r' id="[^"]*"', "", re.sub(r'(<sensor[^>]*) name="[^"]*"', r"\1", other))
     text = text.replace(sensor, f"{sensor}\n{other}")
     return mi.load_string(text, resx=str(width), resy=str(scenes.height(name, width)))
 
