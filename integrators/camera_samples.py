@@ -192,10 +192,10 @@ def cells_of(
     width, height = (film_size(film) // parts).tolist()
     samples = spp * parts**2
     if density is None:
-        return FilmCells(replace(PixelRays.uniform(width * height, samples), cells=parts**2), parts, width)
+        return FilmCells(replace(PixelRays.uniform(width * height, samples), cells=parts**2), width)
     if density.shape != (height, width):
         raise ValueError(f"density must have the shape of the image, {(height, width)}, got {density.shape}")
-    return FilmCells(replace(PixelRays.by_density(density, samples, continued), cells=parts**2), parts, width)
+    return FilmCells(replace(PixelRays.by_density(density, samples, continued), cells=parts**2), width)
 
 
 @contextmanager

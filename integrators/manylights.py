@@ -297,7 +297,7 @@ class ManyLightsIntegrator(PassRenderer):
         if isinstance(sampler, LatticeSampler) and sampler.cells:
             return sampler.cells
         grid = self.pixel_grid(scene, sampler)
-        return FilmCells(PixelRays.uniform(-(-count // grid.samples), grid.samples), 1, grid.width)
+        return FilmCells(PixelRays.uniform(-(-count // grid.samples), grid.samples), grid.width)
 
     def _view(self, scene, sampler, ray, active, cells: FilmCells, known: Start | None) -> View:
         number = dr.detach(sampler.next_1d())

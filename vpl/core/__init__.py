@@ -14,6 +14,7 @@
 - ``stages``: names of the stages of a render, keys of its timings
 - ``parameters``: parameters of scene objects, read without ``mitsuba.traverse``
 - ``meshes``: triangles of meshes, by the names that Mitsuba gives them
+- ``shapes``: shapes of a scene and of its shape groups, by their index in Mitsuba's registry
 - ``registry``: table from shapes or emitters to numbers
 - ``exclusive``: objects for use by one thread at a time
 - ``backend``: checks of the system libraries below Mitsuba

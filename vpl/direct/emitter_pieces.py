@@ -17,7 +17,8 @@ from ..core.arrays import finite_or_zero, select_record, upload
 from ..core.cones import mean_axes
 from ..core.meshes import coordinates_of, faces_of, is_triangle_mesh, normals_of, positions_of
 from ..core.parameters import matrix_of, parameters_of
-from ..lights.emitters import AreaEmitters, registered_shapes
+from ..core.shapes import registered_shapes
+from ..lights.emitters import AreaEmitters
 from ..lights.spheres import Sphere, sphere_coordinates
 
 PARALLELOGRAM, TRIANGLE, DISK, SPHERE, SHAPE = range(5)

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.registry import RegistryTable
-from .emitters import registered_shapes
+from ..core.shapes import registered_shapes
 
 # Name of the last group: emitters without another group
 OTHER = "other"

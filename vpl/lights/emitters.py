@@ -16,12 +16,12 @@ import numpy as np
 
 from ..core.arrays import LARGEST_VALUE, download, finite_or_zero, rgb_to_spectrum, upload, usable
 from ..core.compilation import unrecorded
-from ..core.parameters import children_of, matrix_of, numbers, parameters_of
+from ..core.parameters import matrix_of, numbers, parameters_of
 from ..core.registry import RegistryTable
+from ..core.shapes import registered_shapes
 from .spheres import SphereRows
 from .virtual_lights import VirtualLights
 
-_INSTANCE = "Instance"  # class name of instances of shape groups
 # Shapes, besides meshes, that Mitsuba can sample by area (curves, for example, cannot)
 SAMPLED_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
 # Time to record a call of one shape object, in calls of one shape by pointer
@@ -161,48 +161,6 @@ def _textured_radiance(emitter, shape) -> np.ndarray:
     si.p, si.n, si.uv, si.wi = position.p, position.n, position.uv, mi.Vector3f(0, 0, 1)
     radiance = download(finite_or_zero(emitter.eval(si))).reshape(side * side, -1)
     return np.broadcast_to(radiance.mean(0, dtype=np.float64), (3,)).astype(np.float32)
-
-
-def registered_shapes(scene) -> list:
-    """(Registry index, shape) of every shape of a scene."""
-    registry = download(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())) if scene.shapes() else []
-    return [(int(index), shape) for index, shape in zip(registry, scene.shapes(), strict=True)]
-
-
-@dataclass(frozen=True)
-class Instanced:
-    """A shape group: (registry index, shape) of its ``shapes``, which surface interactions have in place of those of
-    the group's ``instances``."""
-
-    shapes: list
-    instances: list
-
-    @classmethod
-    def of(cls, scene) -> list[Instanced]:
-        """Groups of a scene with instances.  Mitsuba 3.9.1 accepts groups as children of a scene only, and lists them
-        nowhere else."""
-        instances = [row for row in registered_shapes(scene) if row[1].class_name() == _INSTANCE]
-        if not instances:
-            return []
-        groups = [shape for shape in children_of(scene, mi.Shape) if shape.class_name().startswith("ShapeGroup")]
-        return [
-            cls(
-                [(_registry_index(shape), shape) for shape in children_of(group, mi.Shape)],
-                # Mitsuba tells the group of an instance in its printed form alone
-                [row for row in instances if f'name = "{group.id()}"' in str(row[1])],
-            )
-            for group in groups
-        ]
-
-
-def shapes_of_hits(scene) -> list:
-    """(Registry index, shape) of every shape that surface interactions have."""
-    nested = [row for group in Instanced.of(scene) for row in group.shapes]
-    return [row for row in registered_shapes(scene) if row[1].class_name() != _INSTANCE] + nested
-
-
-def _registry_index(shape) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
 def _can_be_sampled(shape) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..core.arrays import channel_mean, finite_or_zero
 from ..core.registry import RegistryTable
-from .emitters import shapes_of_hits
+from ..core.shapes import SceneShapes
 
 # Class names in Mitsuba's printed form
 _MAPS = ("BumpMap[", "NormalMap[")
@@ -28,9 +28,9 @@ _COSINE_SHARE = 0.5
 _DIFFUSE_DENSITY = 1.001 / np.pi
 
 
-def perturbed_shapes(scene) -> tuple[int, ...]:
+def perturbed_shapes(shapes: SceneShapes) -> tuple[int, ...]:
     """Registry indices of the shapes with a bump or normal map."""
-    return tuple(index for index, shape in shapes_of_hits(scene) if any(name in str(shape.bsdf()) for name in _MAPS))
+    return tuple(index for index, shape in shapes.of_hits if any(name in str(shape.bsdf()) for name in _MAPS))
 
 
 @dataclass(init=False)
@@ -44,7 +44,7 @@ class Perturbed:
     _table: RegistryTable | None
 
     def __init__(self, scene):
-        shapes = perturbed_shapes(scene)
+        shapes = perturbed_shapes(SceneShapes.of(scene))
         self.exist = len(shapes) > 0
         self._table = RegistryTable(shapes, 1) if shapes else None
 

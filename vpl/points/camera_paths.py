@@ -17,7 +17,8 @@ from ..core.arrays import add_at, channel_mean, download, finite_or_zero, ones, 
 from ..core.morton import morton_order
 from ..core.registry import RegistryTable
 from ..core.sampling import derived_seed, independent_sampler
-from ..lights.emitters import Emitters, Instanced, shapes_of_hits
+from ..core.shapes import SceneShapes
+from ..lights.emitters import Emitters
 from ..lights.perturbed import perturbed_shapes
 
 # Least probability of the delta and of the smooth lobes, unless their reflectance is zero
@@ -104,8 +105,8 @@ class CameraPaths:
 
 def scene_traits(scene) -> SceneTraits:
     """Union of the flags of a scene's BSDFs."""
-    flags, open_shapes = 0, {}
-    for index, shape in shapes_of_hits(scene):
+    flags, open_shapes, shapes = 0, {}, SceneShapes.of(scene)
+    for index, shape in shapes.of_hits:
         found = int(shape.bsdf().flags())
         if found & int(mi.BSDFFlags.Null):
             open_shapes[index] = shape
@@ -117,17 +118,17 @@ def scene_traits(scene) -> SceneTraits:
     kinds = mi.BSDFFlags
     transmissive = have(int(kinds.DiffuseTransmission) | int(kinds.GlossyTransmission))
     lobes = (have(kind) for kind in (kinds.Delta, kinds.Null, kinds.Smooth, kinds.Glossy))
-    open_groups = [one for one in Instanced.of(scene) if any(index in open_shapes for index, _ in one.shapes)]
+    open_groups = [one for one in shapes.groups if any(index in open_shapes for index, _ in one.shapes)]
     open_instances, open_scene = [index for one in open_groups for index, _ in one.instances], None
     if open_shapes and not open_groups and dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
         open_scene = mi.load_dict({"type": "scene", **{f"open_{index}": one for index, one in open_shapes.items()}})
     listed = *open_shapes, *open_instances
-    return SceneTraits(*lobes, transmissive, perturbed_shapes(scene), listed, open_scene)
+    return SceneTraits(*lobes, transmissive, perturbed_shapes(shapes), listed, open_scene)
 
 
 def refuse_media(scene) -> None:
     """Raise a ValueError with the name of the first shape that bounds a participating medium."""
-    for number, (_, shape) in enumerate(shapes_of_hits(scene)):
+    for number, (_, shape) in enumerate(SceneShapes.of(scene).of_hits):
         if shape.is_medium_transition():
             raise ValueError(
                 f'shape {number} ("{shape.id()}", {shape.class_name()}) bounds a participating medium; '

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import isqrt
 
 import drjit as dr
 import mitsuba as mi
@@ -23,33 +24,37 @@ HALF = "every second"
 class FilmCells:
     """Cells of the film that the camera rays of pixels belong to.
 
-    ``rays`` of the pixels: a pixel has a multiple of ``parts``² rays; ``parts``: cells along each side of a pixel;
-    ``width`` of the image in pixels.  The cells of the film follow each other in rows.
+    ``rays`` of the pixels, each of which has a multiple of its number of cells; ``width`` of the image in pixels.  The
+    cells of the film follow each other in rows.
     """
 
     rays: PixelRays
-    parts: int
     width: int
+
+    @property
+    def parts(self) -> int:
+        """Cells along each side of a pixel."""
+        return isqrt(self.rays.cells)
 
     @property
     def count(self) -> int:
         """Number of cells."""
-        return self.rays.pixels * self.parts**2
+        return self.rays.pixels * self.rays.cells
 
     @property
     def sizes(self) -> tuple[int, ...]:
         """The different numbers of rays of a cell, ascending."""
-        return tuple(size // self.parts**2 for size in self.rays.sizes)
+        return tuple(size // self.rays.cells for size in self.rays.sizes)
 
     @property
     def earlier(self) -> tuple[int, ...] | None:
         """Number of earlier rays of a cell for each of ``sizes``; None for lattices of their own."""
-        return self.rays.earlier and tuple(number // self.parts**2 for number in self.rays.earlier)
+        return self.rays.earlier and tuple(number // self.rays.cells for number in self.rays.earlier)
 
     @property
     def mean(self) -> int:
         """Mean number of rays of a cell."""
-        return self.rays.mean // self.parts**2
+        return self.rays.mean // self.rays.cells
 
     @property
     def is_plain(self) -> bool:
@@ -61,7 +66,7 @@ class FilmCells:
         places = self.rays.places(lane)
         if self.parts == 1:
             return places
-        parts, cells = (dr.opaque(mi.UInt32, number) for number in (self.parts, self.parts**2))
+        parts, cells = (dr.opaque(mi.UInt32, number) for number in (self.parts, self.rays.cells))
         part, number = places.in_cells(cells)
         width = dr.opaque(mi.UInt32, self.width)
         row = places.pixel // width * parts + part // parts
@@ -103,7 +108,7 @@ class FilmCells:
     def _ray(self) -> mi.UInt32:
         """The ray at each of the even places, for equal numbers of rays: the inverse of :meth:`places`, evaluated."""
         pixel, part = self._pixel_and_part(self._even_places.pixel)
-        cells = dr.opaque(mi.UInt32, self.parts**2)
+        cells = dr.opaque(mi.UInt32, self.rays.cells)
         ray = pixel * dr.opaque(mi.UInt32, self.rays.mean) + _number(pixel, part, self._even_places.number, cells)
         dr.eval(ray)
         return ray
@@ -117,7 +122,7 @@ class FilmCells:
     def _means(self, values: mi.Float) -> mi.Float:
         """Mean over the rays of each cell, evaluated."""
         pixel, part = self._pixel_and_part(dr.arange(mi.UInt32, self.count))
-        rays, cells = dr.gather(mi.UInt32, self.rays.by_level(self.sizes), pixel), dr.opaque(mi.UInt32, self.parts**2)
+        rays, cells = dr.gather(mi.UInt32, self.rays.by_level(self.sizes), pixel), dr.opaque(mi.UInt32, self.rays.cells)
         first = dr.gather(mi.UInt32, self.rays.device_first, pixel)
         dr.eval(values, pixel, part, rays, first)
         return _sums(values, pixel, part, rays, first, cells) / mi.Float(rays)

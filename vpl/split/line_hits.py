@@ -25,7 +25,7 @@ from ..core.arrays import download, select_record, upload
 from ..core.loops import recorded_once
 from ..core.meshes import corners_of
 from ..core.sampling import independent_sampler
-from ..lights.emitters import Instanced, registered_shapes
+from ..core.shapes import SceneShapes, registered_shapes
 from .line_sampling import Lines
 
 # Largest distance between a surface and a point found on it, as a fraction of the extent of the shape or triangle: two
@@ -115,9 +115,10 @@ def _uncertainty(scene, found: _Found, scene_size: float) -> np.ndarray:
 
 def has_large_curves(scene) -> bool:
     """Whether hits on a shape that is no mesh are more uncertain than Mitsuba's offset of rays near the origin."""
-    meshes = [one for one in Instanced.of(scene) if all(shape.is_mesh() for _, shape in one.shapes)]
-    of_meshes = {index for one in meshes for index, _ in one.instances}
-    curves = (shape for index, shape in registered_shapes(scene) if not shape.is_mesh() and index not in of_meshes)
+    shapes = SceneShapes.of(scene)
+    meshes = [group for group in shapes.groups if all(shape.is_mesh() for _, shape in group.shapes)]
+    of_meshes = {index for group in meshes for index, _ in group.instances}
+    curves = (shape for index, shape in shapes.own if not shape.is_mesh() and index not in of_meshes)
     boxes = (shape.bbox() for shape in curves)
     return any(_UNCERTAINTY * max(box.extents()) > mi.math.RayEpsilon for box in boxes if box.valid())
 

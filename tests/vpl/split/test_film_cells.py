@@ -1,5 +1,7 @@
 """Cells of a film that is finer than the image, or has pixels with different numbers of rays."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -27,7 +29,8 @@ layouts = pytest.mark.parametrize("layout", LAYOUTS)
 
 
 def cells_of(layout):
-    return FilmCells(*LAYOUTS[layout])
+    rays, parts, width = LAYOUTS[layout]
+    return FilmCells(replace(rays, cells=parts**2), width)
 
 
 def places(cells):
@@ -97,7 +100,7 @@ def test_even_masks_have_the_fractions_of_cells(layout):
 
 def test_the_order_of_cells_is_random_for_every_pixel_and_round():
     """A regular order would light a pattern of cells where few rays of a pixel are lit."""
-    cells = FilmCells(PixelRays.uniform(4096, 8), 2, 64)
+    cells = FilmCells(replace(PixelRays.uniform(4096, 8), cells=4), 64)
     row, column = np.divmod(places(cells)[0], 128)
     part = (row % 2 * 2 + column % 2).reshape(4096, 8)
     for number in range(8):

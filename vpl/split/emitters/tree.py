@@ -12,9 +12,10 @@ import mitsuba as mi
 import numpy as np
 
 from ...core.arrays import finite_or_zero, rgb_to_spectrum, upload
+from ...core.shapes import registered_shapes
 from ...lights.emission import bounding_sphere, solid_angle_radiance
 from ...lights.emitter_groups import EmitterGroups
-from ...lights.emitters import Emitters, registered_shapes
+from ...lights.emitters import Emitters
 from ...lights.light_set import largest_below, moments_below
 from ...lights.light_tree import BOX_MAX, BOX_MIN, INTENSITY, build_light_tree
 from ...lights.virtual_lights import DeviceLights, VirtualLights, spot_falloff

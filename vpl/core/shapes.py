@@ -1,0 +1,62 @@
+"""Shapes of a scene by their index in Mitsuba's registry, with the shapes of its shape groups."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .arrays import download
+from .parameters import children_of
+
+# Class name of instances of shape groups
+_INSTANCE = "Instance"
+
+
+def registered_shapes(scene) -> list:
+    """(Registry index, shape) of every shape of a scene."""
+    registry = download(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())) if scene.shapes() else []
+    return [(int(index), shape) for index, shape in zip(registry, scene.shapes(), strict=True)]
+
+
+@dataclass(frozen=True)
+class ShapeGroup:
+    """(Registry index, shape) of the ``shapes`` of a group, and of its ``instances``."""
+
+    shapes: list
+    instances: list
+
+
+@dataclass(frozen=True)
+class SceneShapes:
+    """(Registry index, shape) of the ``own`` shapes of a scene, instances included; ``groups``: those that instances
+    may be of."""
+
+    own: list
+    groups: list[ShapeGroup]
+
+    @classmethod
+    def of(cls, scene) -> SceneShapes:
+        """Mitsuba 3.9.1 accepts groups as children of a scene only, and lists them nowhere else."""
+        own = registered_shapes(scene)
+        instances = [row for row in own if row[1].class_name() == _INSTANCE]
+        if not instances:
+            return cls(own, [])
+        groups = [shape for shape in children_of(scene, mi.Shape) if shape.class_name().startswith("ShapeGroup")]
+        # Mitsuba tells the group of an instance in its printed form alone
+        of_group = {group: [row for row in instances if f'name = "{group.id()}"' in str(row[1])] for group in groups}
+        return cls(own, [ShapeGroup(_children(group), found) for group, found in of_group.items()])
+
+    @property
+    def of_hits(self) -> list:
+        """(Registry index, shape) of every shape that surface interactions have: those of groups instead of
+        instances."""
+        nested = [row for group in self.groups for row in group.shapes]
+        return [row for row in self.own if row[1].class_name() != _INSTANCE] + nested
+
+
+def _children(group) -> list:
+    """(Registry index, shape) of the shapes of a group."""
+    shapes = children_of(group, mi.Shape)
+    return [(int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]), shape) for shape in shapes]
