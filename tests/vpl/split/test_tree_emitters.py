@@ -12,7 +12,7 @@ from tests.support.scenes import closed_box, rgb, wall
 from tests.support.statistics import assert_same_mean
 from vpl.core.arrays import upload_vectors
 from vpl.lights.emitters import read_emitters
-from vpl.split.emitters.tree import EmitterTree
+from vpl.split.emitters.emitter_tree import EmitterTree
 
 COUNT = 300
 
@@ -70,18 +70,25 @@ def test_every_emitter_is_in_one_cluster_from_which_it_can_be_drawn(count, most)
     tree = EmitterTree(position, np.zeros(count), rng.random(count) + 0.1, most)
     assert tree.clusters == min(count, most)
     rows = dr.arange(mi.UInt32, count)
-    cluster, everywhere = tree.cluster(rows, True), mi.Point3f(0.1, 0.2, 0.3)
-    assert set(np.array(cluster)) == set(range(tree.clusters))
-    from_root, within = (np.array(x, np.float64) for x in tree.probability(rows, everywhere, mi.Bool(True)))
+    everywhere = mi.Point3f(0.1, 0.2, 0.3)
+    known = tree.walk(tree.leaf(rows, True), 0, everywhere, mi.Bool(True))
+    assert (np.array(known.row) == np.arange(count)).all()
+    cluster = np.array(known.cluster)
+    assert set(cluster) == set(range(tree.clusters))
+    from_root, within = (np.array(x, np.float64) for x in (known.probability, known.within))
     np.testing.assert_allclose(from_root.sum(), 1, rtol=1e-5)
-    np.testing.assert_allclose(np.bincount(np.array(cluster), within), 1, rtol=1e-5)
+    np.testing.assert_allclose(np.bincount(cluster, within), 1, rtol=1e-5)
     number = mi.Float(rng.random(20_000))
     which = mi.UInt32(rng.integers(0, tree.clusters, 20_000))
-    found = tree.draw(tree.root(which, True), everywhere, number, mi.Bool(True))
-    assert (np.array(tree.cluster(found, True)) == np.array(which)).all()
-    often = np.bincount(np.array(found), minlength=count) / 20_000
-    expected = within / tree.clusters
-    assert (np.abs(often - expected) < 5 * np.sqrt(expected / 20_000) + 1e-6).all()
+    from_cluster, anywhere = tree.root(which, True), mi.UInt32(0)
+    for target, expected in ((from_cluster, within / tree.clusters), (anywhere, from_root)):
+        found = tree.walk(target, number, everywhere, mi.Bool(True))
+        row = np.array(found.row)
+        assert (np.array(found.cluster) == (np.array(which) if target is from_cluster else cluster[row])).all()
+        np.testing.assert_allclose(np.array(found.probability), from_root[row], rtol=1e-5)
+        np.testing.assert_allclose(np.array(found.within), within[row], rtol=1e-5)
+        often = np.bincount(row, minlength=count) / 20_000
+        assert (np.abs(often - expected) < 5 * np.sqrt(expected / 20_000) + 1e-6).all()
 
 
 @pytest.mark.parametrize("spread", ["volume", "ceiling"])
@@ -92,8 +99,8 @@ def test_one_draw_from_the_tree_is_nearly_in_proportion_to_what_arrives(spread):
     tree = EmitterTree(position, np.zeros(2000), np.ones(2000), 96)
     seen = rng.uniform(-1, 1, (200, 3)) * [1, 1 if spread == "volume" else 0.2, 1]
     rows, place = dr.arange(mi.UInt32, 2000), upload_vectors(mi.Point3f, np.repeat(seen, 2000, 0).astype(np.float32))
-    probability, _ = tree.probability(dr.tile(rows, 200), place, mi.Bool(True))
-    probability = np.array(probability, np.float64).reshape(200, 2000)
+    known = tree.walk(tree.leaf(dr.tile(rows, 200), True), 0, place, mi.Bool(True))
+    probability = np.array(known.probability, np.float64).reshape(200, 2000)
     arrives = 1 / ((position[None] - seen[:, None]) ** 2).sum(2)
     second, third = (np.mean((arrives**k / probability ** (k - 1)).sum(1) / arrives.sum(1) ** k) for k in (2, 3))
     assert second < 3.5

@@ -4,7 +4,8 @@
 - ``cell_choice``: learned probabilities of sources by spatial cell
 - ``arriving_power``: light of each source that arrives in each cell, from which they are learned
 - ``learned``: emitters and regions of the environment, chosen by visibility from a pilot's vertices
-- ``tree``: many emitters, chosen through a tree
+- ``emitter_tree``: tree over emitters, walked to draw one or to find the probability of one
+- ``tree``: many emitters, chosen through this tree
 """
 
 from __future__ import annotations

@@ -5,8 +5,6 @@ Kernels do not grow with the number of emitters.
 
 from __future__ import annotations
 
-from heapq import heappop, heappush
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -16,13 +14,12 @@ from ...core.shapes import registered_shapes
 from ...lights.emission import bounding_sphere, solid_angle_radiance
 from ...lights.emitter_groups import EmitterGroups
 from ...lights.emitters import Emitters
-from ...lights.light_set import largest_below, moments_below
-from ...lights.light_tree import BOX_MAX, BOX_MIN, INTENSITY, build_light_tree
 from ...lights.virtual_lights import DeviceLights, VirtualLights, spot_falloff
 from ...points.camera_paths import emitted_towards, scene_traits
 from ..emitter_lights import EmitterLights, has_true_normals
 from .base import EmitterSample, MetEmitter
 from .cell_choice import CellChoice
+from .emitter_tree import EmitterTree, Found
 from .learned import CellEmitters
 
 # Largest number of clusters; their number grows with the root of the rays to learn by, as does the number of cells
@@ -33,120 +30,6 @@ _ROOT_SHARE = 0.2
 _UNIFORM_SHARE = 0.1
 # Least fraction of the draws from the root for located emitters, and for distant emitters, in scenes with both
 _LEAST_SHARE = 0.1
-# Floats of a node's record in device memory: two vectors of four
-_RECORD = 8
-# Least distance of a vertex to a node, in standard deviations of the emitters' positions. Below 1, because a vertex
-# near the mean is likely to be near some emitters, which would be drawn too rarely
-_LEAST_DISTANCE = 0.6
-# Least intensity of an emitter relative to the brightest: keeps the probability of every emitter positive
-_LEAST_INTENSITY = 1e-12
-
-
-class EmitterTree:
-    """Tree over emitters at ``position`` (n, 3) with a ``radius`` (n,) and a radiant ``intensity`` (n,).
-
-    From the root down, a child is drawn in proportion to its intensity over the squared distance [Conty Estevez and
-    Kulla 2018, "Importance sampling of many lights with adaptive tree splitting"].  The tree lies in preorder, so the
-    path to a known emitter, and the probability of drawing the emitter, need no record of turns.  ``clusters``: number
-    of subtrees at the beginning of a learned choice, limited by ``most_clusters``.
-    """
-
-    def __init__(self, position: np.ndarray, radius: np.ndarray, intensity: np.ndarray, most_clusters: int):
-        self.count = len(position)
-        # The tree needs positive intensities, also of black emitters
-        least = _LEAST_INTENSITY * float(intensity.max()) or 1.0
-        intensity = np.maximum(intensity, least)
-        colours = np.repeat(intensity[:, None], 3, axis=1).astype(np.float32)
-        tree = build_light_tree(position.astype(np.float32), None, colours, np.random.default_rng(0))
-        low, high = tree.records[:, BOX_MIN].astype(np.float64), tree.records[:, BOX_MAX].astype(np.float64)
-        records = np.zeros((len(tree.records), _RECORD), np.float32)
-        records[:, 0:3], variance = moments_below(tree, position, intensity)
-        # Lower bound of the squared distance of a vertex: emitters extend beyond a single position
-        records[:, 3] = _LEAST_DISTANCE**2 * variance + largest_below(tree, radius) ** 2
-        leaf = tree.escape == np.arange(len(tree.records)) + 1
-        records[:, 4] = tree.records[:, INTENSITY]
-        records[:, 5] = tree.escape.astype(np.uint32).view(np.float32)
-        records[:, 6] = tree.representative.astype(np.uint32).view(np.float32)
-        self._records = upload(mi.Float, records)
-        node_of_emitter = np.zeros(len(position), np.uint32)
-        node_of_emitter[tree.representative[leaf]] = np.flatnonzero(leaf)
-        self._leaf = upload(mi.UInt32, node_of_emitter)
-        roots = _cut(tree.escape, records[:, 4], np.linalg.norm(high - low, axis=1), most_clusters)
-        self.clusters = len(roots)
-        self._root = upload(mi.UInt32, roots)
-        self._cluster = upload(mi.UInt32, np.searchsorted(roots, node_of_emitter, side="right") - 1)
-
-    def _escape(self, node):
-        return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._records, node * _RECORD + 5))
-
-    def _importance(self, node, position):
-        place = dr.gather(mi.Vector4f, self._records, node * 2)
-        intensity = dr.gather(mi.Float, self._records, node * _RECORD + 4)
-        return intensity / dr.maximum(dr.squared_norm(place.xyz - position), place.w)
-
-    def _left_share(self, left, right, position):
-        """Probability of the left of two children."""
-        of_left, of_right = self._importance(left, position), self._importance(right, position)
-        share = of_left / (of_left + of_right)
-        return dr.select(dr.isfinite(share), share, 0.5)
-
-    def cluster(self, row, active):
-        """The cluster of the emitter in a row."""
-        return dr.gather(mi.UInt32, self._cluster, row, active)
-
-    def root(self, cluster, active):
-        """The node of a cluster."""
-        return dr.gather(mi.UInt32, self._root, cluster, active)
-
-    @dr.syntax
-    def draw(self, node, position, number, active):
-        """Draw an emitter below a node (0: the root) for each position by a uniform number: its row."""
-        node = mi.UInt32(node)
-        inner = active & (self._escape(node) != node + 1)
-        while dr.hint(inner, exclude=[self]):
-            left = node + 1
-            right = self._escape(left)
-            share = self._left_share(left, right, position)
-            turns = number >= share
-            taken = dr.select(turns, 1 - share, share)
-            number = dr.select(turns, number - share, number) / taken
-            number = dr.minimum(number, dr.one_minus_epsilon(mi.Float))
-            node = dr.select(turns, right, left)
-            inner = self._escape(node) != node + 1
-        return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._records, node * _RECORD + 6))
-
-    @dr.syntax
-    def probability(self, row, position, active):
-        """Probabilities of :meth:`draw` for the emitter of a row: (from the root, from its cluster)."""
-        target = dr.gather(mi.UInt32, self._leaf, row, active)
-        root = self.root(self.cluster(row, active), active)
-        node, probability, within = mi.UInt32(0), mi.Float(1), mi.Float(1)
-        inner = active & (target != 0)
-        while dr.hint(inner, exclude=[self]):
-            left = node + 1
-            right = self._escape(left)
-            share = self._left_share(left, right, position)
-            turns = target >= right
-            taken = dr.select(turns, 1 - share, share)
-            probability *= taken
-            node = dr.select(turns, right, left)
-            within = dr.select(node <= root, 1, within * taken)
-            inner = node != target
-        return dr.select(active, probability, 0), dr.select(active, within, 0)
-
-
-def _cut(escape: np.ndarray, intensity: np.ndarray, size: np.ndarray, most: int) -> np.ndarray:
-    """A cut of at most ``most`` nodes, sorted: divides the node with the largest intensity × size first."""
-    priority = np.asarray(intensity, np.float64) * size
-    nodes, leaves = [(-priority[0], 0)], []
-    while nodes and len(nodes) + len(leaves) < most:
-        _, node = heappop(nodes)
-        if escape[node] == node + 1:
-            leaves.append(node)
-            continue
-        for child in (node + 1, escape[node + 1]):
-            heappush(nodes, (-priority[child], int(child)))
-    return np.sort(leaves + [node for _, node in nodes])
 
 
 class TreeEmitters(CellEmitters):
@@ -219,7 +102,7 @@ class TreeEmitters(CellEmitters):
     def _draw(self, source, position, number, member, active):
         """Draw an emitter of each source by two uniform numbers.
 
-        Returns (mask of located emitters, row in the tree, index among the distant emitters).
+        Returns (mask of located emitters, the emitter found in the tree, index among the distant emitters).
         """
         distant = mi.UInt32(max(self._distant - 1, 0))
         usual = source == self._clusters + self._distant
@@ -229,17 +112,16 @@ class TreeEmitters(CellEmitters):
             among = mi.UInt32(dr.maximum(number - self._share, 0) / (1 - self._share) * self._distant)
             index = dr.minimum(dr.select(usual, among, index), distant)
         alike, count = usual & (number < self._share * _UNIFORM_SHARE), self._tree.count
-        node = dr.select(usual, 0, self._tree.root(source, near & ~usual))
+        target = dr.select(usual, 0, self._tree.root(source, near & ~usual))
         # A number of its own: `number` has too few bits left for thousands of emitters
-        row = self._tree.draw(node, position, member, near & ~alike)
         alike_row = dr.minimum(mi.UInt32(member * count), count - 1)
-        return near, dr.select(alike, alike_row, row), index
+        target = dr.select(alike, self._tree.leaf(alike_row, near & alike), target)
+        return near, self._tree.walk(target, member, position, near), index
 
-    def _probability(self, row, position, cell, active):
-        """Probability of drawing the located emitter in a row of the tree."""
-        by_tree, within = self._tree.probability(row, position, active)
-        learned = self.choice.probability(cell, self._tree.cluster(row, active), active) * within
-        by_tree = self._share * ((1 - _UNIFORM_SHARE) * by_tree + _UNIFORM_SHARE / self._tree.count)
+    def _probability(self, found: Found, cell, active):
+        """Probability of drawing a located emitter."""
+        learned = self.choice.probability(cell, found.cluster, active) * found.within
+        by_tree = self._share * ((1 - _UNIFORM_SHARE) * found.probability + _UNIFORM_SHARE / self._tree.count)
         return learned + self._from_root(cell, active) * by_tree
 
     def _distant_probability(self, index, cell, active):
@@ -304,11 +186,11 @@ class TreeEmitters(CellEmitters):
     def sample(self, si, cell, chosen, member, place, active) -> EmitterSample:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.sample`."""
         source, _, number = self.choice.draw(cell, chosen, active)
-        near, row, index = self._draw(source, si.p, number, member, active)
-        probability = self._probability(row, si.p, cell, near)
+        near, found, index = self._draw(source, si.p, number, member, active)
+        probability = self._probability(found, cell, near)
         if self._distant:
             probability = dr.select(near, probability, self._distant_probability(index, cell, active & ~near))
-        return self._toward(si, near, row, index, place, active).chosen_with(probability)
+        return self._toward(si, near, found.row, index, place, active).chosen_with(probability)
 
     def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.met`."""
@@ -321,7 +203,9 @@ class TreeEmitters(CellEmitters):
             found = self._emitters.area.row(si, active & has_density & si.is_valid())
             here, row = active & has_density & si.is_valid() & (found > 0), found - 1
             pdf = self._emitters.area.on_shape("pdf_direction", row, origin, ds, here)
-            density = dr.select(here, pdf * self._probability(row + self._first_area, vertex, cell, here), density)
+            leaf = self._tree.leaf(row + self._first_area, here)
+            known = self._tree.walk(leaf, 0, vertex, here)
+            density = dr.select(here, pdf * self._probability(known, cell, here), density)
             nearness = dr.select(here, self._nearness(row, si.n, ray.d, si.t, here), nearness)
         if self._environment is not None:
             here = active & has_density & ~si.is_valid()
