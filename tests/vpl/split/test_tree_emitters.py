@@ -91,6 +91,31 @@ def test_every_emitter_is_in_one_cluster_from_which_it_can_be_drawn(count, most)
         assert (np.abs(often - expected) < 5 * np.sqrt(expected / 20_000) + 1e-6).all()
 
 
+@pytest.mark.parametrize("light", [1e-12, 1e30])
+@pytest.mark.parametrize("size", [1e-4, 1e4])
+def test_probabilities_depend_on_no_unit(light, size):
+    """One emitter is 100 000 times as bright as the others, and the vertex lies close to another one."""
+    rng = np.random.default_rng(8)
+    position, intensity = rng.normal(size=(100, 3)), np.append(1e5, rng.random(99) + 0.1)
+    tree = EmitterTree(position, np.zeros(100), intensity, 16)
+    other = EmitterTree(size * position, np.zeros(100), light * intensity, 16)
+    rows, place = dr.arange(mi.UInt32, 100), (position[1] + 1e-3).astype(np.float32)
+    found = tree.walk(tree.leaf(rows, True), 0, mi.Point3f(place), mi.Bool(True))
+    scaled = other.walk(other.leaf(rows, True), 0, mi.Point3f(np.float32(size) * place), mi.Bool(True))
+    np.testing.assert_allclose(np.array(scaled.probability), np.array(found.probability), rtol=1e-3)
+
+
+def test_a_walk_to_an_emitter_ignores_the_number_and_inactive_lanes():
+    rng = np.random.default_rng(9)
+    tree = EmitterTree(rng.normal(size=(100, 3)), np.zeros(100), rng.random(100) + 0.1, 16)
+    rows, place = dr.arange(mi.UInt32, 100), mi.Point3f(0.1, 0.2, 0.3)
+    everywhere = tree.walk(tree.leaf(rows, True), 0, place, mi.Bool(True))
+    some = tree.walk(tree.leaf(rows, True), mi.Float(rng.random(100)), place, rows % 3 == 0)
+    expected = np.arange(100) % 3 == 0
+    for name in ("row", "cluster", "probability", "within"):
+        np.testing.assert_array_equal(np.array(getattr(some, name)), np.array(getattr(everywhere, name)) * expected)
+
+
 @pytest.mark.parametrize("spread", ["volume", "ceiling"])
 def test_one_draw_from_the_tree_is_nearly_in_proportion_to_what_arrives(spread):
     """Also close to single emitters: relative second and third moments of what is drawn, over the probability."""

@@ -18,13 +18,13 @@ _VECTORS = 3
 # Least distance of a vertex to a node, in standard deviations of the emitters' positions. Below 1, because a vertex
 # near the mean is likely to be near some emitters, which would be drawn too rarely
 _LEAST_DISTANCE = 0.6
-# Least intensity of an emitter relative to the brightest: keeps the probability of every emitter positive
+# Least intensity of an emitter relative to the brightest: the tree needs positive intensities, also of black emitters
 _LEAST_INTENSITY = 1e-12
 
 
 @dataclass
 class Found:
-    """Emitters at the ends of walks, one per lane.
+    """Emitters at the ends of walks, one per lane; all fields are 0 in inactive lanes.
 
     ``row`` of the emitter; ``cluster`` of the emitter; ``probability``, ``within``: of a draw of the emitter from the
     root, and from its cluster.
@@ -48,7 +48,6 @@ class EmitterTree:
 
     def __init__(self, position: np.ndarray, radius: np.ndarray, intensity: np.ndarray, most_clusters: int):
         self.count = len(position)
-        # The tree needs positive intensities, also of black emitters
         least = _LEAST_INTENSITY * float(intensity.max()) or 1.0
         intensity = np.maximum(intensity, least)
         colours = np.repeat(intensity[:, None], 3, axis=1).astype(np.float32)
@@ -77,7 +76,8 @@ class EmitterTree:
     def walk(self, target, number, position, active) -> Found:
         """Walk from the root to the node ``target``, and draw an emitter below it by a uniform ``number``.
 
-        The target 0, the root, draws from the whole tree; that of :meth:`leaf` finds the probability of an emitter.
+        The target 0, the root, draws from the whole tree, and that of :meth:`root` from a cluster.  That of
+        :meth:`leaf` finds the probability of an emitter, whatever the number.
         """
         node, number = mi.UInt32(0), mi.Float(number)
         links = self._vector(node, 2, active)
@@ -122,6 +122,7 @@ def _bits(number):
 
 
 def _is_leaf(tree: LightTree) -> np.ndarray:
+    """Mask of the nodes that hold a single emitter."""
     return tree.escape == np.arange(len(tree.escape)) + 1
 
 
@@ -129,17 +130,19 @@ def _records(tree: LightTree, place: np.ndarray, roots: np.ndarray) -> np.ndarra
     """Records of all nodes, (nodes, 3, 4) float32; ``place``: mean position and least squared distance; ``roots`` of
     clusters.
 
-    Vectors of inner nodes: place of the left child; place of the right child; the children's intensities, the right
-    child, and the cluster that begins at the node, from 1 on, or 0.  The last vector of leaves: row of the emitter, 0,
-    0, cluster.
+    Vectors of inner nodes: place of the left child; place of the right child; the children's intensities over that of
+    the root, the right child, and the cluster that begins at the node, from 1 on, or 0.  The last vector of leaves: row
+    of the emitter, 0, 0, and the cluster that begins at the leaf.
     """
     records = np.zeros((len(place), _VECTORS, 4), np.float32)
-    inner = np.flatnonzero(~_is_leaf(tree))
-    leaves = np.flatnonzero(_is_leaf(tree))
+    leaf = _is_leaf(tree)
+    inner, leaves = np.flatnonzero(~leaf), np.flatnonzero(leaf)
+    # Products of intensities and squared distances stay within single precision, whatever the unit of light
+    intensity = tree.records[:, INTENSITY] / tree.records[0, INTENSITY]
     right = tree.escape[inner + 1]
     for index, child in enumerate((inner + 1, right)):
         records[inner, index] = place[child]
-        records[inner, 2, index] = tree.records[child, INTENSITY]
+        records[inner, 2, index] = intensity[child]
     links = records.view(np.uint32)
     links[inner, 2, 2] = right
     links[leaves, 2, 0] = tree.representative[leaves]
@@ -151,10 +154,10 @@ def _cut(tree: LightTree, most: int) -> np.ndarray:
     """A cut of at most ``most`` nodes, sorted: divides the node with the largest intensity × size first."""
     low, high = (tree.records[:, box].astype(np.float64) for box in (BOX_MIN, BOX_MAX))
     priority = tree.records[:, INTENSITY] * np.linalg.norm(high - low, axis=1)
-    nodes, leaves = [(-priority[0], 0)], []
+    is_leaf, nodes, leaves = _is_leaf(tree), [(-priority[0], 0)], []
     while nodes and len(nodes) + len(leaves) < most:
         _, node = heappop(nodes)
-        if tree.escape[node] == node + 1:
+        if is_leaf[node]:
             leaves.append(node)
             continue
         for child in (node + 1, tree.escape[node + 1]):

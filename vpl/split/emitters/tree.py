@@ -200,12 +200,12 @@ class TreeEmitters(CellEmitters):
         ds.p, ds.n, ds.uv, ds.d, ds.dist = si.p, si.n, si.uv, ray.d, si.t
         density, nearness = mi.Float(0), mi.Float(dr.inf)
         if self._areas:
-            found = self._emitters.area.row(si, active & has_density & si.is_valid())
-            here, row = active & has_density & si.is_valid() & (found > 0), found - 1
+            after = self._emitters.area.row(si, active & has_density & si.is_valid())
+            here, row = active & has_density & si.is_valid() & (after > 0), after - 1
             pdf = self._emitters.area.on_shape("pdf_direction", row, origin, ds, here)
             leaf = self._tree.leaf(row + self._first_area, here)
-            known = self._tree.walk(leaf, 0, vertex, here)
-            density = dr.select(here, pdf * self._probability(known, cell, here), density)
+            found = self._tree.walk(leaf, 0, vertex, here)
+            density = dr.select(here, pdf * self._probability(found, cell, here), density)
             nearness = dr.select(here, self._nearness(row, si.n, ray.d, si.t, here), nearness)
         if self._environment is not None:
             here = active & has_density & ~si.is_valid()
