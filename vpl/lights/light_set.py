@@ -123,7 +123,7 @@ class LightSet:
 def _leaf_ranges(tree: LightTree) -> np.ndarray:
     """Begin and end of every node's lights in ``tree.leaf_order``: (2n - 1, 2)."""
     node = np.arange(len(tree.records))
-    leaves_before = np.concatenate([[0], np.cumsum(tree.escape == node + 1)])
+    leaves_before = np.concatenate([[0], np.cumsum(tree.is_leaf)])
     return np.stack([leaves_before[node], leaves_before[tree.escape]], axis=1)
 
 

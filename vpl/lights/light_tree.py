@@ -84,6 +84,11 @@ class LightTree:
         """(2n - 1,) uint32 view: representative light of each node, an index into the caller's arrays."""
         return self.records.view(np.uint32)[:, REPRESENTATIVE]
 
+    @property
+    def is_leaf(self) -> np.ndarray:
+        """(2n - 1,) bool: whether a node is a leaf. The leaves hold the lights in the order of ``leaf_order``."""
+        return self.escape == np.arange(len(self.records)) + 1
+
 
 def build_light_tree(position, direction, flux, rng, window=WINDOW, angular_weight=ANGULAR_WEIGHT) -> LightTree:
     """Cluster lights into a binary tree by the method of the module's docstring.

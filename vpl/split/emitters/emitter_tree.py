@@ -59,9 +59,8 @@ class EmitterTree:
         # Lower bound of the squared distance of a vertex: emitters extend beyond a single position
         place = np.column_stack([mean, _LEAST_DISTANCE**2 * variance + largest_below(tree, radius) ** 2])
         self._records = upload(mi.Float, _records(tree, place, roots))
-        leaves = np.flatnonzero(_is_leaf(tree))
         node_of_emitter = np.zeros(self.count, np.uint32)
-        node_of_emitter[tree.representative[leaves]] = leaves
+        node_of_emitter[tree.leaf_order] = np.flatnonzero(tree.is_leaf)
         self._leaf = upload(mi.UInt32, node_of_emitter)
 
     def root(self, cluster, active):
@@ -121,11 +120,6 @@ def _bits(number):
     return dr.reinterpret_array(mi.UInt32, number)
 
 
-def _is_leaf(tree: LightTree) -> np.ndarray:
-    """Mask of the nodes that hold a single emitter."""
-    return tree.escape == np.arange(len(tree.escape)) + 1
-
-
 def _records(tree: LightTree, place: np.ndarray, roots: np.ndarray) -> np.ndarray:
     """Records of all nodes, (nodes, 3, 4) float32; ``place``: mean position and least squared distance; ``roots`` of
     clusters.
@@ -135,8 +129,7 @@ def _records(tree: LightTree, place: np.ndarray, roots: np.ndarray) -> np.ndarra
     of the emitter, 0, 0, and the cluster that begins at the leaf.
     """
     records = np.zeros((len(place), _VECTORS, 4), np.float32)
-    leaf = _is_leaf(tree)
-    inner, leaves = np.flatnonzero(~leaf), np.flatnonzero(leaf)
+    inner = np.flatnonzero(~tree.is_leaf)
     # Products of intensities and squared distances stay within single precision, whatever the unit of light
     intensity = tree.records[:, INTENSITY] / tree.records[0, INTENSITY]
     right = tree.escape[inner + 1]
@@ -145,7 +138,7 @@ def _records(tree: LightTree, place: np.ndarray, roots: np.ndarray) -> np.ndarra
         records[inner, 2, index] = intensity[child]
     links = records.view(np.uint32)
     links[inner, 2, 2] = right
-    links[leaves, 2, 0] = tree.representative[leaves]
+    links[tree.is_leaf, 2, 0] = tree.leaf_order
     links[roots, 2, 3] = np.arange(len(roots)) + 1
     return records
 
@@ -154,7 +147,7 @@ def _cut(tree: LightTree, most: int) -> np.ndarray:
     """A cut of at most ``most`` nodes, sorted: divides the node with the largest intensity × size first."""
     low, high = (tree.records[:, box].astype(np.float64) for box in (BOX_MIN, BOX_MAX))
     priority = tree.records[:, INTENSITY] * np.linalg.norm(high - low, axis=1)
-    is_leaf, nodes, leaves = _is_leaf(tree), [(-priority[0], 0)], []
+    is_leaf, nodes, leaves = tree.is_leaf, [(-priority[0], 0)], []
     while nodes and len(nodes) + len(leaves) < most:
         _, node = heappop(nodes)
         if is_leaf[node]:
