@@ -48,6 +48,8 @@ from benchmarks.views import move_cameras  # noqa: E402
 NAMES = (*scenes.NAMES, "classroom", "hall")
 # Scenes where virtual lights gain little: leaves, equal emitters, gloss, masks, no noise
 HARD = ("foliage", "lamp_grid", "glossy", "veils", "furnace")
+# Parts that measure the variance between passes
+BETWEEN = ("product", "timed", "classes", "lights")
 PARTS = ("product", "timed", "denoised", "cost", "classes", "lights", "cold")
 # Light paths, as multiples of the chosen number
 SWEEP = (1 / 4, 1 / 2, 1, 2, 4)
@@ -229,6 +231,9 @@ def main() -> None:
     results.add_json_option(parser)
     options = parser.parse_args()
     results.check_json_option(parser, options)
+    least = max((2 for part in options.parts if part in BETWEEN), default=1)
+    if options.passes < least:
+        parser.error(f"--passes is {options.passes}: allowed are {least} and above for {', '.join(options.parts)}")
     if options.views < 0:
         parser.error(f"--views is {options.views}: allowed are 0 and above")
     usual = (*NAMES, *HARD) if options.parts == ["cost"] else NAMES

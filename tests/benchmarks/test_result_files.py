@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import subprocess
 import sys
 
 import pytest
@@ -64,3 +65,12 @@ def test_one_file_takes_one_part(capsys):
     with pytest.raises(SystemExit):
         results.check_json_option(parser, parser.parse_args(["--json", "a.json", "--parts", "cold", "path"]))
     assert "--parts names 2" in capsys.readouterr().err
+
+
+def test_a_variance_needs_two_passes():
+    """The benchmark tells before it renders."""
+    file = results.ROOT / "benchmarks" / "manylights.py"
+    command = [sys.executable, file, "--parts", "denoised", "timed", "--passes", "1"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 2
+    assert "--passes is 1: allowed are 2 and above for denoised, timed" in ended.stderr
