@@ -66,8 +66,8 @@ class Pass:
 
     @property
     def growth(self):
-        """Expected costs of a sample of larger passes, a list of (ratio of the sizes, cost over that in this pass) by
-        size; None if the integrator does not predict them, as for a pass with virtual lights."""
+        """Expected costs of a sample of passes of other sizes, a list of (ratio of the sizes, cost over that in this
+        pass) by size; None if the integrator does not predict them."""
         return self.statistics.get("growth")
 
     @property

@@ -12,10 +12,12 @@ so does growth that risks twice the time, for passes that are slow to start.
 Passes in parts report the time of their start, so that one pass tells the cost of any size. A second pass may have
 virtual lights where the small first pass has none, and cost more. Up to the largest size for which the first pass
 predicts the cost, it may take all of the remaining time; beyond this size, half. A pass that determines the samples of
-pixels takes less.
+pixels takes less. The samples of a pixel share the cuts of virtual lights, so a pass with lights costs less for each
+sample than a smaller one, as the smaller one predicts.
 """
 
 import math
+from typing import NamedTuple
 
 from .pass_sizes import PARTS, PROBE, USUAL, PassSizes, power_of_two
 
@@ -45,6 +47,19 @@ def sizes_of(progressive, spp=None, time=None, fixed=None, many=False):
     return TimedSizes(progressive.pixels, time, **limits)
 
 
+class Cost(NamedTuple):
+    """Expected cost of passes of up to `most` samples per pixel: `fixed` + `each` × samples, in samples of a pass that
+    is known."""
+
+    most: float
+    fixed: float
+    each: float
+
+    def of(self, size):
+        """Return the expected cost of a pass of this `size`."""
+        return self.fixed + self.each * size
+
+
 class TimedSizes(PassSizes):
     """Sizes of the passes of an image that ends after `time` seconds, or by another limit of `PassSizes` before."""
 
@@ -55,7 +70,7 @@ class TimedSizes(PassSizes):
         self._known = {}  # size -> seconds of the last pass; not of the first pass, which is slower
         self._starts = {}  # size -> seconds to start the last pass, of passes that report them
         self._lit = False  # whether a pass had virtual lights
-        self._predicted = []  # (largest size, cost of a sample over those so far, at most) of ranges of sizes
+        self._predicted = []  # costs as `_costs_by_size` returns them; empty if no pass predicted any
         self._kernel_seconds = 0.0  # expected compilation of the next pass
         self._dearer = 1.0  # expected cost of a sample of the next pass over that of known passes
         self._before = None  # number of passes from a checkpoint; None until the first call
@@ -94,10 +109,9 @@ class TimedSizes(PassSizes):
         if last.start_seconds is not None:
             self._starts[self._asked] = last.start_seconds
             self._lit |= last.has_lights
-            if last.growth:
-                costs = [UNSURE * cost if cost > 1 else 1.0 for _, cost in last.growth]
-                sizes = [round(times * self._asked) for times, _ in last.growth]
-                self._predicted = list(zip(sizes, costs, strict=True))
+            # Over the cost of the pass by which `_line` goes
+            if last.growth and self._asked >= max(self._known, default=0):
+                self._predicted = _costs_by_size(last.growth, self._asked)
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
         if not is_first:
             before = self._known.get(self._asked, seconds)
@@ -121,7 +135,7 @@ class TimedSizes(PassSizes):
             if self._any_size:
                 return self._kept(self._filling(wanted))
             start, each = line
-            each *= self._last_cost if self._may_be_lit else 1.0
+            each *= self._costs[-1].each
             return min(power_of_two((wanted - start) / each), MOST_GROWTH * self._current)
         grown = power_of_two(self._current * wanted / max(seconds, 1e-6))
         if repeated and seconds < wanted:
@@ -141,7 +155,7 @@ class TimedSizes(PassSizes):
         if self.is_probe:
             left = PROBE * min(left, PART_SECONDS)
         elif self._any_size and self._may_be_lit:
-            left, predicted = DOUBT * left, self._predicted[-1][0] if self._predicted else 0
+            left, predicted = DOUBT * left, self._predicted[-2].most if self._predicted else 0
         if self._any_size and self._line():
             filling = max(self._filling(left), min(self._filling(whole), predicted))
             # Without virtual lights, small passes are as good as large ones
@@ -160,30 +174,33 @@ class TimedSizes(PassSizes):
         """Whether the next pass may be the first one with virtual lights, and its cost is not known."""
         return not self._known and not self._lit
 
-    def _cost_of(self, size):
-        """Return the expected cost of a sample of a pass with virtual lights, over those so far."""
-        return next((cost for most, cost in self._predicted if size <= most), self._last_cost)
+    @property
+    def _of_larger(self):
+        """Costs by size of passes that may have virtual lights where those so far have none."""
+        return self._predicted or [Cost(math.inf, 0.0, LIT)]
 
     @property
-    def _last_cost(self):
-        return self._predicted[-1][1] if self._predicted else LIT
+    def _costs(self):
+        """Costs by size."""
+        if self._may_be_lit:
+            return self._of_larger
+        return (self._lit and self._predicted) or [Cost(math.inf, 0.0, 1.0)]
 
     def _filling(self, seconds):
         """Return the largest size of a pass of some `seconds`, by its expected cost."""
         start, each = self._line()
         affordable = (seconds - self._kernel_seconds - start) / (self._dearer * each)
-        ranges = [*self._predicted, (math.inf, self._last_cost)] if self._may_be_lit else [(math.inf, 1.0)]
         found = before = 0
-        for most, cost in ranges:
-            size = int(min(affordable / cost, most))
+        for cost in self._costs:
+            size = int(min((affordable - cost.fixed) / cost.each, cost.most))
             # The cost is that of sizes beyond the range before
-            found, before = size if size > before else found, most
+            found, before = size if size > before else found, cost.most
         return found
 
     def _certain(self, size):
         """Return the largest size up to `size` that takes no longer than expected if its pass has virtual lights."""
         known = max(self._known, default=0)
-        return int(size if self._lit or not known else min(size, max(known, size / self._cost_of(size))))
+        return int(size if self._lit or not known else min(size, max(known, size**2 / _cost(self._of_larger, size))))
 
     def _wanted(self):
         """Return the intended seconds of a pass."""
@@ -202,7 +219,7 @@ class TimedSizes(PassSizes):
             large, longest = max((self._known or self._seconds).items())
             line = 0.0, longest / large
         start, each = line
-        return start + each * size * (self._cost_of(size) if self._starts and self._may_be_lit else 1.0)
+        return start + each * (_cost(self._costs, size) if self._starts else size)
 
     def _line(self):
         """Return the seconds to start a pass, and the seconds per sample per pixel of known passes; None if unknown.
@@ -223,3 +240,28 @@ class TimedSizes(PassSizes):
         each = (longest - self._known[small]) / (large - small)
         each = min(max(each, LEAST_SHARE * longest / large), longest / large)
         return longest - each * large, each
+
+
+def _costs_by_size(growth, size):
+    """Return the costs of passes, a list of `Cost` by size up to infinity, as a pass of this `size` predicts them by
+    its `growth`: (ratio of the sizes, cost of a sample over that in this pass) by size."""
+    costs, before, total, last = [], 0, 0.0, 0.0
+    for times, predicted in growth:
+        most = times * size
+        if most != int(most):
+            continue
+        cost = UNSURE * predicted if predicted > 1 else min(UNSURE * predicted, 1.0)
+        # Where the samples of a pixel share cuts, the whole cost grows in proportion to samples beyond a fixed part
+        shares = 0 < cost < last and cost * most > total
+        each = (cost * most - total) / (most - before) if shares else cost
+        costs.append(Cost(most, total - each * before if shares else 0.0, each))
+        before, total, last = most, cost * most, cost
+    if len(costs) > 1 and costs[1].fixed:
+        # The fixed part of smaller passes is the same
+        costs[0] = costs[1]._replace(most=costs[0].most)
+    return [*costs, Cost(math.inf, 0.0, last)]
+
+
+def _cost(costs, size):
+    """Return the cost of a pass of this `size`, by `costs` by size."""
+    return next(cost for cost in costs if size <= cost.most).of(size)

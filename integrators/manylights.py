@@ -36,7 +36,7 @@ _SHARED_SAMPLES = 16
 # Largest depth that prb can count, with 32 bits
 _DEEPEST = 2**32 - 1
 # Ratios of the sizes of later passes of a render, of which a pass predicts the cost
-_LARGER = 1.5, 2, 4, 8, 16
+_OTHER_SIZES = 0.25, 0.5, 1, 1.5, 2, 4, 8, 16
 # Names of channels and layers of images, which are no names of groups of emitters
 _RESERVED = (*LENGTHS, OTHER, "albedo", "normal", "depth", *"RGBAXYZ")
 
@@ -280,8 +280,9 @@ class ManyLightsIntegrator(PassRenderer):
         found = estimate(view, start, kept, self.should_stop, clock)
         # Later passes share the pilot and its measurements
         self.statistics = found.statistics | {"pilots": int(known is None), "measured": start.measured - before}
-        if shared and not found.decision.plan.gathers:
-            self.statistics["growth"] = [(times, found.decision.growth(times)) for times in _LARGER]
+        if shared:
+            rays = self.statistics.get("shadow_rays", 0) / view.pixels
+            self.statistics["growth"] = [(times, found.decision.growth(times, rays)) for times in _OTHER_SIZES]
         channels = [channel for name in self._layer_names for channel in found.layers[name]]
         if self._pass.half:
             number = cells.places(dr.arange(mi.UInt32, view.count)).number

@@ -309,6 +309,36 @@ def test_in_parts_costs_may_be_predicted_for_several_sizes():
     assert second_size([3.0, 1.0], time=2.4) == 25
 
 
+def lit_passes(time, traced, cuts, pixels=SQUARE):
+    """Sizes and seconds of passes with virtual lights: `traced` seconds for each sample, and `cuts` for a pass of any
+    size, as predicted."""
+    sizes, passes, elapsed = TimedSizes(pixels, time, in_parts=True), [], 0.0
+
+    def seconds_of(size):
+        return size * traced + cuts
+
+    while not isinstance(spp := sizes.next(passes, elapsed), str):
+        ratios = (1 / 4, 1 / 2, 1, 1.5, 2, 4, 8, 16)
+        growth = [(ratio, seconds_of(ratio * spp) / ratio / seconds_of(spp)) for ratio in ratios]
+        stages = {Stage.TRACED: spp * traced, Stage.CUTS: cuts}
+        passes.append(Pass(0, spp, seconds_of(spp) + 0.1, {"seconds": stages, "growth": growth}, 0.0))
+        elapsed += passes[-1].seconds
+    return [one.spp for one in passes], elapsed
+
+
+def test_in_parts_samples_share_the_cuts_of_their_pixel():
+    """Passes of one sample would take 6.1 seconds each, four samples 8.8."""
+    sizes, elapsed = lit_passes(30, 0.9, 5.1, pixels=1280 * 720)
+    assert sizes == [1, 4, 4] and elapsed < 30
+
+
+@pytest.mark.parametrize("cuts", (0.0, 0.5, 2.0, 5.0))
+@pytest.mark.parametrize("time", (10, 20, 60))
+def test_in_parts_shared_cuts_hardly_exceed_the_time(time, cuts):
+    _, elapsed = lit_passes(time, 0.1, cuts)
+    assert 0.7 * time < elapsed < 1.15 * time
+
+
 def test_in_parts_samples_after_a_probe_are_expected_to_cost_more():
     """Samples of pixels with different numbers cost 8% more."""
     sizes, passes, elapsed = TimedSizes(SQUARE // 2, 10, in_parts=True, probes=True), [], 0.0

@@ -85,7 +85,7 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
 
 def decide(view: View, start: Start) -> Decision:
     """Compare the kinds of virtual lights for a view of a certain size."""
-    evidence = evidence_of(view, start.pilot)
+    evidence = evidence_of(view, start)
     plan = without_lights(start.refusal) if start.refusal else choose(evidence, start.options)
     return Decision(start.pilot, evidence, plan, start.options)
 

@@ -106,6 +106,11 @@ class Pilot:
         """Mean radiance around each path, (n,), estimated from the remaining paths."""
         return self._of_others[0]
 
+    @cached_property
+    def direct(self) -> np.ndarray:
+        """Radiance (n,) without emission on first edges and without the part through arrivals."""
+        return self.radiance - self.seen - self.indirect
+
     def nearby(self, values: np.ndarray) -> np.ndarray:
         """Mean of the paths' ``values`` (n,) around each pixel of the image, (pixels,)."""
         return pixel_means(values, self.pixel, *self.size, self._of_others[1])

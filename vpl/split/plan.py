@@ -9,7 +9,7 @@ which virtual lights do not change.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,7 +29,7 @@ class Plan:
     lights represent emitters; ``error``: bound of the cuts, as a fraction of the pixel; ``vertices``: lit vertices per
     pixel; ``variance``: remaining relative variance of a camera path; ``shared``: variance of the lights and of the
     choice of lit vertices, in the same unit; ``cost`` of a path with its share of lights and cuts, over that of a path
-    alone; ``reason`` in words.
+    alone; ``rays``: shadow rays of a pixel's cuts; ``reason`` in words.
     """
 
     light_paths: int
@@ -39,6 +39,7 @@ class Plan:
     variance: float
     shared: float
     cost: float
+    rays: float
     reason: str
 
     @property
@@ -68,12 +69,12 @@ class Option:
         if self.to_measure:
             self.residual, self.to_measure = self.to_measure(), None
 
-    @property
+    @cached_property
     def expected(self) -> np.ndarray:
         """Expected radiance (n,) without the part carried by virtual lights."""
         return self.traced - self.indirect * self.surfaces
 
-    @property
+    @cached_property
     def concentration(self) -> float:
         """Mean square of the indirect light over the squared mean."""
         total = np.sum(self.indirect)
@@ -98,7 +99,7 @@ class Evidence:
 
     ``radiance`` (n,) of the pilot's paths, in pairs; ``seen`` (n,): emission on their first edges; ``direct`` (n,):
     without ``seen`` and the part available to lights on surfaces; ``brightness`` (n,) of the image nearby;
-    ``emitters``: whether lights may represent many emitters.
+    ``emitters``: whether lights may represent many emitters; ``known``: results of :meth:`_once`, which passes share.
     """
 
     radiance: np.ndarray
@@ -109,6 +110,7 @@ class Evidence:
     samples: int
     emitters: bool
     model: CostModel
+    known: dict = field(default_factory=dict, repr=False)
 
     @cached_property
     def whole(self) -> float:
@@ -123,10 +125,23 @@ class Evidence:
         """
         model, edges = self.model, self.samples**-0.5
         retained = max(model.stratified_many if self.emitters else model.stratified, edges)
-        whole = relative_variance(radiance, self.brightness, model)
-        unseen = min(relative_variance(radiance - self.seen, self.brightness, model), whole)
-        direct = min(relative_variance(self.direct, self.brightness, model), unseen)
+        whole = self.relative(radiance)
+        unseen = min(self._once("unseen", radiance, lambda values: values - self.seen), whole)
+        direct = min(self.relative(self.direct), unseen)
         return edges * (whole - unseen) + unseen - (1 - retained) * direct
+
+    def relative(self, values: np.ndarray) -> float:
+        """Relative variance of the ``values`` (n,) of paths."""
+        return self._once("whole", values, lambda values: values)
+
+    def _once(self, name: str, values: np.ndarray, part: Callable[[np.ndarray], np.ndarray]) -> float:
+        """Relative variance of a ``part`` of the ``values`` (n,), computed once for each array and ``name``: sorting
+        the errors of a large pilot takes milliseconds, and each pass compares many sizes."""
+        key = name, id(values), self.model
+        if key not in self.known:
+            # With the array: otherwise, another array could get its id
+            self.known[key] = values, relative_variance(part(values), self.brightness, self.model)
+        return self.known[key][1]
 
 
 @dataclass(frozen=True)
@@ -144,14 +159,22 @@ class Decision:
         remains = next(x.expected for x in self.options if (x.surfaces, x.emitters) == kinds)
         return np.maximum(self.pilot.nearby(self.pilot.radiance - remains), 0)
 
-    def growth(self, times: float) -> float:
+    def growth(self, times: float, rays: float | None = None) -> float:
         """Expected cost of a path of a pass with ``times`` as many samples, over that in this pass: larger passes may
-        have virtual lights where this one has none."""
+        have virtual lights where this one has none, and more samples share the cuts of a pixel.
+
+        ``rays``: shadow rays of a pixel's cuts in this pass, None for the expected number.
+        """
         if not self.options:
             return 1.0
-        paths, samples = round(times * self.evidence.paths), round(times * self.evidence.samples)
-        larger = replace(self.evidence, paths=paths, samples=samples)
-        return choose(larger, self.options, measures=False).cost / self.plan.cost
+        paths, samples = (max(round(times * x), 1) for x in (self.evidence.paths, self.evidence.samples))
+        other = replace(self.evidence, paths=paths, samples=samples)
+        excess = (rays / self.plan.rays if rays and self.plan.rays else 1.0) - 1
+        of_other, of_this = (
+            plan.cost + excess * of.model.ray_cost * plan.rays / of.samples
+            for plan, of in ((choose(other, self.options, measures=False), other), (self.plan, self.evidence))
+        )
+        return of_other / of_this
 
     def precision(self, samples: int) -> float:
         """Expected inverse of the relative variance of a pixel with ``samples``; ``samples`` for a black image.
@@ -187,7 +210,7 @@ def choose(evidence: Evidence, options: list[Option], measures: bool = True) -> 
 
 def without_lights(reason: str) -> Plan:
     """The plan of an image without virtual lights."""
-    return Plan(0, False, 0.0, 0, 0.0, 0.0, 1.0, reason)
+    return Plan(0, False, 0.0, 0, 0.0, 0.0, 1.0, 0.0, reason)
 
 
 def price(evidence: Evidence, option: Option) -> float:
@@ -228,7 +251,7 @@ def _priced_with(evidence: Evidence, option: Option, rest: float) -> tuple[float
     shared = model.vertex_variance * samples / vertices
     if light_paths:
         shared += samples * model.light_variance * _indirect_variance(evidence, option) / light_paths
-    plan = Plan(light_paths, option.emitters, error, vertices, left, shared, cost, "")
+    plan = Plan(light_paths, option.emitters, error, vertices, left, shared, cost, cuts * rays, "")
     return cost * left**model.denoised_power, plan
 
 
@@ -246,7 +269,7 @@ def _cut_rays(rest: float, samples: int, model: CostModel) -> tuple[float, float
 
 def _indirect_variance(evidence: Evidence, option: Option) -> float:
     """Relative variance of the indirect light of a camera path."""
-    return relative_variance(option.indirect, evidence.brightness, evidence.model)
+    return evidence.relative(option.indirect)
 
 
 def _light_paths(evidence: Evidence, option: Option, left: float) -> int:

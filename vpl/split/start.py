@@ -30,7 +30,7 @@ class Start:
     if ``learned``; ``options``: kinds of lights to compare, empty if ``refusal`` holds a reason against lights.
 
     ``paths``: number of camera rays that sized the learning; ``seed`` of the first pass; ``later``: samplers of
-    emitters by the size of passes, see :meth:`emitters_for`.
+    emitters by the size of passes, see :meth:`emitters_for`; ``known``: see :class:`vpl.split.plan.Evidence`.
     """
 
     pilot: Pilot
@@ -41,6 +41,7 @@ class Start:
     paths: int
     seed: int
     later: dict[int, EmitterSampler] = field(default_factory=dict)
+    known: dict = field(default_factory=dict)
 
     @property
     def measured(self) -> int:
@@ -104,12 +105,13 @@ def is_certain_rise(before: np.ndarray, after: np.ndarray, model: CostModel) -> 
     return len(rise) > 1 and bool(rise.mean() > rise.std(ddof=1) / len(rise) ** 0.5)
 
 
-def evidence_of(view: View, pilot: Pilot) -> Evidence:
-    """Measurements of a pilot for the size of a view."""
-    emitters, direct = _may_carry_emitters(view), pilot.radiance - pilot.seen - pilot.indirect
+def evidence_of(view: View, start: Start) -> Evidence:
+    """Measurements of the pilot of a start for the size of a view."""
+    pilot, emitters = start.pilot, _may_carry_emitters(view)
     return Evidence(
-        pilot.radiance, pilot.seen, direct, pilot.brightness, view.count, view.samples, emitters, view.model
-    )
+        pilot.radiance, pilot.seen, pilot.direct, pilot.brightness, view.count, view.samples, emitters, view.model,
+        start.known,
+    )  # fmt: skip
 
 
 def _may_carry_emitters(view: View) -> bool:

@@ -5,8 +5,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from vpl.split import plan
 from vpl.split.cost_model import CostModel, table
-from vpl.split.plan import Evidence, Option, choose, price
+from vpl.split.plan import Decision, Evidence, Option, choose, price
 
 DENOISED = CostModel()
 # Lights pay as in raw images, and are as many as in denoised ones
@@ -161,6 +162,40 @@ def test_no_residual_lowers_a_price(samples):
     assumed = price(evidence, option)
     for share in np.geomspace(0.1, 1, 100):
         assert price(evidence, measured(option, share * direct)) >= assumed
+
+
+def decision(samples, pixels=10**6):
+    """The decision for an image whose indirect light is all of its noise."""
+    indirect = 3 * np.random.default_rng(0).exponential(size=10_000)
+    option = Option(True, False, indirect, indirect)
+    evidence = Evidence(indirect, UNSEEN, 0 * indirect, np.ones(10_000), samples * pixels, samples, False, MODEL)
+    return Decision(None, evidence, choose(evidence, [option]), [option])
+
+
+def test_samples_of_larger_passes_share_cuts():
+    """The largest error bound limits how coarse the cuts of few samples are."""
+    one = decision(1)
+    assert one.plan.gathers and one.growth(1) == 1
+    costs = [one.growth(times) for times in (1, 2, 4, 8, 16)]
+    assert (np.diff(costs) < 0).all() and costs[2] < 0.7
+    # The whole pass costs more
+    assert (np.diff(np.multiply(costs, (1, 2, 4, 8, 16))) > 0).all()
+
+
+def test_cuts_with_more_rays_than_expected_are_a_larger_part_of_the_cost():
+    one = decision(1)
+    expected = one.plan.rays
+    assert one.growth(4, expected) == pytest.approx(one.growth(4))
+    assert one.growth(4, 4 * expected) < one.growth(4) < one.growth(4, 0.5 * expected)
+    assert one.growth(1, 4 * expected) == 1
+
+
+def test_the_variance_of_paths_is_computed_once(monkeypatch):
+    one, calls = decision(16), []
+    monkeypatch.setattr(plan, "relative_variance", lambda *arguments: calls.append(arguments))
+    for times in (1, 4, 16):
+        one.growth(times)
+    assert not calls
 
 
 def test_more_vertices_are_lit_the_less_noise_there_is_besides():
