@@ -231,9 +231,11 @@ def main() -> None:
     results.add_json_option(parser)
     options = parser.parse_args()
     results.check_json_option(parser, options)
-    least = max((2 for part in options.parts if part in BETWEEN), default=1)
+    between = [part for part in options.parts if part in BETWEEN]
+    least = 2 if between else 1
     if options.passes < least:
-        parser.error(f"--passes is {options.passes}: allowed are {least} and above for {', '.join(options.parts)}")
+        of_parts = f" for {', '.join(between)}" if between else ""
+        parser.error(f"--passes is {options.passes}: allowed are {least} and above{of_parts}")
     if options.views < 0:
         parser.error(f"--views is {options.views}: allowed are 0 and above")
     usual = (*NAMES, *HARD) if options.parts == ["cost"] else NAMES

@@ -48,16 +48,12 @@ def sizes_of(progressive, spp=None, time=None, fixed=None, many=False):
 
 
 class Cost(NamedTuple):
-    """Expected cost of passes of up to `most` samples per pixel: `fixed` + `each` × samples, in samples of a pass that
-    is known."""
+    """Expected cost of passes of up to `most` samples per pixel: `fixed` + `each` × samples, over the cost of a sample
+    of the pass that is the reference."""
 
     most: float
     fixed: float
     each: float
-
-    def of(self, size):
-        """Return the expected cost of a pass of this `size`."""
-        return self.fixed + self.each * size
 
 
 class TimedSizes(PassSizes):
@@ -70,7 +66,7 @@ class TimedSizes(PassSizes):
         self._known = {}  # size -> seconds of the last pass; not of the first pass, which is slower
         self._starts = {}  # size -> seconds to start the last pass, of passes that report them
         self._lit = False  # whether a pass had virtual lights
-        self._predicted = []  # costs as `_costs_by_size` returns them; empty if no pass predicted any
+        self._growth = {}  # size -> costs of other sizes that the last pass predicted, see `Pass.growth`
         self._kernel_seconds = 0.0  # expected compilation of the next pass
         self._dearer = 1.0  # expected cost of a sample of the next pass over that of known passes
         self._before = None  # number of passes from a checkpoint; None until the first call
@@ -90,7 +86,9 @@ class TimedSizes(PassSizes):
         """See `PassSizes`: a low estimate where time ends the render and later passes may have virtual lights."""
         left = [self._spp - done] if self._spp is not None else []
         if self._line():
-            left.append(self._filling(self._time - elapsed))
+            rest = self._time - elapsed
+            wanted = min(self._wanted(), rest)
+            left.append(self._filling(wanted) * rest / wanted if wanted > 0 else 0)
         return done + min(left, default=math.inf)
 
     def _intended(self, done):
@@ -109,9 +107,7 @@ class TimedSizes(PassSizes):
         if last.start_seconds is not None:
             self._starts[self._asked] = last.start_seconds
             self._lit |= last.has_lights
-            # Over the cost of the pass by which `_line` goes
-            if last.growth and self._asked >= max(self._known, default=0):
-                self._predicted = _costs_by_size(last.growth, self._asked)
+            self._growth[self._asked] = last.growth or []
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
         if not is_first:
             before = self._known.get(self._asked, seconds)
@@ -132,11 +128,8 @@ class TimedSizes(PassSizes):
     def _grown(self, seconds, wanted, repeated, line):
         """Return the size of a pass of at most `wanted` seconds, from the `seconds` of a pass of the current size."""
         if line:
-            if self._any_size:
-                return self._kept(self._filling(wanted))
-            start, each = line
-            each *= self._costs[-1].each
-            return min(power_of_two((wanted - start) / each), MOST_GROWTH * self._current)
+            filling = self._filling(wanted)
+            return self._kept(filling) if self._any_size else min(power_of_two(filling), MOST_GROWTH * self._current)
         grown = power_of_two(self._current * wanted / max(seconds, 1e-6))
         if repeated and seconds < wanted:
             # Without this, a pass with a dominant start would never grow
@@ -161,13 +154,18 @@ class TimedSizes(PassSizes):
             # Without virtual lights, small passes are as good as large ones
             if self._known and filling < (LEAST_GAIN * size if self._lit else least):
                 return 0
-            certain = self._kept(self._certain(filling))
+            certain = self._kept(min(self._certain(filling), self._largest))
             # A single last pass, instead of several ever smaller ones
-            if least <= certain <= self._largest and filling < (size if self._spp else 2 * size):
+            if least <= certain and self._is_last(filling, size, whole):
                 return certain
         while size > least and self._expected(size) > left:
             size = max(least, power_of_two(size - 1))
         return size if self._expected(size) <= max(2 * left, whole) else 0
+
+    def _is_last(self, filling, size, left):
+        """Return whether the next pass is the last one, of about `filling` samples that the `left` seconds allow: after
+        a pass of the usual `size` there would be no time for another one."""
+        return filling < size if self._spp else self._filling(left - self._expected(size)) < size
 
     @property
     def _may_be_lit(self):
@@ -175,15 +173,25 @@ class TimedSizes(PassSizes):
         return not self._known and not self._lit
 
     @property
-    def _of_larger(self):
+    def _reference(self):
+        """The size of the pass that others are compared with, 0 if there is none."""
+        return max(self._known or self._starts, default=0)
+
+    @property
+    def _predicted(self):
+        """Costs by size as the reference predicts them; empty if it predicts none."""
+        return _costs_by_size(self._growth.get(self._reference, []), self._reference)
+
+    @property
+    def _with_lights(self):
         """Costs by size of passes that may have virtual lights where those so far have none."""
         return self._predicted or [Cost(math.inf, 0.0, LIT)]
 
     @property
     def _costs(self):
-        """Costs by size."""
+        """Costs by size: those of the reference for every sample if no pass had virtual lights."""
         if self._may_be_lit:
-            return self._of_larger
+            return self._with_lights
         return (self._lit and self._predicted) or [Cost(math.inf, 0.0, 1.0)]
 
     def _filling(self, seconds):
@@ -200,7 +208,9 @@ class TimedSizes(PassSizes):
     def _certain(self, size):
         """Return the largest size up to `size` that takes no longer than expected if its pass has virtual lights."""
         known = max(self._known, default=0)
-        return int(size if self._lit or not known else min(size, max(known, size**2 / _cost(self._of_larger, size))))
+        if self._lit or not known:
+            return size
+        return int(min(size, max(known, size / _cost_of_sample(self._with_lights, max(size, 1)))))
 
     def _wanted(self):
         """Return the intended seconds of a pass."""
@@ -219,7 +229,7 @@ class TimedSizes(PassSizes):
             large, longest = max((self._known or self._seconds).items())
             line = 0.0, longest / large
         start, each = line
-        return start + each * (_cost(self._costs, size) if self._starts else size)
+        return start + each * size * (_cost_of_sample(self._costs, size) if self._starts else 1.0)
 
     def _line(self):
         """Return the seconds to start a pass, and the seconds per sample per pixel of known passes; None if unknown.
@@ -227,7 +237,7 @@ class TimedSizes(PassSizes):
         From the shortest start that passes report, or else from the largest size and the least one within
         `MOST_GROWTH` of it.
         """
-        large = max(self._known or self._starts, default=0)
+        large = self._reference
         longest = self._known.get(large) or self._seconds.get(large)
         if large in self._starts:
             each = max((longest - self._starts[large]) / large, LEAST_SHARE * longest / large)
@@ -244,13 +254,12 @@ class TimedSizes(PassSizes):
 
 def _costs_by_size(growth, size):
     """Return the costs of passes, a list of `Cost` by size up to infinity, as a pass of this `size` predicts them by
-    its `growth`: (ratio of the sizes, cost of a sample over that in this pass) by size."""
+    its `growth`: (ratio of the sizes, cost of a sample over that in this pass) by size; empty for an empty `growth`."""
     costs, before, total, last = [], 0, 0.0, 0.0
     for times, predicted in growth:
-        most = times * size
-        if most != int(most):
-            continue
-        cost = UNSURE * predicted if predicted > 1 else min(UNSURE * predicted, 1.0)
+        most, cost = times * size, predicted
+        if times > 1:
+            cost = UNSURE * predicted if predicted > 1 else min(UNSURE * predicted, 1.0)
         # Where the samples of a pixel share cuts, the whole cost grows in proportion to samples beyond a fixed part
         shares = 0 < cost < last and cost * most > total
         each = (cost * most - total) / (most - before) if shares else cost
@@ -259,9 +268,10 @@ def _costs_by_size(growth, size):
     if len(costs) > 1 and costs[1].fixed:
         # The fixed part of smaller passes is the same
         costs[0] = costs[1]._replace(most=costs[0].most)
-    return [*costs, Cost(math.inf, 0.0, last)]
+    return [*costs, Cost(math.inf, 0.0, last)] if costs else []
 
 
-def _cost(costs, size):
-    """Return the cost of a pass of this `size`, by `costs` by size."""
-    return next(cost for cost in costs if size <= cost.most).of(size)
+def _cost_of_sample(costs, size):
+    """Return the cost of a sample of a pass of this `size`, by `costs` by size."""
+    found = next(cost for cost in costs if size <= cost.most)
+    return found.fixed / size + found.each

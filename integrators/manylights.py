@@ -7,6 +7,7 @@ from contextlib import contextmanager, nullcontext
 import drjit as dr
 import mitsuba as mi
 
+from vpl.core.arrays import NO_LIMIT
 from vpl.core.clock import Clock
 from vpl.core.exclusive import exclusive
 from vpl.core.garbage import garbage_kept
@@ -280,9 +281,12 @@ class ManyLightsIntegrator(PassRenderer):
         found = estimate(view, start, kept, self.should_stop, clock)
         # Later passes share the pilot and its measurements
         self.statistics = found.statistics | {"pilots": int(known is None), "measured": start.measured - before}
-        if shared:
+        # Mitsuba's passes of `samples_per_pass` have the same size in larger renders
+        if shared and self.samples_per_pass == NO_LIMIT:
             rays = self.statistics.get("shadow_rays", 0) / view.pixels
-            self.statistics["growth"] = [(times, found.decision.growth(times, rays)) for times in _OTHER_SIZES]
+            sizes = sorted({max(round(times * view.samples), 1) for times in _OTHER_SIZES})
+            growth = [(size / view.samples, found.decision.growth(size, rays)) for size in sizes]
+            self.statistics["growth"] = growth
         channels = [channel for name in self._layer_names for channel in found.layers[name]]
         if self._pass.half:
             number = cells.places(dr.arange(mi.UInt32, view.count)).number

@@ -73,4 +73,4 @@ def test_a_variance_needs_two_passes():
     command = [sys.executable, file, "--parts", "denoised", "timed", "--passes", "1"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert ended.returncode == 2
-    assert "--passes is 1: allowed are 2 and above for denoised, timed" in ended.stderr
+    assert "--passes is 1: allowed are 2 and above for timed" in ended.stderr

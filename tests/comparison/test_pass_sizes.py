@@ -3,11 +3,12 @@
 import math
 from collections import Counter
 
+import numpy as np
 import pytest
 
 from comparison.pass_sizes import PassSizes
 from comparison.single_pass import MAXIMUM_PASS_SAMPLES, Pass
-from comparison.timed_sizes import PASS_SECONDS, TimedSizes
+from comparison.timed_sizes import PASS_SECONDS, TimedSizes, _cost_of_sample, _costs_by_size
 from vpl.core.stages import Stage
 
 SQUARE = 256 * 256
@@ -309,19 +310,19 @@ def test_in_parts_costs_may_be_predicted_for_several_sizes():
     assert second_size([3.0, 1.0], time=2.4) == 25
 
 
-def lit_passes(time, traced, cuts, pixels=SQUARE):
+def lit_passes(time, traced, cuts, pixels=SQUARE, predicts=True, **limits):
     """Sizes and seconds of passes with virtual lights: `traced` seconds for each sample, and `cuts` for a pass of any
     size, as predicted."""
-    sizes, passes, elapsed = TimedSizes(pixels, time, in_parts=True), [], 0.0
+    sizes, passes, elapsed = TimedSizes(pixels, time, in_parts=True, **limits), [], 0.0
 
     def seconds_of(size):
         return size * traced + cuts
 
     while not isinstance(spp := sizes.next(passes, elapsed), str):
-        ratios = (1 / 4, 1 / 2, 1, 1.5, 2, 4, 8, 16)
-        growth = [(ratio, seconds_of(ratio * spp) / ratio / seconds_of(spp)) for ratio in ratios]
-        stages = {Stage.TRACED: spp * traced, Stage.CUTS: cuts}
-        passes.append(Pass(0, spp, seconds_of(spp) + 0.1, {"seconds": stages, "growth": growth}, 0.0))
+        others = {max(round(ratio * spp), 1) for ratio in (1 / 4, 1 / 2, 1, 1.5, 2, 4, 8, 16)}
+        growth = [(size / spp, seconds_of(size) / size / (seconds_of(spp) / spp)) for size in sorted(others)]
+        stages = {"seconds": {Stage.TRACED: spp * traced, Stage.CUTS: cuts}} | ({"growth": growth} if predicts else {})
+        passes.append(Pass(0, spp, seconds_of(spp) + 0.1, stages, 0.0))
         elapsed += passes[-1].seconds
     return [one.spp for one in passes], elapsed
 
@@ -329,7 +330,35 @@ def lit_passes(time, traced, cuts, pixels=SQUARE):
 def test_in_parts_samples_share_the_cuts_of_their_pixel():
     """Passes of one sample would take 6.1 seconds each, four samples 8.8."""
     sizes, elapsed = lit_passes(30, 0.9, 5.1, pixels=1280 * 720)
-    assert sizes == [1, 4, 4] and elapsed < 30
+    assert sizes == [1, 4, 8] and elapsed < 30
+    assert max(lit_passes(30, 0.9, 5.1, pixels=1280 * 720, predicts=False)[0]) < 4
+
+
+@pytest.mark.parametrize("size", (1, 3, 4, 37))
+@pytest.mark.parametrize("fixed", (0.0, 0.5, 0.9, 0.95))
+def test_predicted_costs_are_those_of_passes_with_a_fixed_part(size, fixed):
+    """Larger passes are expected to cost up to a tenth more."""
+    ratios = [one / size for one in sorted({max(round(ratio * size), 1) for ratio in (0.25, 0.5, 1, 1.5, 2, 4, 8, 16)})]
+    costs = _costs_by_size([(ratio, fixed / ratio + 1 - fixed) for ratio in ratios], size)
+    for other in range(1, 16 * size + 1):
+        expected = fixed * size / other + 1 - fixed
+        # To within the steps by which an unsure cost grows
+        assert 0.99 * expected < _cost_of_sample(costs, other) < 1.11 * expected
+    whole = [other * _cost_of_sample(costs, other) for other in range(1, 16 * size + 1)]
+    assert (np.diff(whole) > 0).all()
+
+
+def test_costs_are_those_of_the_pass_that_others_are_compared_with():
+    """A checkpoint may end with a small pass, and the first pass after it may be larger."""
+    stages = {"seconds": {Stage.TRACED: 0.4, Stage.CUTS: 2.0}, "growth": [(1, 1.0), (4, 0.4), (16, 0.2)]}
+    sizes = TimedSizes(SQUARE, 60, in_parts=True)
+    passes = [Pass(0, 4, 2.5, stages, 0.0)]
+    sizes.next(passes, 2.5)
+    larger = {"seconds": {Stage.TRACED: 1.6, Stage.CUTS: 2.0}, "growth": [(0.25, 2.7), (1, 1.0), (4, 0.6)]}
+    sizes._asked = 16
+    passes.append(Pass(0, 16, 3.7, larger, 0.0))
+    sizes.next(passes, 6.2)
+    assert sizes._expected(64) == pytest.approx(0.1 + 2.4 * 16 * 1.1 * 0.2, rel=0.01)
 
 
 @pytest.mark.parametrize("cuts", (0.0, 0.5, 2.0, 5.0))

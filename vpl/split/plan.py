@@ -99,7 +99,8 @@ class Evidence:
 
     ``radiance`` (n,) of the pilot's paths, in pairs; ``seen`` (n,): emission on their first edges; ``direct`` (n,):
     without ``seen`` and the part available to lights on surfaces; ``brightness`` (n,) of the image nearby;
-    ``emitters``: whether lights may represent many emitters; ``known``: results of :meth:`_once`, which passes share.
+    ``emitters``: whether lights may represent many emitters; ``known``: results of :meth:`_once`, which passes with
+    the same pilot share.
     """
 
     radiance: np.ndarray
@@ -110,7 +111,7 @@ class Evidence:
     samples: int
     emitters: bool
     model: CostModel
-    known: dict = field(default_factory=dict, repr=False)
+    known: dict = field(default_factory=dict, repr=False, compare=False)
 
     @cached_property
     def whole(self) -> float:
@@ -129,6 +130,10 @@ class Evidence:
         unseen = min(self._once("unseen", radiance, lambda values: values - self.seen), whole)
         direct = min(self.relative(self.direct), unseen)
         return edges * (whole - unseen) + unseen - (1 - retained) * direct
+
+    def cost(self, plan: Plan, excess: float) -> float:
+        """Cost of a path with a ``plan`` whose cuts take 1 + ``excess`` times the expected shadow rays."""
+        return plan.cost + excess * self.model.ray_cost * plan.rays / self.samples
 
     def relative(self, values: np.ndarray) -> float:
         """Relative variance of the ``values`` (n,) of paths."""
@@ -159,22 +164,19 @@ class Decision:
         remains = next(x.expected for x in self.options if (x.surfaces, x.emitters) == kinds)
         return np.maximum(self.pilot.nearby(self.pilot.radiance - remains), 0)
 
-    def growth(self, times: float, rays: float | None = None) -> float:
-        """Expected cost of a path of a pass with ``times`` as many samples, over that in this pass: larger passes may
-        have virtual lights where this one has none, and more samples share the cuts of a pixel.
+    def growth(self, samples: int, rays: float | None = None) -> float:
+        """Expected cost of a path of a pass with so many ``samples`` for a pixel, over that in this pass: larger passes
+        may have virtual lights where this one has none, and more samples share the cuts of a pixel.
 
         ``rays``: shadow rays of a pixel's cuts in this pass, None for the expected number.
         """
         if not self.options:
             return 1.0
-        paths, samples = (max(round(times * x), 1) for x in (self.evidence.paths, self.evidence.samples))
+        paths = round(self.evidence.paths * samples / self.evidence.samples)
         other = replace(self.evidence, paths=paths, samples=samples)
-        excess = (rays / self.plan.rays if rays and self.plan.rays else 1.0) - 1
-        of_other, of_this = (
-            plan.cost + excess * of.model.ray_cost * plan.rays / of.samples
-            for plan, of in ((choose(other, self.options, measures=False), other), (self.plan, self.evidence))
-        )
-        return of_other / of_this
+        excess = rays / self.plan.rays - 1 if rays is not None and self.plan.rays else 0.0
+        of_other = other.cost(choose(other, self.options, measures=False), excess)
+        return of_other / self.evidence.cost(self.plan, excess)
 
     def precision(self, samples: int) -> float:
         """Expected inverse of the relative variance of a pixel with ``samples``; ``samples`` for a black image.

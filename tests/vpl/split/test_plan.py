@@ -176,10 +176,12 @@ def test_samples_of_larger_passes_share_cuts():
     """The largest error bound limits how coarse the cuts of few samples are."""
     one = decision(1)
     assert one.plan.gathers and one.growth(1) == 1
-    costs = [one.growth(times) for times in (1, 2, 4, 8, 16)]
+    sizes = np.array([1, 2, 4, 8, 16])
+    costs = np.array([one.growth(int(size)) for size in sizes])
     assert (np.diff(costs) < 0).all() and costs[2] < 0.7
     # The whole pass costs more
-    assert (np.diff(np.multiply(costs, (1, 2, 4, 8, 16))) > 0).all()
+    assert (np.diff(costs * sizes) > 0).all()
+    assert decision(16).growth(1) == pytest.approx(1 / costs[-1])
 
 
 def test_cuts_with_more_rays_than_expected_are_a_larger_part_of_the_cost():
@@ -188,13 +190,15 @@ def test_cuts_with_more_rays_than_expected_are_a_larger_part_of_the_cost():
     assert one.growth(4, expected) == pytest.approx(one.growth(4))
     assert one.growth(4, 4 * expected) < one.growth(4) < one.growth(4, 0.5 * expected)
     assert one.growth(1, 4 * expected) == 1
+    # Without a single ray, the cuts cost nothing
+    assert one.growth(4) < one.growth(4, 0.0)
 
 
 def test_the_variance_of_paths_is_computed_once(monkeypatch):
     one, calls = decision(16), []
     monkeypatch.setattr(plan, "relative_variance", lambda *arguments: calls.append(arguments))
-    for times in (1, 4, 16):
-        one.growth(times)
+    for samples in (1, 4, 16, 64):
+        one.growth(samples)
     assert not calls
 
 
