@@ -106,6 +106,10 @@ TABLES = {
         ),
         order="speedup",
     ),
+    "denoised_wide": Table(
+        {"": ("manylights_denoised768",)},
+        (Column("ratio", ratio="speedup"), Column("over `independent`", ratio="independent_speedup")),
+    ),
     "views": Table({"": ("manylights_views",)}, (Column("ratio", ratio="speedup"),), first="scene, view"),
     "own": Table({"": ("manylights_own",)}, (Column("ratio", ratio="speedup"),)),
     "timed10": Table(
