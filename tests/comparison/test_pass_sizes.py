@@ -12,6 +12,8 @@ from comparison.timed_sizes import PASS_SECONDS, TimedSizes, _cost_of_sample, _c
 from vpl.core.stages import Stage
 
 SQUARE = 256 * 256
+# Sizes, over that of a pass, of which the pass predicts the cost
+RATIOS = 1 / 4, 1 / 2, 1, 1.5, 2, 4, 8, 16
 
 
 def render(pixels, start, each, compilation=3.0, more=None, slow=None, **limits):
@@ -310,17 +312,21 @@ def test_in_parts_costs_may_be_predicted_for_several_sizes():
     assert second_size([3.0, 1.0], time=2.4) == 25
 
 
-def lit_passes(time, traced, cuts, pixels=SQUARE, predicts=True, **limits):
+def other_sizes(size):
+    """Sizes of which a pass of a `size` predicts the cost."""
+    return sorted({max(round(ratio * size), 1) for ratio in RATIOS})
+
+
+def lit_passes(time, traced, cuts, pixels=SQUARE, predicts=True):
     """Sizes and seconds of passes with virtual lights: `traced` seconds for each sample, and `cuts` for a pass of any
     size, as predicted."""
-    sizes, passes, elapsed = TimedSizes(pixels, time, in_parts=True, **limits), [], 0.0
+    sizes, passes, elapsed = TimedSizes(pixels, time, in_parts=True), [], 0.0
 
     def seconds_of(size):
         return size * traced + cuts
 
     while not isinstance(spp := sizes.next(passes, elapsed), str):
-        others = {max(round(ratio * spp), 1) for ratio in (1 / 4, 1 / 2, 1, 1.5, 2, 4, 8, 16)}
-        growth = [(size / spp, seconds_of(size) / size / (seconds_of(spp) / spp)) for size in sorted(others)]
+        growth = [(size / spp, seconds_of(size) / size / (seconds_of(spp) / spp)) for size in other_sizes(spp)]
         stages = {"seconds": {Stage.TRACED: spp * traced, Stage.CUTS: cuts}} | ({"growth": growth} if predicts else {})
         passes.append(Pass(0, spp, seconds_of(spp) + 0.1, stages, 0.0))
         elapsed += passes[-1].seconds
@@ -338,7 +344,7 @@ def test_in_parts_samples_share_the_cuts_of_their_pixel():
 @pytest.mark.parametrize("fixed", (0.0, 0.5, 0.9, 0.95))
 def test_predicted_costs_are_those_of_passes_with_a_fixed_part(size, fixed):
     """Larger passes are expected to cost up to a tenth more."""
-    ratios = [one / size for one in sorted({max(round(ratio * size), 1) for ratio in (0.25, 0.5, 1, 1.5, 2, 4, 8, 16)})]
+    ratios = [other / size for other in other_sizes(size)]
     costs = _costs_by_size([(ratio, fixed / ratio + 1 - fixed) for ratio in ratios], size)
     for other in range(1, 16 * size + 1):
         expected = fixed * size / other + 1 - fixed

@@ -99,7 +99,7 @@ class Evidence:
 
     ``radiance`` (n,) of the pilot's paths, in pairs; ``seen`` (n,): emission on their first edges; ``direct`` (n,):
     without ``seen`` and the part available to lights on surfaces; ``brightness`` (n,) of the image nearby;
-    ``emitters``: whether lights may represent many emitters; ``known``: results of :meth:`_once`, which passes with
+    ``emitters``: whether lights may represent many emitters; ``known``: results of :meth:`relative`, which passes with
     the same pilot share.
     """
 
@@ -127,7 +127,7 @@ class Evidence:
         model, edges = self.model, self.samples**-0.5
         retained = max(model.stratified_many if self.emitters else model.stratified, edges)
         whole = self.relative(radiance)
-        unseen = min(self._once("unseen", radiance, lambda values: values - self.seen), whole)
+        unseen = min(self.relative(radiance, without_seen=True), whole)
         direct = min(self.relative(self.direct), unseen)
         return edges * (whole - unseen) + unseen - (1 - retained) * direct
 
@@ -135,17 +135,17 @@ class Evidence:
         """Cost of a path with a ``plan`` whose cuts take 1 + ``excess`` times the expected shadow rays."""
         return plan.cost + excess * self.model.ray_cost * plan.rays / self.samples
 
-    def relative(self, values: np.ndarray) -> float:
-        """Relative variance of the ``values`` (n,) of paths."""
-        return self._once("whole", values, lambda values: values)
+    def relative(self, values: np.ndarray, without_seen: bool = False) -> float:
+        """Relative variance of the ``values`` (n,) of paths, or of the values less ``seen``.
 
-    def _once(self, name: str, values: np.ndarray, part: Callable[[np.ndarray], np.ndarray]) -> float:
-        """Relative variance of a ``part`` of the ``values`` (n,), computed once for each array and ``name``: sorting
-        the errors of a large pilot takes milliseconds, and each pass compares many sizes."""
-        key = name, id(values), self.model
+        Computed once for each array: sorting the errors of a large pilot takes milliseconds, and each pass compares
+        many sizes.
+        """
+        key = id(values), without_seen, self.model
         if key not in self.known:
+            found = relative_variance(values - self.seen if without_seen else values, self.brightness, self.model)
             # With the array: otherwise, another array could get its id
-            self.known[key] = values, relative_variance(part(values), self.brightness, self.model)
+            self.known[key] = values, found
         return self.known[key][1]
 
 
