@@ -81,16 +81,12 @@ class Option:
         return len(self.indirect) * np.sum(self.indirect**2) / total**2 if total else 0.0
 
     def assumed(self, evidence: Evidence) -> float:
-        """Assumed relative variance of a path that remains."""
-        traced, model = evidence.variance(self.traced), evidence.model
-        if not self.surfaces:
-            return traced
-        return traced - model.carried_fraction * (traced - min(evidence.variance(self.expected), traced))
+        """Least relative variance of a path that remains: lights carry all of the indirect light."""
+        return min(evidence.variance(self.expected), evidence.variance(self.traced))
 
     def remaining(self, evidence: Evidence, assumed: float) -> float:
-        """Relative variance of a path that remains: the ``assumed`` value, or a much larger measured value."""
-        measured = assumed if self.residual is None else evidence.variance(self.residual)
-        return measured if measured > evidence.model.doubtful * assumed else assumed
+        """Relative variance of a path that remains: the measured value, at least the ``assumed`` one."""
+        return assumed if self.residual is None else max(evidence.variance(self.residual), assumed)
 
 
 @dataclass(frozen=True)
@@ -122,10 +118,11 @@ class Evidence:
         """Relative variance of a path with ``radiance`` (n,), where the samples of a pixel are stratified.
 
         Emitters that are seen directly make noise at their edges in the pixel.  Of it, n stratified samples retain the
-        fraction n^-0.5 [Mitchell 1996, "Consequences of stratified sampling in graphics"].
+        fraction n^-0.5 [Mitchell 1996, "Consequences of stratified sampling in graphics"].  Of the noise of direct
+        light they retain more.
         """
         model, edges = self.model, self.samples**-0.5
-        retained = max(model.stratified_many if self.emitters else model.stratified, edges)
+        retained = model.stratified_many if self.emitters else self.samples**-model.stratified_power
         whole = self.relative(radiance)
         unseen = min(self.relative(radiance, without_seen=True), whole)
         direct = min(self.relative(self.direct), unseen)
@@ -260,9 +257,12 @@ def _priced_with(evidence: Evidence, option: Option, rest: float) -> tuple[float
 def _cut_rays(rest: float, samples: int, model: CostModel) -> tuple[float, float]:
     """(Shadow rays of a pixel's cuts, error bound), where paths leave the relative variance ``rest``.
 
-    The least of (rest / samples + cut variance / rays) × (samples + rays × their cost).
+    For r rays of a sample, the least of (rest + cut variance / r)^power × (1 + r × their cost): the positive root of
+    cost × rest × r² + (1 - power) × cost × cut variance × r = power × cut variance.
     """
-    wanted = (model.cut_variance / (model.ray_cost * max(rest, 1e-9))) ** 0.5
+    power, rest = model.denoised_power, max(rest, 1e-9)
+    half = 0.5 * (1 - power) * model.cut_variance / rest
+    wanted = (half**2 + power * model.cut_variance / (model.ray_cost * rest)) ** 0.5 - half
     rays = samples * min(wanted, model.most_rays)
     # A cut has some nodes, however few rays are wanted
     error = float(np.clip((rays / model.coarse_rays) ** -model.error_slope, model.finest_error, model.coarsest_error))
