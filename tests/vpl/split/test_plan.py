@@ -52,7 +52,7 @@ def test_images_that_are_denoised_need_lights_that_remove_more_variance():
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
     none = np.zeros(10_000)
-    for share, pays in ((0.0, True), (1.2, False)):
+    for share, pays in ((0.0, True), (2.0, False)):
         traced = share * direct + indirect
         evidence = Evidence(traced, UNSEEN, share * direct + none, np.ones(10_000), 10**8, 64, False, MODEL)
         option = [Option(True, False, traced, indirect)]
@@ -81,6 +81,38 @@ def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
     indirect, direct = rng.exponential(size=(2, 10_000))
     assert balanced(0.1 * direct, indirect, 10**8, 64).light_paths > 0
     assert balanced(0.1 * direct, indirect, 10**8, 64, left=0.95 * indirect).light_paths == 0
+
+
+@pytest.mark.parametrize("power", (0.2, 0.45, 1.0))
+def test_cuts_have_the_shadow_rays_of_the_least_price(power):
+    unlimited = replace(MODEL, denoised_power=power, most_rays=1e9, finest_error=1e-12, coarsest_error=1e12)
+    tried = np.geomspace(1e-3, 1e3, 100_001)
+    for rest in (1e-4, 0.01, 1.0, 100.0):
+        prices = (rest + unlimited.cut_variance / tried) ** power * (1 + unlimited.ray_cost * tried)
+        rays, _ = plan._cut_rays(rest, 64, unlimited)
+        assert rays / 64 == pytest.approx(tried[np.argmin(prices)], rel=0.01)
+
+
+def test_stratified_samples_retain_the_less_noise_of_direct_light_the_more_they_are():
+    rng = np.random.default_rng(0)
+    direct, none = rng.exponential(size=10_000), np.zeros(10_000)
+
+    def variance(samples, emitters=False):
+        return Evidence(direct, none, direct, none + 1, 10**8, samples, emitters, MODEL).variance(direct)
+
+    assert variance(64) / variance(1) == pytest.approx(64**-MODEL.stratified_power)
+    assert variance(64, emitters=True) == variance(1)
+
+
+def test_cuts_are_the_coarser_the_more_noise_the_pilot_measures():
+    """Until it measures, lights carry all of the indirect light."""
+    rng = np.random.default_rng(0)
+    indirect, direct = 3 * rng.exponential(size=(2, 10_000))
+    found = [
+        balanced(0.1 * direct, indirect, 10**8, 64, left) for left in (None, *(x * direct for x in (0, 0.1, 0.2, 0.3)))
+    ]
+    assert found[0] == found[1] == found[2]
+    assert found[2].rays > found[3].rays > found[4].rays > 0
 
 
 def measured(option, residual):
@@ -165,9 +197,9 @@ def test_no_residual_lowers_a_price(samples):
 
 
 def decision(samples, pixels=10**6):
-    """The decision for an image whose indirect light is all of its noise."""
+    """The decision for an image whose indirect light is all of its noise, of which lights leave a tenth."""
     indirect = 3 * np.random.default_rng(0).exponential(size=10_000)
-    option = Option(True, False, indirect, indirect)
+    option = Option(True, False, indirect, indirect, residual=0.1**0.5 * indirect)
     evidence = Evidence(indirect, UNSEEN, 0 * indirect, np.ones(10_000), samples * pixels, samples, False, MODEL)
     return Decision(None, evidence, choose(evidence, [option]), [option])
 
@@ -205,7 +237,9 @@ def test_the_variance_of_paths_is_computed_once(monkeypatch):
 def test_more_vertices_are_lit_the_less_noise_there_is_besides():
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
-    found = [balanced(share * direct, indirect, 10**8, 64).vertices for share in (0.0, 0.3, 1.0)]
+    left = 0.3 * indirect
+    shares = (0.0, 0.3, 1.0)
+    found = [balanced(x * direct, indirect, 10**8, 64, left + x * direct).vertices for x in shares]
     assert 64 >= found[0] > found[1] > found[2] >= 8
     assert balanced(0.1 * direct, indirect, 10**8, 1).vertices == 1
 
@@ -223,8 +257,8 @@ def test_one_sample_has_no_noise_that_lights_could_take_away():
 
 
 def test_constants_out_of_range_are_refused_by_name():
-    with pytest.raises(ValueError, match=r"carried_fraction must be from 0 to 1, got 1\.8"):
-        CostModel(carried_fraction=1.8)
+    with pytest.raises(ValueError, match=r"stratified_power must be from 0 to 1, got 1\.8"):
+        CostModel(stratified_power=1.8)
     with pytest.raises(ValueError, match="ray_cost must be at least 0, got -1"):
         CostModel(ray_cost=-1)
 
