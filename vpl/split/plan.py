@@ -262,7 +262,9 @@ def _cut_rays(rest: float, samples: int, model: CostModel) -> tuple[float, float
     """
     power, rest = model.denoised_power, max(rest, 1e-9)
     half = 0.5 * (1 - power) * model.cut_variance / rest
-    wanted = (half**2 + power * model.cut_variance / (model.ray_cost * rest)) ** 0.5 - half
+    squared = power * model.cut_variance / (model.ray_cost * rest)
+    # The root as a fraction, because a difference would cancel for a small rest
+    wanted = squared / (half + (half**2 + squared) ** 0.5)
     rays = samples * min(wanted, model.most_rays)
     # A cut has some nodes, however few rays are wanted
     error = float(np.clip((rays / model.coarse_rays) ** -model.error_slope, model.finest_error, model.coarsest_error))
