@@ -38,10 +38,10 @@ NEGLIGIBLE = 0.2
 # Largest fraction of a limit of time for the fastest network at twice the resolution. From a half, less error would
 # remain in the usual resolution; a first pass, of four samples, takes 1.3 times as long as the network
 FINE_SHARE = 1 / 3
-# Width of the tile whose denoising is timed, pixels, least seconds that it takes, and its least part of the image;
-# smaller tiles are doubled. On two cores a tile of 64 takes 0.013 s, and a pixel of it 1.05 to 1.2 times as long as one
-# of an image of 256 to 1920. One in three measurements of so short a time is up to twice as long as the others
-TILE, TILE_SECONDS, TILE_SHARE = 64, 0.005, 0.01
+# Width of the tile whose denoising is timed, pixels; least fraction of the seconds of the image that it takes, within
+# limits in seconds; smaller tiles are doubled. On two cores a tile of 64 takes 0.013 s, and a pixel of it 1.05 to 1.2
+# times as long as one of an image of 256 to 1920. A third of these measurements are up to twice as long as the others
+TILE, TILE_SHARE, TILE_SECONDS = 64, 0.01, (0.005, 0.05)
 
 
 def import_oidn():
@@ -168,7 +168,7 @@ class Denoiser:
         while True:
             inputs = tile(width)
             seconds, size = self._seconds_of(inputs, quality), int(np.prod(inputs["color"].shape[:2]))
-            if size == whole or (seconds >= TILE_SECONDS and size >= TILE_SHARE * whole):
+            if size == whole or seconds >= np.clip(TILE_SHARE * seconds * whole / size, *TILE_SECONDS):
                 # A large image multiplies the error of a single measurement
                 return min(seconds, self._seconds_of(inputs, quality)) * whole / size
             width *= 2

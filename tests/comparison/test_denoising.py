@@ -200,6 +200,17 @@ def test_tiles_become_larger_where_the_denoiser_is_fast(monkeypatch):
     assert widths == [64, 64, 128, 256, 300, 300]
 
 
+@pytest.mark.parametrize(("seconds", "last"), ((0.01, 128), (0.06, 64)))
+def test_tiles_become_larger_where_an_image_takes_long(seconds, last, monkeypatch):
+    """A tile takes a hundredth of the time of the image, unless that is longer than a twentieth of a second."""
+    scene, widths = cornell(350).load(), []
+    monkeypatch.setattr(
+        Denoiser, "_seconds_of", lambda self, inputs, quality: widths.append(len(inputs["color"])) or seconds
+    )
+    assert Denoiser(scene, parts=2).expected_seconds == pytest.approx(seconds * 700**2 / last**2)
+    assert widths == [64, 64, last] + [128] * (last == 128)
+
+
 def made_up_networks(monkeypatch, share):
     """Networks of which the best one takes a `share` of 1000 seconds for the 40 × 40 pixels of an image."""
     times = {"high": 1.0, "balanced": 0.45, "fast": 0.24}

@@ -98,7 +98,7 @@ class CostModel:
     stratified_power: float = _constant(
         0.3,
         "exponent",
-        "Of the variance of direct light, n stratified samples retain n to the power of minus this.",
+        "Stratified samples, n in a pixel, retain the fraction n^-x of the variance of direct light; this is x.",
         "depth 2, 4, 16 and 64 samples: cornell 0.32, 0.11, 0.07, kitchen 0.61, 0.35, 0.27, staircase2 0.36, 0.19, "
         "0.15, living_room 1.1, 0.62, 0.54, dining_room 0.60, 0.47, 0.41",
         most=1,
@@ -106,8 +106,8 @@ class CostModel:
     stratified_many: float = _constant(
         1.0,
         "fraction",
-        "Fraction of this variance that they retain where there are many emitters: samples are hardly stratified over "
-        "more emitters than samples.",
+        "Fraction of the variance of direct light that stratified samples retain where there are many emitters: "
+        "samples are hardly stratified over more emitters than samples.",
         "everything8003: lights are not chosen with 0.5",
         most=1,
     )

@@ -19,6 +19,7 @@ from .pilot import Pilot, relative_variance
 from .view import ViewLights
 
 _TINY = np.finfo(np.float64).tiny
+_FEWEST_RAYS = 1e-9  # for a sample; the largest error bound limits the rays
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class Option:
         return len(self.indirect) * np.sum(self.indirect**2) / total**2 if total else 0.0
 
     def assumed(self, evidence: Evidence) -> float:
-        """Least relative variance of a path that remains: lights carry all of the indirect light."""
+        """Least relative variance of a path that remains: lights on surfaces carry all of the indirect light."""
         return min(evidence.variance(self.expected), evidence.variance(self.traced))
 
     def remaining(self, evidence: Evidence, assumed: float) -> float:
@@ -122,7 +123,9 @@ class Evidence:
         light they retain more.
         """
         model, edges = self.model, self.samples**-0.5
-        retained = model.stratified_many if self.emitters else self.samples**-model.stratified_power
+        retained = self.samples**-model.stratified_power
+        if self.emitters:
+            retained = max(model.stratified_many, retained)
         whole = self.relative(radiance)
         unseen = min(self.relative(radiance, without_seen=True), whole)
         direct = min(self.relative(self.direct), unseen)
@@ -164,6 +167,8 @@ class Decision:
     def growth(self, samples: int, rays: float | None = None) -> float:
         """Expected cost of a path of a pass with so many ``samples`` for a pixel, over that in this pass: larger passes
         may have virtual lights where this one has none, and more samples share the cuts of a pixel.
+
+        Depends on the options measured so far, unlike the plan, so only renders with a limit of time use it.
 
         ``rays``: shadow rays of a pixel's cuts in this pass, None for the expected number.
         """
@@ -224,20 +229,10 @@ def _most_to_pay(evidence: Evidence) -> float:
 
 def _priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:
     """(:func:`price`, best plan) with the lights of an option."""
-    assumed = option.assumed(evidence)
-    left = option.remaining(evidence, assumed)
-    product, plan = _priced_with(evidence, option, left)
-    if left > assumed:
-        # Limits of the numbers of lights and rays let the price fall a little where more variance remains
-        product = max(product, _priced_with(evidence, option, assumed)[0])
-    return product, plan
-
-
-def _priced_with(evidence: Evidence, option: Option, rest: float) -> tuple[float, Plan]:
-    """(Variance × cost, best plan) where paths leave the relative variance ``rest``."""
+    rest = option.remaining(evidence, option.assumed(evidence))
     model, paths, samples = evidence.model, evidence.paths, evidence.samples
     cuts = model.emitter_cuts * option.emitters + option.surfaces
-    rays, error = _cut_rays(rest, samples, model)
+    rays, error = _cut_rays(rest, cuts, samples, model)
     # Never 0, because cuts leave a variance
     left, light_paths = rest + cuts * model.cut_variance * samples / rays, 0
     if option.surfaces:
@@ -254,18 +249,19 @@ def _priced_with(evidence: Evidence, option: Option, rest: float) -> tuple[float
     return cost * left**model.denoised_power, plan
 
 
-def _cut_rays(rest: float, samples: int, model: CostModel) -> tuple[float, float]:
+def _cut_rays(rest: float, cuts: float, samples: int, model: CostModel) -> tuple[float, float]:
     """(Shadow rays of a pixel's cuts, error bound), where paths leave the relative variance ``rest``.
 
-    For r rays of a sample, the least of (rest + cut variance / r)^power × (1 + r × their cost): the positive root of
-    cost × rest × r² + (1 - power) × cost × cut variance × r = power × cut variance.
+    ``cuts``: variance and rays over those of cuts through surface lights.  For r rays of a sample, the least of
+    (rest + cuts × cut variance / r)^power × (1 + cuts × r × cost of a ray), without fixed costs.  It is the positive
+    root of cost × rest × r² + (1 - power) × cost × cuts × cut variance × r = power × cut variance.
     """
     power, rest = model.denoised_power, max(rest, 1e-9)
-    half = 0.5 * (1 - power) * model.cut_variance / rest
+    half = 0.5 * (1 - power) * cuts * model.cut_variance / rest
     squared = power * model.cut_variance / (model.ray_cost * rest)
     # The root as a fraction, because a difference would cancel for a small rest
     wanted = squared / (half + (half**2 + squared) ** 0.5)
-    rays = samples * min(wanted, model.most_rays)
+    rays = samples * min(max(wanted, _FEWEST_RAYS), model.most_rays)
     # A cut has some nodes, however few rays are wanted
     error = float(np.clip((rays / model.coarse_rays) ** -model.error_slope, model.finest_error, model.coarsest_error))
     return model.coarse_rays * error ** (-1 / model.error_slope), error

@@ -88,9 +88,10 @@ def test_cuts_have_the_shadow_rays_of_the_least_price(power):
     unlimited = replace(MODEL, denoised_power=power, most_rays=1e9, finest_error=1e-12, coarsest_error=1e12)
     tried = np.geomspace(1e-3, 1e3, 100_001)
     for rest in (1e-4, 0.01, 1.0, 100.0):
-        prices = (rest + unlimited.cut_variance / tried) ** power * (1 + unlimited.ray_cost * tried)
-        rays, _ = plan._cut_rays(rest, 64, unlimited)
-        assert rays / 64 == pytest.approx(tried[np.argmin(prices)], rel=0.01)
+        for cuts in (0.4, 1.0, 1.4):
+            variance, cost = cuts * unlimited.cut_variance / tried, cuts * unlimited.ray_cost * tried
+            rays, _ = plan._cut_rays(rest, cuts, 64, unlimited)
+            assert rays / 64 == pytest.approx(tried[np.argmin((rest + variance) ** power * (1 + cost))], rel=0.01)
 
 
 def test_stratified_samples_retain_the_less_noise_of_direct_light_the_more_they_are():
@@ -109,7 +110,7 @@ def test_cuts_are_the_coarser_the_more_noise_the_pilot_measures():
     rng = np.random.default_rng(0)
     indirect, direct = 3 * rng.exponential(size=(2, 10_000))
     found = [
-        balanced(0.1 * direct, indirect, 10**8, 64, left) for left in (None, *(x * direct for x in (0, 0.1, 0.2, 0.3)))
+        balanced(0.1 * direct, indirect, 10**8, 64, left) for left in (None, *(x * direct for x in (0, 0.05, 0.2, 0.3)))
     ]
     assert found[0] == found[1] == found[2]
     assert found[2].rays > found[3].rays > found[4].rays > 0
@@ -123,20 +124,21 @@ def measured(option, residual):
     return found
 
 
+@pytest.mark.parametrize("model", (MODEL, DENOISED))
 @pytest.mark.parametrize("emitters", (False, True))
 @pytest.mark.parametrize("samples", (1, 64, 1024))
 @pytest.mark.parametrize("paths", (10**4, 10**6, 10**9))
-def test_the_more_lights_leave_the_higher_their_price(paths, samples, emitters):
+def test_the_more_lights_leave_the_higher_their_price(paths, samples, emitters, model):
     """The lights prove worse than assumed only after they are measured."""
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
     for scale in (1e-3, 1, 1e3):
         traced, small = direct + scale * indirect, 1e-3 * indirect
-        evidence = Evidence(traced, UNSEEN, direct, np.ones(10_000), paths, samples, emitters, MODEL)
+        evidence = Evidence(traced, UNSEEN, direct, np.ones(10_000), paths, samples, emitters, model)
         assumed = Option(True, emitters, traced, scale * indirect)
         prices = [price(evidence, measured(assumed, noise * traced)) for noise in (0, 0.1, 0.5, 1, 2, 8, 64)]
         assert prices[0] == price(evidence, assumed)
-        assert (np.diff(prices) >= 0).all() and prices[-1] > 10 * prices[0]
+        assert (np.diff(prices) >= 0).all() and prices[-1] > 10**model.denoised_power * prices[0]
         assert price(evidence, measured(assumed, small)) == prices[0]
 
 
@@ -186,7 +188,7 @@ def test_a_choice_is_independent_of_earlier_measurements(emitters, model):
 
 @pytest.mark.parametrize("samples", (16, 64))
 def test_no_residual_lowers_a_price(samples):
-    """At the limits of the numbers of lights and rays, the price by the variance alone falls by half a percent."""
+    """Other numbers of rays than the best would let the price fall by half a percent where more variance remains."""
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
     evidence = Evidence(direct + indirect, UNSEEN, 0 * direct, np.ones(10_000), 10**9, samples, True, DENOISED)
