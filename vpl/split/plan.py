@@ -73,7 +73,7 @@ class Option:
     @cached_property
     def expected(self) -> np.ndarray:
         """Expected radiance (n,) without the part carried by virtual lights."""
-        return self.traced - self.indirect * self.surfaces
+        return self.traced - self.indirect if self.surfaces else self.traced
 
     @cached_property
     def concentration(self) -> float:
@@ -81,13 +81,10 @@ class Option:
         total = np.sum(self.indirect)
         return len(self.indirect) * np.sum(self.indirect**2) / total**2 if total else 0.0
 
-    def assumed(self, evidence: Evidence) -> float:
-        """Least relative variance of a path that remains: lights on surfaces carry all of the indirect light."""
-        return min(evidence.variance(self.expected), evidence.variance(self.traced))
-
-    def remaining(self, evidence: Evidence, assumed: float) -> float:
-        """Relative variance of a path that remains: the measured value, at least the ``assumed`` one."""
-        return assumed if self.residual is None else max(evidence.variance(self.residual), assumed)
+    def remaining(self, evidence: Evidence) -> float:
+        """Relative variance of a path that remains: the measured value, at least that of :attr:`expected`."""
+        least = min(evidence.variance(self.expected), evidence.variance(self.traced))
+        return least if self.residual is None else max(evidence.variance(self.residual), least)
 
 
 @dataclass(frozen=True)
@@ -120,7 +117,7 @@ class Evidence:
 
         Emitters that are seen directly make noise at their edges in the pixel.  Of it, n stratified samples retain the
         fraction n^-0.5 [Mitchell 1996, "Consequences of stratified sampling in graphics"].  Of the noise of direct
-        light they retain more.
+        light they retain more, by the constants ``stratified_power`` and ``stratified_many``.
         """
         model, edges = self.model, self.samples**-0.5
         retained = self.samples**-model.stratified_power
@@ -229,7 +226,7 @@ def _most_to_pay(evidence: Evidence) -> float:
 
 def _priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:
     """(:func:`price`, best plan) with the lights of an option."""
-    rest = option.remaining(evidence, option.assumed(evidence))
+    rest = option.remaining(evidence)
     model, paths, samples = evidence.model, evidence.paths, evidence.samples
     cuts = model.emitter_cuts * option.emitters + option.surfaces
     rays, error = _cut_rays(rest, cuts, samples, model)
