@@ -39,17 +39,27 @@ def precise_sample(sampler):
     return precise(sampler.next_1d()) + precise(sampler.next_1d()) * 2.0**-_SAMPLE_BITS
 
 
-def pair_samples(seed: int, first, second) -> tuple[mi.Float64, mi.Float64]:
-    """Two uniform double-precision numbers of 32 bits for each pair of indices (UInt32), by Mitsuba's hash.
+def pair_samples(seed: int, first, second) -> mi.Float64:
+    """A uniform double-precision number of 32 bits for each pair of indices (UInt32), by Mitsuba's hash.
 
-    The numbers of a pair depend on its indices and not on its lane.  A ray that passes exactly between two shapes meets
+    The number of a pair depends on its indices and not on its lane.  A ray that passes exactly between two shapes meets
     either of them, because Mitsuba loads shapes in an order that changes with the process.  If this adds a pair, the
     numbers of other pairs remain.
     """
-    precise = dr.float64_array_t(mi.Float)
     own, key = mi.sample_tea_32(first, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)
-    numbers = mi.sample_tea_32(own, second ^ key, HASH_ROUNDS)
-    return tuple(precise(number) * 2.0**-32 for number in numbers)
+    number, _ = mi.sample_tea_32(own, second ^ key, HASH_ROUNDS)
+    return dr.float64_array_t(mi.Float)(number) * 2.0**-32
+
+
+def systematic_samples(seed: int, sequence, place, size) -> mi.Float64:
+    """The numbers at ``place`` of systematic samples of [0, 1), from a random start for each ``sequence``, UInt32.
+
+    The step is 1 / ``size``, so that successive samples select successive ones of ``size`` equal intervals.
+    """
+    start, _ = mi.sample_tea_32(sequence, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)
+    # The lanes that fill a packet hold zeros, by which processors do not divide
+    step = dr.opaque(mi.UInt32, 2**32 - 1) // dr.maximum(size, 1)
+    return dr.float64_array_t(mi.Float)(start + place * step) * 2.0**-32
 
 
 def stratified(sampler, count: int, first: int, total: int):

@@ -188,11 +188,14 @@ class CutChunk:
     visits: mi.UInt32
 
     @property
-    def written(self):
+    def place(self) -> mi.UInt32:
+        """Place of each entry in the cut of its point."""
+        return dr.arange(mi.UInt32, dr.width(self.rows)) - dr.gather(mi.UInt32, self.offset, self.rows)
+
+    @property
+    def written(self) -> mi.Bool:
         """Mask of valid entries: rounding may shorten a cut after the counting traversal and leave entries unused."""
-        row = dr.arange(mi.UInt32, dr.width(self.rows))
-        place = row - dr.gather(mi.UInt32, self.offset, self.rows)
-        return place < dr.gather(mi.UInt32, self.length, self.rows)
+        return self.place < dr.gather(mi.UInt32, self.length, self.rows)
 
 
 def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):

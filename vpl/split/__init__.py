@@ -22,6 +22,7 @@ The terms of the estimator:
 - ``contributions``: sums of the contributions of paths, for the image and for its layers
 - ``gather_vertices``: vertices where virtual lights are added, the choice of lit vertices, and both normalisations
 - ``pixel_clusters``: a light cut for the vertices of a pixel with similar normals
+- ``spread_light``: a part of the light of virtual lights, divided among the camera rays of a pixel
 - ``pixel_rays``: numbers of camera rays of pixels, which may differ
 - ``film_cells``: the rays of the pixels of a film that is finer than the image
 - ``lattice``: stratified random numbers for the samples of a pixel

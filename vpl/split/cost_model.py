@@ -211,6 +211,15 @@ class CostModel:
     dark_pixel: float = _constant(
         0.1, "image means", "Pixels darker than this are lit as precisely as if they were as bright.", _SENSITIVITY
     )
+    spread: float = _constant(
+        0.4,
+        "fraction",
+        "Part of the light of virtual lights that is spread over the rays of a pixel, where a film is finer than the "
+        "image.",
+        "denoised error with 0.3 and 0.5 over that with 0, 16 samples: staircase2 0.93, 0.91, living_room 0.98, 1.0, "
+        "veach_ajar 0.89, 0.85, classroom 0.94, 0.87; 0.3 and 0.6: cornell 0.95, 1.12",
+        most=1,
+    )
     largest_cut: int = _constant(1000, "nodes", "Largest cut of a cluster of gather vertices.", _SENSITIVITY)
     emitter_points_share: float = _constant(
         0.03, "1 / camera ray", "Virtual lights on area emitters for a camera ray.", _SENSITIVITY

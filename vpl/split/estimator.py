@@ -31,6 +31,7 @@ from .pixel_clusters import PixelClusters, light_clusters
 from .pixel_rays import PixelRays
 from .plan import Decision, Plan, choose, without_lights
 from .roulette import OutgoingRadiance, best_multiple
+from .spread_light import spread
 from .start import Start, evidence_of
 from .surface_lights import KeptLights, surface_lights
 from .view import PathSettings, Stream, View, ViewLights
@@ -163,11 +164,11 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
         dr.eval(lane)
         sums_of_part = sums.part(part.first) if sums else None
         traced, points = _traced_part(view, lane, part, settings, lights, decision.plan, sums_of_part, clock)
-        found, opaque = traced.radiance, traced.valid
+        found, opaque, weight = traced.radiance, traced.valid, traced.gathered.first.weight
         # Frees the memory of unlit gather vertices
         del traced
         if points is not None:
-            light, counts = gatherer.light(points, found, part, sums_of_part, clock)
+            light, counts = gatherer.light(points, weight, found, part, sums_of_part, clock)
             found += light
             for name, number in counts.items():
                 statistics[name] = statistics.get(name, 0) + number
@@ -227,12 +228,12 @@ class Gatherer:
         return cls(view, decision.plan, transports, decision.expected_light(lights), darkest)
 
     def light(
-        self, points: LitVertices, found, part: Part, sums: LayerSums | None, clock: Clock
+        self, points: LitVertices, weight, found, part: Part, sums: LayerSums | None, clock: Clock
     ) -> tuple[mi.UnpolarizedSpectrum, dict]:
         """(Light at the ``points``, per camera ray; counters) for a part of the image.
 
         The brightness of a pixel is the radiance ``found`` by paths plus the expected light of virtual lights.
-        ``sums`` by layer of this part.
+        ``weight`` of the first gather vertices, lit or not; ``sums`` by layer of this part.
         """
         view, rays = self.view, part.rays
         lit = dr.zeros(mi.UnpolarizedSpectrum, rays.count)
@@ -252,6 +253,9 @@ class Gatherer:
         for number, transport in enumerate(self.transports):
             stream = derived_seed(seed, 1, number)
             shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit, sums)
+        # Otherwise, the layers of a cell would not sum to its light
+        if rays.cells > 1 and sums is None:
+            lit = spread(lit, weight, rays, view.model.spread)
         clock.stop()
         counts = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}
         return lit, counts | {"later": points.alone}

@@ -4,6 +4,9 @@ These vertices form a cluster.  Bounds on the box and the cone of normals choose
 in Multidimensional Lightcuts [MDLC].  For each pair of the cluster and a node of the cut, a vertex is drawn by weight
 and a light of the node by intensity, anew for every pair.  Neighbouring pixels therefore share no representative
 lights.  The error is uncorrelated noise: samples average the noise out, and a denoiser recognises noise.
+
+Successive nodes of a cut, which are near each other, get successive vertices, and so do the cells of a finer film: all
+vertices and cells get light from all parts of the cut.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import numpy as np
 
 from ..core.arrays import add_at, channel_mean
 from ..core.loops import recorded_once
-from ..core.sampling import derived_seed, find_interval, pair_samples, running_sums
+from ..core.sampling import derived_seed, find_interval, pair_samples, running_sums, systematic_samples
 from ..cuts.light_cuts import collect_cuts, limited_cuts
 from ..points.bsdf_proxies import MaterialProxy
 from ..points.surfaces import LambertianSurface, Receiver
@@ -192,9 +195,10 @@ def light_clusters(
     rays = 0
     for chunk in collect_cuts(transport.lights, clusters.receivers, threshold, sizes):
         cluster = dr.gather(mi.UInt32, chunk.points, chunk.rows)
-        of_vertex, of_light = pair_samples(
-            derived_seed(seed, chunk.number), cluster, chunk.group.first_light(chunk.nodes)
-        )
+        stream = derived_seed(seed, chunk.number)
+        of_light = pair_samples(stream, cluster, chunk.group.first_light(chunk.nodes))
+        size = dr.gather(mi.UInt32, clusters.size, cluster)
+        of_vertex = systematic_samples(derived_seed(stream, 1), cluster, chunk.place, size)
         ray, surface, weight = clusters.draw(cluster, of_vertex)
         light, scale = chunk.group.draw(chunk.nodes, of_light)
         value, traced = evaluate_pairs(transport, chunk.group, surface, light, scale)

@@ -9,7 +9,13 @@ from scipy import stats
 from tests.support.rendering import render
 from tests.support.scenes import area_light, sensor, wall
 from vpl.core.arrays import download, upload
-from vpl.core.sampling import Choice, RowChoice, SpreadSamples, independent_sampler, pair_samples, precise_sample
+from vpl.core.sampling import (
+    Choice,
+    RowChoice,
+    SpreadSamples,
+    pair_samples,
+    systematic_samples,
+)
 
 SEQUENCES, MEMBERS = 2000, 64
 
@@ -106,22 +112,32 @@ def test_members_of_rows_are_drawn_with_exactly_the_claimed_probability(lengths)
 
 def test_numbers_of_pairs_are_uniform_uncorrelated_and_independent_of_the_lane(variant):
     first, second = (x.ravel().astype(np.uint32) for x in np.mgrid[1000:1300, 0:300])
-    numbers = [download(x) for x in pair_samples(5, *(upload(mi.UInt32, x) for x in (first, second)))]
     later = slice(len(first) // 2, None)
-    again = pair_samples(5, *(upload(mi.UInt32, x[later]) for x in (first, second)))
-    other = pair_samples(6, *(upload(mi.UInt32, x) for x in (first, second)))
-    for one, same in zip(numbers, again, strict=True):
-        assert one.min() >= 0 and one.max() < 1 and stats.kstest(one, "uniform").pvalue > 1e-4
-        assert np.array_equal(one[later], download(same))
-    # Neighbours along either index, the two numbers of a pair, and two seeds
-    grid = numbers[0].reshape(300, 300)
-    near = [(grid[1:], grid[:-1]), (grid[:, 1:], grid[:, :-1]), tuple(numbers), (numbers[0], download(other[0]))]
-    for one, two in near:
+    number, again, other = (
+        download(pair_samples(seed, *(upload(mi.UInt32, x[rows]) for x in (first, second))))
+        for seed, rows in ((5, slice(None)), (5, later), (6, slice(None)))
+    )
+    assert number.min() >= 0 and number.max() < 1 and stats.kstest(number, "uniform").pvalue > 1e-4
+    assert np.array_equal(number[later], again)
+    # Neighbours along either index, and two seeds
+    grid = number.reshape(300, 300)
+    for one, two in [(grid[1:], grid[:-1]), (grid[:, 1:], grid[:, :-1]), (number, other)]:
         assert abs(np.corrcoef(one.ravel(), two.ravel())[0, 1]) < 5 / np.sqrt(one.size)
 
 
-def test_precise_numbers_have_bits_below_those_of_the_sampler(variant):
-    values = download(precise_sample(independent_sampler(1, 100_000)))
-    assert values.dtype == np.float64 and values.min() >= 0 and values.max() < 1
-    for fraction in (values, values * 2**23 % 1):
-        assert stats.kstest(fraction, "uniform").pvalue > 1e-4
+def test_systematic_samples_are_uniform_and_select_successive_intervals(variant):
+    sequences, places, sizes = 3000, 40, np.array([1, 3, 7, 64, 1000], np.uint32)
+    sequence, place = (x.ravel().astype(np.uint32) for x in np.mgrid[0:sequences, 0:places])
+    size = sizes[sequence % len(sizes)]
+    samples = [
+        download(systematic_samples(seed, *(upload(mi.UInt32, x) for x in (sequence, place, size)))) for seed in (5, 6)
+    ]
+    for at in (0, 1, places - 1):
+        assert stats.kstest(samples[0][place == at], "uniform").pvalue > 1e-4
+    assert 0 <= samples[0].min() and samples[0].max() < 1
+    starts = [one[place == 0] for one in samples]
+    assert abs(np.corrcoef(*starts)[0, 1]) < 5 / np.sqrt(sequences)
+    interval = np.floor(samples[0] * size).reshape(sequences, places)
+    # A step is rounded down to a multiple of 2^-32
+    moved = (np.diff(interval, axis=1) - 1) % size.reshape(sequences, places)[:, 1:]
+    assert np.mean(moved == 0) > 0.999

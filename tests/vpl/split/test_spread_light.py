@@ -1,0 +1,56 @@
+"""A part of the light of virtual lights is spread over the camera rays of a pixel: sums, and what each ray gets."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests.support.properties import points
+from vpl.core.arrays import download
+from vpl.split.pixel_rays import PixelRays
+from vpl.split.spread_light import spread
+
+RNG = np.random.default_rng(3)
+LAYOUTS = {
+    "equal numbers": PixelRays.uniform(40, 12),
+    "one ray": PixelRays.uniform(5, 1),
+    "different numbers": PixelRays.by_density(10.0 ** RNG.uniform(-1.5, 1.5, 60), 16),
+}
+
+
+def spectra(values):
+    return mi.Color3f(points(values))
+
+
+def spread_over(rays, light, weight, fraction):
+    return download(spread(spectra(light), spectra(weight), rays, fraction)).astype(np.float64)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_sum_of_a_pixel_remains(layout, fraction):
+    rays = LAYOUTS[layout]
+    light = RNG.exponential(size=(rays.count, 3)) * (RNG.random((rays.count, 1)) < 0.2)
+    weight = RNG.uniform(0.1, 1, (rays.count, 3)) * RNG.choice([-1, 1], (rays.count, 1))
+    moved = spread_over(rays, light, weight, fraction)
+    sums = [np.add.reduceat(x, rays.first[:-1]) for x in (moved, light, np.abs(weight))]
+    np.testing.assert_allclose(sums[0], sums[1], rtol=1e-5)
+    even = np.abs(weight) * np.repeat(sums[1] / sums[2], rays.numbers, axis=0)
+    np.testing.assert_allclose(moved, (1 - fraction) * light + fraction * even, rtol=1e-5, atol=1e-6)
+
+
+def test_light_in_proportion_to_weight_remains():
+    """Light of constant irradiance has the detail of the weights, which spreading keeps."""
+    rays = LAYOUTS["different numbers"]
+    weight = RNG.uniform(0, 1, (rays.count, 3))
+    light = weight * np.repeat(RNG.exponential(size=(rays.pixels, 1)), rays.numbers, axis=0)
+    np.testing.assert_allclose(spread_over(rays, light, weight, 1.0), light, rtol=1e-5, atol=1e-7)
+
+
+def test_light_remains_in_channels_without_a_weight():
+    rays = PixelRays.uniform(8, 4)
+    light, weight = RNG.exponential(size=(rays.count, 3)), np.ones((rays.count, 3))
+    weight[:, 1], weight[:4] = 0, 0
+    moved = spread_over(rays, light, weight, 0.5)
+    np.testing.assert_array_equal(moved[:, 1], light[:, 1].astype(np.float32))
+    np.testing.assert_array_equal(moved[:4], light[:4].astype(np.float32))
+    assert not np.allclose(moved[4:, 0], light[4:, 0])
