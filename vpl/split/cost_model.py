@@ -147,7 +147,10 @@ class CostModel:
 
     # ---------------------- Costs ----------------------
     fixed_cost: float = _constant(
-        200_000, "paths", "Cost of starting lights and cuts: recorded kernels, trees.", _SENSITIVITY
+        100_000,
+        "paths",
+        "Cost of starting lights and cuts: recorded kernels, trees.",
+        "16 samples: hall 120 000, kitchen 90 000, staircase2 53 000, six others less",
     )
     light_path_cost: float = _constant(4.0, "paths", "Cost of a line with the lights that it meets.", _LIGHTS)
     ray_cost: float = _constant(0.2, "paths", "Cost of a shadow ray of a cut, with its bounds.", _SENSITIVITY)
