@@ -70,8 +70,8 @@ def single_classes():
         finally:
             chosen.now = dr.opaque(mi.UInt32, _ALL)
 
-    def gathered(self, points, found, *others):
-        value, counts = light(self, points, found, *others)
+    def gathered(self, points, weight, found, *others):
+        value, counts = light(self, points, weight, found, *others)
         return (value if chosen.gathers else dr.zeros(mi.UnpolarizedSpectrum, dr.width(found))), counts
 
     chosen.now = dr.opaque(mi.UInt32, _ALL)

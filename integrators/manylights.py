@@ -127,8 +127,9 @@ class ManyLightsIntegrator(PassRenderer):
       given size, images by several workers and images above half a million pixels (a million in their own resolution)
       have equal numbers.
     - Fine films: where an image is denoised at twice its resolution, the rays of a pixel share two fifths of the light
-      of virtual lights, in proportion to what they reflect.  The sum over the pixel is the same; inside a pixel, this
-      light is slightly blurred.  Images with layers have no such sharing.
+      of virtual lights, in proportion to the light that they reflect.  The sum over the pixel is the same, and this
+      light is slightly blurred inside the pixel.  With another filter than a box, this changes pixels at edges a
+      little.  With ``layers`` or ``light_groups``, rays share no light.
     - Light through masks and thin glass: shadow rays to area emitters and environments pass these surfaces, as far as
       ``max_depth`` allows, and multiple importance sampling combines them with the paths that find the same light.
       Where such light is rare, shadow rays take up to a tenth more time for little.  Light through other glass,

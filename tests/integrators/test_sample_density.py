@@ -1,5 +1,7 @@
 """Passes of ``manylights`` whose pixels have different numbers of samples; channels with every second sample."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -311,6 +313,35 @@ def test_a_fine_film_shows_the_parts_of_pixels():
     np.testing.assert_allclose(found, expected, atol=0.02 * expected.max())
     merged_image = render(scene, integrator, None, 2, 4096, parts=2)
     np.testing.assert_allclose(merged_image, found.reshape(HEIGHT, 2, WIDTH, 2, 3).mean((1, 3)), rtol=1e-5)
+
+
+def fine_image(scene, integrator, density=None):
+    """A first pass in the resolution of a fine film: an array (height, width, channels)."""
+    camera = scene.sensors()[0]
+    with integrator.pass_of(SharedStart(), True, density, parts=2), fine_film(camera, 2):
+        return np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=16, seed=3), np.float64)
+
+
+@pytest.mark.parametrize("density", [None, DENSITY], ids=["equal numbers", "different numbers"])
+def test_light_that_the_rays_of_a_pixel_share_leaves_the_pixel_as_it_is(density):
+    scene, integrator, found = room(), plugin(), []
+    for spread in (0.0, 1.0):
+        integrator.cost_model = replace(integrator.cost_model, spread=spread)
+        found.append(fine_image(scene, integrator, density))
+        assert integrator.statistics["light_paths"] > 0
+    apart, shared = (image.reshape(HEIGHT, 2, WIDTH, 2, 3) for image in found)
+    # Cells with the mean number of rays: a pixel is the mean of its cells
+    np.testing.assert_allclose(shared.mean((1, 3)), apart.mean((1, 3)), rtol=1e-4)
+    assert shared.std((1, 3)).mean() < 0.9 * apart.std((1, 3)).mean()
+
+
+def test_with_layers_rays_share_no_light():
+    scene, images = room(), []
+    for spread in (0.0, 1.0):
+        integrator = plugin(layers="direct,indirect")
+        integrator.cost_model = replace(integrator.cost_model, spread=spread)
+        images.append(fine_image(scene, integrator))
+    np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("spp", [4, 20, 64])

@@ -52,9 +52,11 @@ def pair_samples(seed: int, first, second) -> mi.Float64:
 
 
 def systematic_samples(seed: int, sequence, place, size) -> mi.Float64:
-    """The numbers at ``place`` of systematic samples of [0, 1), from a random start for each ``sequence``, UInt32.
+    """The numbers at ``place`` of the systematic samples of a ``sequence``, double precision; all UInt32.
 
-    The step is 1 / ``size``, so that successive samples select successive ones of ``size`` equal intervals.
+    A sequence begins at a random number in [0, 1), has the step 1 / ``size``, and wraps around at 1.  Successive
+    samples select successive ones of ``size`` equal intervals.  A number depends on the place, so another place changes
+    it, unlike those of :func:`pair_samples`.
     """
     start, _ = mi.sample_tea_32(sequence, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)
     # The lanes that fill a packet hold zeros, by which processors do not divide

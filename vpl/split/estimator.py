@@ -164,11 +164,15 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
         dr.eval(lane)
         sums_of_part = sums.part(part.first) if sums else None
         traced, points = _traced_part(view, lane, part, settings, lights, decision.plan, sums_of_part, clock)
-        found, opaque, weight = traced.radiance, traced.valid, traced.gathered.first.weight
+        found, opaque = traced.radiance, traced.valid
+        # Not with layers, which would not sum to the light of a cell
+        shares = points is not None and part.rays.cells > 1 and sums is None
+        weight = traced.gathered.first.weight if shares else None
         # Frees the memory of unlit gather vertices
         del traced
         if points is not None:
             light, counts = gatherer.light(points, weight, found, part, sums_of_part, clock)
+            del weight
             found += light
             for name, number in counts.items():
                 statistics[name] = statistics.get(name, 0) + number
@@ -233,7 +237,7 @@ class Gatherer:
         """(Light at the ``points``, per camera ray; counters) for a part of the image.
 
         The brightness of a pixel is the radiance ``found`` by paths plus the expected light of virtual lights.
-        ``weight`` of the first gather vertices, lit or not; ``sums`` by layer of this part.
+        ``weight`` of the first gather vertices, if the rays of a pixel share light; ``sums`` by layer of this part.
         """
         view, rays = self.view, part.rays
         lit = dr.zeros(mi.UnpolarizedSpectrum, rays.count)
@@ -253,8 +257,7 @@ class Gatherer:
         for number, transport in enumerate(self.transports):
             stream = derived_seed(seed, 1, number)
             shadow_rays += light_clusters(transport, clusters, allowed, view.model.largest_cut, stream, lit, sums)
-        # Otherwise, the layers of a cell would not sum to its light
-        if rays.cells > 1 and sums is None:
+        if weight is not None:
             lit = spread(lit, weight, rays, view.model.spread)
         clock.stop()
         counts = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}

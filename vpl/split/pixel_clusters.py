@@ -2,11 +2,11 @@
 
 These vertices form a cluster.  Bounds on the box and the cone of normals choose a light cut for the whole cluster, as
 in Multidimensional Lightcuts [MDLC].  For each pair of the cluster and a node of the cut, a vertex is drawn by weight
-and a light of the node by intensity, anew for every pair.  Neighbouring pixels therefore share no representative
-lights.  The error is uncorrelated noise: samples average the noise out, and a denoiser recognises noise.
+and a light of the node by intensity.  Neighbouring pixels therefore share no representative lights.  Their errors are
+uncorrelated noise: samples average the noise out, and a denoiser recognises noise.
 
-Successive nodes of a cut, which are near each other, get successive vertices, and so do the cells of a finer film: all
-vertices and cells get light from all parts of the cut.
+Vertices are drawn by systematic sampling along the cut, from a random start for each cluster.  Successive nodes of a
+cut are near each other.  They light successive vertices, which mostly belong to different cells of a finer film.
 """
 
 from __future__ import annotations

@@ -13,7 +13,9 @@ from vpl.core.sampling import (
     Choice,
     RowChoice,
     SpreadSamples,
+    independent_sampler,
     pair_samples,
+    precise_sample,
     systematic_samples,
 )
 
@@ -141,3 +143,10 @@ def test_systematic_samples_are_uniform_and_select_successive_intervals(variant)
     # A step is rounded down to a multiple of 2^-32
     moved = (np.diff(interval, axis=1) - 1) % size.reshape(sequences, places)[:, 1:]
     assert np.mean(moved == 0) > 0.999
+
+
+def test_precise_numbers_have_bits_below_those_of_the_sampler(variant):
+    values = download(precise_sample(independent_sampler(1, 100_000)))
+    assert values.dtype == np.float64 and values.min() >= 0 and values.max() < 1
+    for fraction in (values, values * 2**23 % 1):
+        assert stats.kstest(fraction, "uniform").pvalue > 1e-4

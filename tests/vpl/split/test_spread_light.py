@@ -9,11 +9,15 @@ from vpl.core.arrays import download
 from vpl.split.pixel_rays import PixelRays
 from vpl.split.spread_light import spread
 
-RNG = np.random.default_rng(3)
+
+def generator():
+    return np.random.default_rng(3)
+
+
 LAYOUTS = {
     "equal numbers": PixelRays.uniform(40, 12),
     "one ray": PixelRays.uniform(5, 1),
-    "different numbers": PixelRays.by_density(10.0 ** RNG.uniform(-1.5, 1.5, 60), 16),
+    "different numbers": PixelRays.by_density(10.0 ** generator().uniform(-1.5, 1.5, 60), 16),
 }
 
 
@@ -28,9 +32,9 @@ def spread_over(rays, light, weight, fraction):
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_sum_of_a_pixel_remains(layout, fraction):
-    rays = LAYOUTS[layout]
-    light = RNG.exponential(size=(rays.count, 3)) * (RNG.random((rays.count, 1)) < 0.2)
-    weight = RNG.uniform(0.1, 1, (rays.count, 3)) * RNG.choice([-1, 1], (rays.count, 1))
+    rng, rays = generator(), LAYOUTS[layout]
+    light = rng.exponential(size=(rays.count, 3)) * (rng.random((rays.count, 1)) < 0.2)
+    weight = rng.uniform(0.1, 1, (rays.count, 3)) * rng.choice([-1, 1], (rays.count, 1))
     moved = spread_over(rays, light, weight, fraction)
     sums = [np.add.reduceat(x, rays.first[:-1]) for x in (moved, light, np.abs(weight))]
     np.testing.assert_allclose(sums[0], sums[1], rtol=1e-5)
@@ -40,17 +44,27 @@ def test_the_sum_of_a_pixel_remains(layout, fraction):
 
 def test_light_in_proportion_to_weight_remains():
     """Light of constant irradiance has the detail of the weights, which spreading keeps."""
-    rays = LAYOUTS["different numbers"]
-    weight = RNG.uniform(0, 1, (rays.count, 3))
-    light = weight * np.repeat(RNG.exponential(size=(rays.pixels, 1)), rays.numbers, axis=0)
+    rng, rays = generator(), LAYOUTS["different numbers"]
+    weight = rng.uniform(0, 1, (rays.count, 3))
+    light = weight * np.repeat(rng.exponential(size=(rays.pixels, 1)), rays.numbers, axis=0)
     np.testing.assert_allclose(spread_over(rays, light, weight, 1.0), light, rtol=1e-5, atol=1e-7)
 
 
 def test_light_remains_in_channels_without_a_weight():
-    rays = PixelRays.uniform(8, 4)
-    light, weight = RNG.exponential(size=(rays.count, 3)), np.ones((rays.count, 3))
+    rng, rays = generator(), PixelRays.uniform(8, 4)
+    light, weight = rng.exponential(size=(rays.count, 3)), np.ones((rays.count, 3))
     weight[:, 1], weight[:4] = 0, 0
     moved = spread_over(rays, light, weight, 0.5)
     np.testing.assert_array_equal(moved[:, 1], light[:, 1].astype(np.float32))
     np.testing.assert_array_equal(moved[:4], light[:4].astype(np.float32))
     assert not np.allclose(moved[4:, 0], light[4:, 0])
+
+
+@pytest.mark.parametrize("value", [np.inf, np.nan])
+def test_a_weight_that_is_not_finite_takes_no_light(value):
+    rng, rays = generator(), PixelRays.uniform(2, 4)
+    light, weight = rng.exponential(size=(rays.count, 3)), np.ones((rays.count, 3))
+    weight[1, 0] = value
+    moved = spread_over(rays, light, weight, 0.5)
+    np.testing.assert_allclose(moved[:4].sum(0), light[:4].sum(0), rtol=1e-5)
+    np.testing.assert_allclose(moved[1, 0], 0.5 * light[1, 0], rtol=1e-5)
