@@ -20,32 +20,44 @@ def spread(light, weight, rays: PixelRays, fraction: float) -> mi.UnpolarizedSpe
     """``light``, with a ``fraction`` divided among the camera ``rays`` of each pixel in proportion to ``weight``.
 
     ``light``, and ``weight`` of first gather vertices, of which absolute values count: unpolarized spectra, one entry
-    for each ray.  Channels in which no ray of a pixel has a weight keep their light.  Evaluated.
+    for each ray.  Every second round of rays over the cells of a pixel shares apart from the others, so that two halves
+    of the samples stay independent.  Channels in which these rays have no weight keep their light.  Evaluated.
     """
     # A weight that is not finite must not take the light of the remaining rays
     weight = dr.select(dr.isfinite(weight), dr.abs(weight), 0)
     dr.eval(light, weight)
-    mean = _mean_irradiance(light, weight, rays.device_first, rays.by_level(rays.sizes))
-    pixel = rays.places(dr.arange(mi.UInt32, rays.count)).pixel
-    even = weight * dr.gather(mi.UnpolarizedSpectrum, mean, pixel)
+    cells = dr.opaque(mi.UInt32, rays.cells)
+    group = dr.arange(mi.UInt32, 2 * rays.pixels)
+    first, count = (dr.gather(mi.UInt32, x, group // 2) for x in (rays.device_first, rays.by_level(rays.sizes)))
+    dr.eval(first, count)
+    mean = _mean_irradiance(light, weight, first, count, group & 1, cells)
+    places = rays.places(dr.arange(mi.UInt32, rays.count))
+    even = weight * dr.gather(mi.UnpolarizedSpectrum, mean, 2 * places.pixel + _half(places.number, cells))
     moved = light + dr.opaque(mi.Float, fraction) * (even - light)
     result = dr.select(dr.isfinite(even), moved, light)
     dr.eval(result)
     return result
 
 
+def _half(number: mi.UInt32, cells: mi.UInt32) -> mi.UInt32:
+    """Half of the samples, 0 or 1, of the ray with a ``number`` in its pixel."""
+    return number // cells & 1
+
+
 @recorded_once
 @dr.syntax
-def _mean_irradiance(light, weight, first, rays):
-    """Light of each pixel over the sum of its weights, not finite without a weight; evaluated.
+def _mean_irradiance(light, weight, first, rays, half, cells):
+    """Light over the sum of the weights, of a ``half`` of each pixel's rays; not finite without a weight; evaluated.
 
-    ``first``, ``rays``: first ray and number of rays of the pixels.
+    ``first``, ``rays``: first ray and number of rays of the pixels; ``cells`` of a pixel.
     """
+    dr.make_opaque(half)
     total, whole = (dr.zeros(mi.UnpolarizedSpectrum, dr.width(first)) for _ in range(2))
     k = dr.zeros(mi.UInt32, dr.width(first))
-    while dr.hint(k < rays, exclude=[light, weight, first, rays]):
-        total += dr.gather(mi.UnpolarizedSpectrum, light, first + k)
-        whole += dr.gather(mi.UnpolarizedSpectrum, weight, first + k)
+    while dr.hint(k < rays, exclude=[light, weight, first, rays, half, cells]):
+        taken = _half(k, cells) == half
+        total += dr.select(taken, dr.gather(mi.UnpolarizedSpectrum, light, first + k), 0)
+        whole += dr.select(taken, dr.gather(mi.UnpolarizedSpectrum, weight, first + k), 0)
         k += 1
     mean = total / whole
     dr.eval(mean)
