@@ -1,6 +1,6 @@
 """Sensitivity of ``manylights`` to the constants of its cost model: each one halved and doubled.
 
-    python benchmarks/cost_model.py                                          all constants, five scenes, an hour
+    python benchmarks/cost_model.py                                         all constants, five scenes, an hour
     python benchmarks/cost_model.py --constants shared ray_cost --passes 6  two constants
 
 Prints variance × CPU seconds over that with the default value, scene by scene, with geometric means.  Below 1: the

@@ -21,7 +21,7 @@ from vpl.split.emitters import emitter_sampler
 from vpl.split.emitters.cell_choice import learning_rays
 from vpl.split.estimator import estimate
 from vpl.split.film_cells import HALF, FilmCells
-from vpl.split.pixel_rays import PixelRays
+from vpl.split.pixel_rays import PixelRays, half_of
 from vpl.split.roulette import OutgoingRadiance
 from vpl.split.start import Start, make_start
 from vpl.split.surface_lights import KeptLights
@@ -293,8 +293,9 @@ class ManyLightsIntegrator(PassRenderer):
             self.statistics["growth"] = growth
         channels = [channel for name in self._layer_names for channel in found.layers[name]]
         if self._pass.half:
-            number = cells.places(dr.arange(mi.UInt32, view.count)).number
-            channels += list(dr.select((number & 1) == 1, 2 * found.radiance, 0))
+            number = cells.rays.places(dr.arange(mi.UInt32, view.count)).number
+            half = half_of(number, dr.opaque(mi.UInt32, cells.rays.cells))
+            channels += list(dr.select(half == 1, 2 * found.radiance, 0))
         if cells.is_plain:
             return mi.Spectrum(found.radiance), found.valid, channels
         channels = [cells.evenly(channel) for channel in channels]

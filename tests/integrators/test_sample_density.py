@@ -58,15 +58,20 @@ def plugin(lights=True, **more):
     return mi.load_dict({"type": "manylights", "denoised": True, "max_depth": 4, "virtual_lights": lights} | more)
 
 
-def render(scene, integrator, density=None, seed=0, spp=SPP, half=False, parts=1, continued=None):
-    """A first pass of a render: an array (height, width, channels), in the resolution of the image."""
+def render(scene, *arguments, parts=1, **more):
+    """A first pass of a render, see :func:`fine_image`, in the resolution of the image."""
+    filter = scene.sensors()[0].film().rfilter()
+    return merged(fine_image(scene, *arguments, parts=parts, **more), parts, filter)
+
+
+def fine_image(scene, integrator, density=None, seed=0, spp=SPP, half=False, parts=1, continued=None):
+    """A first pass of a render in the resolution of its film: an array (height, width, channels)."""
     camera = scene.sensors()[0]
-    filter = camera.film().rfilter()
     one = integrator.pass_of(SharedStart(), True, density, half, parts, continued)
     with one as is_missing, fine_film(camera, parts):
         assert not is_missing
         found = mi.render(scene, sensor=camera, integrator=integrator, spp=spp // parts**2, seed=seed)
-        return merged(np.array(found, np.float64), parts, filter)
+        return np.array(found, np.float64)
 
 
 def by_pixel(planes):
@@ -307,19 +312,11 @@ def test_a_fine_film_shows_the_parts_of_pixels():
     camera = scene.sensors()[0]
     with fine_film(camera, 2):
         expected = np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=4096, seed=1))
-        with integrator.pass_of(SharedStart(), True, parts=2):
-            found = np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=1024, seed=2))
+    found = fine_image(scene, integrator, None, 2, 4096, parts=2)
     assert found.shape == (2 * HEIGHT, 2 * WIDTH, 3)
     np.testing.assert_allclose(found, expected, atol=0.02 * expected.max())
     merged_image = render(scene, integrator, None, 2, 4096, parts=2)
     np.testing.assert_allclose(merged_image, found.reshape(HEIGHT, 2, WIDTH, 2, 3).mean((1, 3)), rtol=1e-5)
-
-
-def fine_image(scene, integrator, density=None):
-    """A first pass in the resolution of a fine film: an array (height, width, channels)."""
-    camera = scene.sensors()[0]
-    with integrator.pass_of(SharedStart(), True, density, parts=2), fine_film(camera, 2):
-        return np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=16, seed=3), np.float64)
 
 
 @pytest.mark.parametrize("density", [None, DENSITY], ids=["equal numbers", "different numbers"])
@@ -327,7 +324,7 @@ def test_light_that_the_rays_of_a_pixel_share_leaves_the_pixel_as_it_is(density)
     scene, integrator, found = room(), plugin(), []
     for spread in (0.0, 1.0):
         integrator.cost_model = replace(integrator.cost_model, spread=spread)
-        found.append(fine_image(scene, integrator, density))
+        found.append(fine_image(scene, integrator, density, 3, 64, parts=2))
         assert integrator.statistics["light_paths"] > 0
     apart, shared = (image.reshape(HEIGHT, 2, WIDTH, 2, 3) for image in found)
     # Cells with the mean number of rays: a pixel is the mean of its cells
@@ -340,7 +337,7 @@ def test_with_layers_rays_share_no_light():
     for spread in (0.0, 1.0):
         integrator = plugin(layers="direct,indirect")
         integrator.cost_model = replace(integrator.cost_model, spread=spread)
-        images.append(fine_image(scene, integrator))
+        images.append(fine_image(scene, integrator, None, 3, 64, parts=2))
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-5)
 
 

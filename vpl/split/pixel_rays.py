@@ -52,6 +52,12 @@ class RayNumbers:
         return (self.number + turn_of_cells(self.pixel, turn)) % cells, turn
 
 
+def half_of(number: mi.UInt32, cells: mi.UInt32) -> mi.UInt32:
+    """Half of the samples, 0 or 1, of the rays with a ``number`` in their pixel: every second round of rays over the
+    ``cells`` of the film in the pixel."""
+    return number // cells & 1
+
+
 def turn_of_cells(pixel: mi.UInt32, turn: mi.UInt32) -> mi.UInt32:
     """Random numbers by which the order of a pixel's cells is rotated, for every round of its rays over the cells."""
     return mi.sample_tea_32(pixel, turn, HASH_ROUNDS)[0] >> 8

@@ -13,15 +13,15 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.loops import recorded_once
-from .pixel_rays import PixelRays
+from .pixel_rays import PixelRays, half_of
 
 
 def spread(light, weight, rays: PixelRays, fraction: float) -> mi.UnpolarizedSpectrum:
     """``light``, with a ``fraction`` divided among the camera ``rays`` of each pixel in proportion to ``weight``.
 
     ``light``, and ``weight`` of first gather vertices, of which absolute values count: unpolarized spectra, one entry
-    for each ray.  Every second round of rays over the cells of a pixel shares apart from the others, so that two halves
-    of the samples stay independent.  Channels in which these rays have no weight keep their light.  Evaluated.
+    for each ray.  The two halves of the samples, see :func:`vpl.split.pixel_rays.half_of`, share apart and stay
+    independent.  Channels in which the rays of a half have no weight keep their light.  Evaluated.
     """
     # A weight that is not finite must not take the light of the remaining rays
     weight = dr.select(dr.isfinite(weight), dr.abs(weight), 0)
@@ -32,16 +32,11 @@ def spread(light, weight, rays: PixelRays, fraction: float) -> mi.UnpolarizedSpe
     dr.eval(first, count)
     mean = _mean_irradiance(light, weight, first, count, group & 1, cells)
     places = rays.places(dr.arange(mi.UInt32, rays.count))
-    even = weight * dr.gather(mi.UnpolarizedSpectrum, mean, 2 * places.pixel + _half(places.number, cells))
+    even = weight * dr.gather(mi.UnpolarizedSpectrum, mean, 2 * places.pixel + half_of(places.number, cells))
     moved = light + dr.opaque(mi.Float, fraction) * (even - light)
     result = dr.select(dr.isfinite(even), moved, light)
     dr.eval(result)
     return result
-
-
-def _half(number: mi.UInt32, cells: mi.UInt32) -> mi.UInt32:
-    """Half of the samples, 0 or 1, of the ray with a ``number`` in its pixel."""
-    return number // cells & 1
 
 
 @recorded_once
@@ -55,7 +50,7 @@ def _mean_irradiance(light, weight, first, rays, half, cells):
     total, whole = (dr.zeros(mi.UnpolarizedSpectrum, dr.width(first)) for _ in range(2))
     k = dr.zeros(mi.UInt32, dr.width(first))
     while dr.hint(k < rays, exclude=[light, weight, first, rays, half, cells]):
-        taken = _half(k, cells) == half
+        taken = half_of(k, cells) == half
         total += dr.select(taken, dr.gather(mi.UnpolarizedSpectrum, light, first + k), 0)
         whole += dr.select(taken, dr.gather(mi.UnpolarizedSpectrum, weight, first + k), 0)
         k += 1
