@@ -84,11 +84,11 @@ class ErrorEstimate:
         return float(np.sqrt(np.percentile(shared[finite], 100 * SHARE)))
 
 
-def relative_squares(first, second):
+def relative_squares(first, second, image):
     """Return the squared difference of two images (height, width, channels), a mean over channels, relative to the
-    squared scale of relMSE of their mean; 0 where it is not finite. (height, width) float64."""
-    first, second = (np.asarray(image, np.float64) for image in (first, second))
-    squares, mean = np.square(first - second).mean(axis=-1), 0.5 * (first + second).mean(axis=-1)
+    squared scale of relMSE of another `image`; 0 where it is not finite. (height, width) float64."""
+    first, second, image = (np.asarray(one, np.float64) for one in (first, second, image))
+    squares, mean = np.square(first - second).mean(axis=-1), image.mean(axis=-1)
     return _over_scale(squares, mean, np.isfinite(squares) & np.isfinite(mean))
 
 

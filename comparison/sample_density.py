@@ -1,11 +1,13 @@
 """Numbers of samples of pixels for images that will be denoised: more where the denoiser leaves noise.
 
-The error of a denoised image is concentrated at edges, textures, lamps and shadows, which neighbours cannot smooth. Two
-halves of the samples of a pass are denoised apart; their squared difference, smoothed, shows where. Later passes have
-numbers of samples in proportion to its root, which would be best for noise that falls by the inverse of the samples.
-A pass has a common weight for all pixels, which does not depend on its noise, and numbers that depend on earlier passes
-only, so the mean of the raw image does not change. Its variance is larger than with equal numbers, because the raw
-noise of the remaining pixels does not matter to the denoiser.
+The error of a denoised image is concentrated at edges, textures, lamps and shadows, which neighbours cannot smooth.
+Two halves of the samples of a pass show where: their squared difference, smoothed, and that of the halves denoised
+apart. Each of them predicts the error of a denoised image, and their product does so best. Later passes have numbers of
+samples in proportion to a power of the product.
+
+A pass has a common weight for all pixels, which does not depend on their noise, and numbers that depend on earlier
+passes only, so the mean of the raw image does not change. Its variance is larger than with equal numbers, because the
+raw noise of the remaining pixels does not matter to the denoiser.
 """
 
 from __future__ import annotations
@@ -22,6 +24,10 @@ from .images import colour
 QUALITY = "fast"  # of the denoiser: a quarter of the time of "high", and the same error in three scenes
 LEAST_SAMPLES = 8  # of a pass that determines the density: fewer leave too much noise in its halves
 LUMINANCE = 0.212671, 0.715160, 0.072169  # of red, green and blue, as in Mitsuba's films of one channel
+# Power of the product of both squared differences that the numbers of samples are in proportion to. Denoised error
+# expected from the errors of eleven scenes, over that with equal numbers: 0.91; with the root of the difference of the
+# denoised halves alone, 0.97; with its best power, 0.3, 0.93
+POWER = 0.25
 OUTLIERS = 0.995  # quantile of the differences that limits them: fireflies
 SMOOTHED = 2  # times that differences are averaged over 5 × 5 pixels: as by a Gaussian filter of 2 pixels
 
@@ -77,14 +83,31 @@ class SampleDensity:
         if "R" not in channels:
             half = half @ np.float32(LUMINANCE)[:, None]
         half = np.broadcast_to(half, whole.shape)
-        halves = [self._denoise(one, ["R", "G", "B"], QUALITY) for one in (half, 2 * whole - half)]
-        difference = relative_squares(*halves)
-        difference = np.minimum(difference, np.quantile(difference, OUTLIERS))
-        for _ in range(SMOOTHED):
-            difference = box_mean(difference)
-        if not difference.any():
+        halves = half, 2 * whole - half
+        denoised = [self._denoise(one, ["R", "G", "B"], QUALITY) for one in halves]
+        image = 0.5 * (denoised[0] + denoised[1])
+        left, noise = (_smoothed(relative_squares(*pair, image)) for pair in (denoised, halves))
+        if not (left.any() and noise.any()):
             return
-        # Without this minimum, black pixels would have no samples
-        difference = np.maximum(difference, 1e-6 * difference.max())
-        numbers = PixelRays.by_density(np.sqrt(difference), MULTIPLE).numbers.reshape(difference.shape)
+        density = (left * noise) ** POWER
+        numbers = PixelRays.by_density(density, MULTIPLE).numbers.reshape(density.shape)
         self.relative = numbers / MULTIPLE
+
+
+def _smoothed(squares):
+    """Return squared differences (height, width) without outliers, as means over neighbours; black pixels have a
+    minimum, because they would have no samples."""
+    squares = np.minimum(squares, np.quantile(squares, OUTLIERS))
+    for _ in range(SMOOTHED):
+        squares = box_mean(squares)
+    return np.maximum(squares, 1e-6 * squares.max())
+
+
+def gain_of(density):
+    """Return the precision of a sample where pixels have a `density`, their numbers of samples over the mean, relative
+    to that of a sample where numbers are equal; 1 for None.
+
+    Numbers are best for squared errors in proportion to d² / n, with the density d and n samples. With equal numbers
+    their mean is that of d², over n; with the density it is 1 / n.
+    """
+    return 1.0 if density is None else float(np.mean(np.square(density)))

@@ -8,7 +8,7 @@ import manylights
 from comparison import fine_film, rendering, single_pass
 from comparison.checkpoint import Checkpoint
 from comparison.pass_sizes import PROBE
-from comparison.sample_density import LEAST_SAMPLES, SampleDensity
+from comparison.sample_density import LEAST_SAMPLES, SampleDensity, gain_of
 from comparison.timed_sizes import PASS_SECONDS, TimedSizes
 from tests.comparison.test_pass_sizes import render as made_up_passes
 from tests.support.scenes import area_light, closed_box, cornell
@@ -17,9 +17,10 @@ from tests.support.statistics import assert_same_mean
 SIZE = 48
 
 
-def learned(difference):
-    """The density learned from two halves of a grey image that differ by `difference`; the denoiser changes nothing."""
-    density = SampleDensity(lambda image, names, quality: image)
+def learned(difference, left=1.0):
+    """The density learned from two halves of a grey image that differ by `difference`, of which the denoiser leaves the
+    fraction `left`."""
+    density = SampleDensity(lambda image, names, quality: 1 + (image - 1) * np.float32(left))
     image = np.ones((SIZE, SIZE, 3), np.float32)
     half = image + np.float32(difference)[..., None] / 2
     density.learn(image, half, ["R", "G", "B"])
@@ -51,6 +52,35 @@ def test_pixels_where_halves_differ_have_more_samples():
 def test_equal_differences_give_equal_numbers():
     density = learned(np.full((SIZE, SIZE), 0.1))
     assert (density.relative == 1).all()
+
+
+def test_noise_counts_with_and_without_the_denoiser():
+    """Four times the noise, of which the denoiser leaves a sixteenth, is a quarter of the noise after denoising."""
+    removed = corner(1 / 16)[..., None] / np.where(corner(1) == 1, 1, 0.1)[..., None]
+    assert (learned(corner(0.4), removed).relative == 1).all()
+    assert same(learned(corner(0.4), 0.1), learned(corner(0.4)))
+
+
+def test_noise_that_the_denoiser_removes_determines_nothing():
+    assert learned(corner(0.4), 0.0).relative is None
+
+
+def test_the_gain_is_that_of_errors_for_which_the_numbers_are_best():
+    density = np.array([[0.5, 1.5, 1.0]])
+    errors = density**2
+    assert gain_of(density) == pytest.approx(errors.mean() / (errors / density).mean())
+    assert gain_of(None) == gain_of(np.ones((2, 3))) == 1
+
+
+def test_passes_with_numbers_of_their_own_weigh_more():
+    scene, plugin = cornell().load(), mi.load_dict({"type": "manylights", "denoised": True})
+    width, height = scene.sensors()[0].film().crop_size()
+    density = np.tile([0.5, 1.5], (height, width // 2))
+    shared, passes = single_pass.SharedStart(), []
+    for seed, one in enumerate((None, None, density)):
+        found = single_pass.render_pass(scene, 0, plugin, 16, seed, first=(16, 0), shared=shared, density=one)
+        passes.append(found.taken)
+    assert passes[2].weight == pytest.approx(1.25 * passes[1].weight, rel=1e-5)
 
 
 def test_the_sign_of_a_difference_does_not_matter():
