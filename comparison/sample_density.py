@@ -6,8 +6,7 @@ apart. Each of them predicts the error of a denoised image, and their product do
 samples in proportion to a power of the product.
 
 A pass has a common weight for all pixels, which does not depend on their noise, and numbers that depend on earlier
-passes only, so the mean of the raw image does not change. Its variance is larger than with equal numbers, because the
-raw noise of the remaining pixels does not matter to the denoiser.
+passes only, so the mean of the raw image does not change.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ from .images import colour
 QUALITY = "fast"  # of the denoiser: a quarter of the time of "high", and the same error in three scenes
 LEAST_SAMPLES = 8  # of a pass that determines the density: fewer leave too much noise in its halves
 LUMINANCE = 0.212671, 0.715160, 0.072169  # of red, green and blue, as in Mitsuba's films of one channel
-# Power of the product of both squared differences that the numbers of samples are in proportion to. Denoised error
-# expected from the errors of eleven scenes, over that with equal numbers: 0.91; with the root of the difference of the
-# denoised halves alone, 0.97; with its best power, 0.3, 0.93
+# Power of the product of both squared differences: numbers of samples are in proportion to it. Denoised error over that
+# with the root of the squared difference of the denoised halves, seven scenes: 0.94 to 1.00; with powers of 0.2 and
+# 0.3, 0.97 to 1.01 times that (decisions.md)
 POWER = 0.25
 OUTLIERS = 0.995  # quantile of the differences that limits them: fireflies
 SMOOTHED = 2  # times that differences are averaged over 5 × 5 pixels: as by a Gaussian filter of 2 pixels
@@ -85,8 +84,8 @@ class SampleDensity:
         half = np.broadcast_to(half, whole.shape)
         halves = half, 2 * whole - half
         denoised = [self._denoise(one, ["R", "G", "B"], QUALITY) for one in halves]
-        image = 0.5 * (denoised[0] + denoised[1])
-        left, noise = (_smoothed(relative_squares(*pair, image)) for pair in (denoised, halves))
+        mean = 0.5 * (denoised[0] + denoised[1])
+        left, noise = (_smoothed(relative_squares(*pair, mean)) for pair in (denoised, halves))
         if not (left.any() and noise.any()):
             return
         density = (left * noise) ** POWER
@@ -95,19 +94,9 @@ class SampleDensity:
 
 
 def _smoothed(squares):
-    """Return squared differences (height, width) without outliers, as means over neighbours; black pixels have a
-    minimum, because they would have no samples."""
+    """Return squared differences (height, width) without outliers, as means over neighbours."""
     squares = np.minimum(squares, np.quantile(squares, OUTLIERS))
     for _ in range(SMOOTHED):
         squares = box_mean(squares)
+    # The logarithm of the density must be finite, and without this minimum, black pixels would have no samples
     return np.maximum(squares, 1e-6 * squares.max())
-
-
-def gain_of(density):
-    """Return the precision of a sample where pixels have a `density`, their numbers of samples over the mean, relative
-    to that of a sample where numbers are equal; 1 for None.
-
-    Numbers are best for squared errors in proportion to d² / n, with the density d and n samples. With equal numbers
-    their mean is that of d², over n; with the density it is 1 / n.
-    """
-    return 1.0 if density is None else float(np.mean(np.square(density)))

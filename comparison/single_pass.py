@@ -15,7 +15,6 @@ from vpl.split.film_cells import HALF
 
 from .fine_film import fine_film
 from .images import colour
-from .sample_density import gain_of
 
 MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the time to the first image
 MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
@@ -45,22 +44,20 @@ def largest_pass(pixels, in_parts=False):
 
 @dataclass
 class Pass:
-    """A finished pass: seed, samples per pixel, wall-clock seconds, counters of the integrator, the seconds of
-    compilation, None if they were not measured, and the `gain` of different numbers of samples, see `gain_of`."""
+    """A finished pass: seed, samples per pixel, wall-clock seconds, counters of the integrator, and the seconds of
+    compilation, None if they were not measured."""
 
     seed: int
     spp: int
     seconds: float
     statistics: dict = field(default_factory=dict)
     compile_seconds: float | None = None
-    gain: float = 1.0
 
     @property
     def weight(self):
         """Weight in the average of passes: the precision that the integrator expects of the pass before rendering it,
-        or else the samples per pixel, times the gain. Passes of `manylights` without virtual lights are noisier than
-        the others."""
-        return self.gain * self.statistics.get("precision", self.spp)
+        or else the samples per pixel. Passes of `manylights` without virtual lights are noisier than the others."""
+        return self.statistics.get("precision", self.spp)
 
     @property
     def has_lights(self):
@@ -132,7 +129,7 @@ def render_pass(
     channels = [entry.name for entry in bitmap.struct_()]
     planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
     statistics = dict(getattr(integrator, "statistics", None) or {})
-    taken = Pass(seed, spp, seconds, statistics, compilation and compilation.seconds, gain_of(density))
+    taken = Pass(seed, spp, seconds, statistics, compilation and compilation.seconds)
     if not half:
         return PassImage(planes, channels, taken)
     rest = [index for index, name in enumerate(channels) if not name.startswith(HALF)]
@@ -152,11 +149,12 @@ def _render(scene, sensor, integrator, spp, seed, parts):
 @dataclass
 class SharedStart:
     """What the passes of a render share: `start`, an object of the integrator, None before the first pass. The scene
-    must not change while it is used. `rays`: least number of camera rays for which the start is made; 0 without a limit
-    of time, with a checkpoint, and on a cluster."""
+    must not change while it is used. `rays`, `learning`: least numbers of camera rays for which the start is made, and
+    for which emitters are learned; 0 without a limit of time, with a checkpoint, and on a cluster."""
 
     start: object = None
     rays: int = 0
+    learning: int = 0
 
 
 @contextmanager

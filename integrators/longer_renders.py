@@ -49,16 +49,16 @@ class PassRenderer(GatheringIntegrator):
     ):  # fmt: skip
         """Within the block, a render is a pass of a longer render and uses the start that its passes share.
 
-        ``shared``: object with an attribute ``start``, None until the first pass is rendered, and ``rays``: least
-        number of camera rays for which the start is made.  The start depends on the first pass and ``rays`` alone:
-        where it is missing and this is not the first pass, yields True, and the caller has to render the first pass
-        within :meth:`only_start`.  ``parts``: the film has ``parts``² pixels for each pixel of the image, the same in
-        all passes.  ``density`` (height, width): samples of each pixel of the image over their mean, about; None for
-        equal numbers.  ``half``: whether the image has the mean of every second sample as channels of the layer
-        :data:`vpl.split.film_cells.HALF`, with an even number of samples for each pixel of the film.  Both need
-        :meth:`may_differ`, and exclude each other.  ``continued``: earlier passes with this density whose lattices the
-        samples continue; None for lattices of their own.  The density must not depend on these passes: their samples
-        tell where the next ones lie.
+        ``shared``: object with an attribute ``start``, None until the first pass is rendered; ``rays``: least number of
+        camera rays for which the start is made; ``learning``: least number for which emitters are learned.  The start
+        depends on the first pass and these numbers alone: where it is missing and this is not the first pass, yields
+        True, and the caller has to render the first pass within :meth:`only_start`.  ``parts``: the film has ``parts``²
+        pixels for each pixel of the image, the same in all passes.  ``density`` (height, width): samples of each pixel
+        of the image over their mean, about; None for equal numbers.  ``half``: whether the image has the mean of every
+        second sample as channels of the layer :data:`vpl.split.film_cells.HALF`, with an even number of samples for
+        each pixel of the film.  Both need :meth:`may_differ`, and exclude each other.  ``continued``: earlier passes
+        with this density whose lattices the samples continue; None for lattices of their own.  The density must not
+        depend on these passes: their samples tell where the next ones lie.
         """
         if half and density is not None:
             raise ValueError("half must be False where pixels have different numbers of samples, by a density")

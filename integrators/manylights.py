@@ -119,13 +119,13 @@ class ManyLightsIntegrator(PassRenderer):
       default, the plugin also stratifies the samples in a pixel, on the lens and in time.  Other samplers, the sensor
       ``batch`` and wrappers, such as ``aov`` and ``moment``, keep the samples of the sensor's sampler.
     - Numbers of samples: with ``denoised``, the passes of ``manylights.render`` from the third on give a pixel from a
-      quarter to four times the mean number of samples.  Two halves of the second pass are denoised apart, and show
-      where noise remains.  Passes depend on earlier passes only and have a common weight for all pixels, so the mean of
-      the image is unchanged.  These passes share lattices, so that their samples are spread as those of one pass.
-      Renders of less than some 60 samples have no such second pass and equal numbers.  The sensor needs the samples of
-      this plugin, and a film in the resolution of the image a box filter.  Images that end by ``error``, passes of a
-      given size, images by several workers and images above half a million pixels (a million in their own resolution)
-      have equal numbers.
+      quarter to four times the mean number of samples.  The differences of two halves of the second pass, denoised and
+      not, show where noise remains.  Passes depend on earlier passes only and have a common weight for all pixels, so
+      the mean of the image is unchanged.  These passes share lattices, so that their samples are spread as those of one
+      pass.  Renders of less than some 60 samples have no such second pass and equal numbers.  The sensor needs the
+      samples of this plugin, and a film in the resolution of the image a box filter.  Images that end by ``error``,
+      passes of a given size, images by several workers and images above half a million pixels (a million in their own
+      resolution) have equal numbers.
     - Fine films: where an image is denoised at twice its resolution, the rays of a pixel share two fifths of the light
       of virtual lights, in proportion to the light that they reflect.  The sum over the pixel is the same, and this
       light is slightly blurred inside the pixel.  With another filter than a box, this changes pixels at edges a
@@ -318,7 +318,7 @@ class ManyLightsIntegrator(PassRenderer):
         dr.make_opaque(ray, active)
         # A shared start serves larger passes, too
         shared = self._pass.shared
-        learning = max(count, _SHARED_SAMPLES * pixels) if shared else count
+        learning = max(count, _SHARED_SAMPLES * pixels, shared.learning) if shared else count
         # For many pixels and little time, 16 samples of each would be more than the render has
         planned = max(count, shared.rays, min(learning, self.cost_model.root_from)) if shared else count
         groups = EmitterGroups(scene, self.light_groups) if self.light_groups and not known else None

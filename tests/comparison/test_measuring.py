@@ -16,7 +16,7 @@ class Recorded(rendering.Progressive):
         self.restart()
 
     pixels, integrator = property(lambda self: self._pixels), None
-    _denoise, _rays, differs, parts = None, 0, False, 1
+    _denoise, _rays, differs, parts = None, {}, False, 1
 
     def render(self, spp, seed=None, is_probe=False):
         self.asked.append((spp, seed is not None))

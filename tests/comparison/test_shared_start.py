@@ -45,14 +45,24 @@ def test_long_renders_have_larger_pilots(rays, size):
 
 
 @pytest.mark.parametrize(
-    ("limits", "rays"),
-    [({}, 0), ({"spp": 8}, 0), ({"seconds": 2.0}, 200_000), ({"seconds": 2.0, "spp": 8}, 8 * 16 * 16)],
-)
-def test_limits_of_a_render_determine_the_rays_of_the_start(limits, rays):
+    ("limits", "rays", "learning"),
+    [
+        ({}, 0, 0), ({"spp": 8}, 0, 0), ({"seconds": 2.0}, 200_000, 1_200_000),
+        ({"seconds": 2.0, "spp": 8}, 8 * 16 * 16, 8 * 16 * 16),
+    ],
+)  # fmt: skip
+def test_limits_of_a_render_determine_the_rays_of_the_start(limits, rays, learning):
     progressive = Progressive(scene(), 0, integrator=plugin(), **limits)
-    assert progressive._shared.rays == rays
-    progressive.restart()
-    assert progressive._shared.rays == rays
+    for _ in range(2):
+        assert (progressive._shared.rays, progressive._shared.learning) == (rays, learning)
+        progressive.restart()
+
+
+@pytest.mark.parametrize(("learning", "size"), [(0, 16 * 16 * 16), (10**5, 10**5)])
+def test_long_renders_learn_emitters_for_all_of_their_rays(learning, size):
+    shared = SharedStart(learning=learning)
+    render_pass(scene(), 0, plugin(), *FIRST, shared=shared)
+    assert shared.start.paths == size
 
 
 @pytest.mark.parametrize(("with_checkpoint", "rays"), [(False, 8 * 16 * 16), (True, 0)])
