@@ -121,11 +121,10 @@ class ManyLightsIntegrator(PassRenderer):
     - Numbers of samples: with ``denoised``, the passes of ``manylights.render`` from the third on give a pixel from a
       quarter to four times the mean number of samples.  The differences of two halves of the second pass, denoised and
       not, show where noise remains.  Passes depend on earlier passes only and have a common weight for all pixels, so
-      the mean of the image is unchanged.  These passes share lattices, so that their samples are spread as those of one
-      pass.  Renders of less than some 60 samples have no such second pass and equal numbers.  The sensor needs the
-      samples of this plugin, and a film in the resolution of the image a box filter.  Images that end by ``error``,
-      passes of a given size, images by several workers and images above half a million pixels (a million in their own
-      resolution) have equal numbers.
+      the mean of the image is unchanged.  These passes take successive points of common lattices.  Renders of less than
+      some 60 samples have no such second pass and equal numbers.  The sensor needs the samples of this plugin, and a
+      film in the resolution of the image a box filter.  Images that end by ``error``, passes of a given size, images by
+      several workers and images above half a million pixels (a million in their own resolution) have equal numbers.
     - Fine films: where an image is denoised at twice its resolution, the rays of a pixel share two fifths of the light
       of virtual lights, in proportion to the light that they reflect.  The sum over the pixel is the same, and this
       light is slightly blurred inside the pixel.  With another filter than a box, this changes pixels at edges a
