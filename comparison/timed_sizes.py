@@ -257,7 +257,8 @@ def _costs_by_size(growth, size):
     its `growth`: (ratio of the sizes, cost of a sample over that in this pass) by size; empty for an empty `growth`."""
     costs, before, total, last = [], 0, 0.0, 0.0
     for times, predicted in growth:
-        most, cost = times * size, predicted
+        # Samplers take integers only
+        most, cost = round(times * size), predicted
         if times > 1:
             cost = UNSURE * predicted if predicted > 1 else min(UNSURE * predicted, 1.0)
         # Where the samples of a pixel share cuts, the whole cost grows in proportion to samples beyond a fixed part

@@ -317,9 +317,10 @@ class ManyLightsIntegrator(PassRenderer):
         dr.make_opaque(ray, active)
         # A shared start serves larger passes, too
         shared = self._pass.shared
-        learning = max(count, _SHARED_SAMPLES * pixels, shared.learning) if shared else count
+        usual = max(count, _SHARED_SAMPLES * pixels) if shared else count
+        learning = max(usual, shared.learning) if shared else count
         # For many pixels and little time, 16 samples of each would be more than the render has
-        planned = max(count, shared.rays, min(learning, self.cost_model.root_from)) if shared else count
+        planned = max(count, shared.rays, min(usual, self.cost_model.root_from)) if shared else count
         groups = EmitterGroups(scene, self.light_groups) if self.light_groups and not known else None
         emitters = known.emitters if known else emitter_sampler(scene, learning_rays(learning), groups)
         return View(

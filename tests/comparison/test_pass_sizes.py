@@ -284,10 +284,14 @@ def second_size(growth=(), compiled=0.0, time=10.0, **limits):
     """Size of the second pass, after one of 4 samples that takes 0.4 s without compilation, of which 0.1 s are a start,
     and predicts the costs `growth` of 16, 32, ... samples; the rest of `time` is left."""
     sizes = TimedSizes(SQUARE // 2, time, in_parts=True, **limits)
-    costs = [(4 * 2**index, cost) for index, cost in enumerate(growth)]
+    # Ratios of sizes, as the integrator gives them
+    costs = [(16 * 2**index / 4, cost) for index, cost in enumerate(growth)]
     statistics = {"seconds": {Stage.TRACED: 0.3}} | ({"growth": costs} if costs else {})
     first = Pass(0, sizes.next([], 0.0), 0.4 + (compiled or 0), statistics, compiled)
-    return sizes.next([first], 0.4)
+    size = sizes.next([first], 0.4)
+    # Samplers refuse other numbers
+    assert isinstance(size, int)
+    return size
 
 
 def test_in_parts_a_predicted_cost_makes_the_second_pass_larger():

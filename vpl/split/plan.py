@@ -1,9 +1,10 @@
 """Plan: whether virtual lights pay, the number of lights, and the fineness of the clusters.
 
 An :class:`Option` is a choice of light kinds.  :func:`price` predicts the variance × cost of an option by the cost
-model; :func:`choose` measures the options that may pay, and takes the one with the least product, or no lights.  In
-images that are denoised, the product has a power of the variance: what a denoiser leaves is in part made at edges,
-which virtual lights do not change.
+model; :func:`choose` measures the options that may pay, and takes the one with the least product, or no lights.  The
+variance is that of the paths, of the choice of lit vertices and of the lights.  In images that are denoised, the
+product has a power of the variance: what a denoiser leaves is in part made at edges, which virtual lights do not
+change.  There, the noise of lights has a larger weight, as neighbouring pixels share it.
 """
 
 from __future__ import annotations
@@ -81,9 +82,13 @@ class Option:
         total = np.sum(self.indirect)
         return len(self.indirect) * np.sum(self.indirect**2) / total**2 if total else 0.0
 
+    def least(self, evidence: Evidence) -> float:
+        """Relative variance of a path that remains at least, if lights carry all that they can."""
+        return min(evidence.variance(self.expected), evidence.variance(self.traced))
+
     def remaining(self, evidence: Evidence) -> float:
-        """Relative variance of a path that remains: the measured value, at least that of :attr:`expected`."""
-        least = min(evidence.variance(self.expected), evidence.variance(self.traced))
+        """Relative variance of a path that remains: the measured value, not below :meth:`least`."""
+        least = self.least(evidence)
         return least if self.residual is None else max(evidence.variance(self.residual), least)
 
 
@@ -226,7 +231,15 @@ def _most_to_pay(evidence: Evidence) -> float:
 
 def _priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:
     """(:func:`price`, best plan) with the lights of an option."""
-    rest = option.remaining(evidence)
+    least, rest = option.least(evidence), option.remaining(evidence)
+    found, plan = _planned(evidence, option, rest)
+    # At least the price before measuring, so that the order of measurements does not matter: the number of shadow rays
+    # is the best one for the variance of paths, and the price counts that of the lights, too
+    return max(found, _planned(evidence, option, least)[0]) if rest > least else found, plan
+
+
+def _planned(evidence: Evidence, option: Option, rest: float) -> tuple[float, Plan]:
+    """(Price, best plan) with the lights of an option, where paths leave the relative variance ``rest``."""
     model, paths, samples = evidence.model, evidence.paths, evidence.samples
     cuts = model.emitter_cuts * option.emitters + option.surfaces
     rays, error = _cut_rays(rest, cuts, samples, model)
@@ -239,11 +252,12 @@ def _priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:
     # The least of (left + vertex variance / share) × (cost + vertex cost × share)
     share = (model.vertex_variance * cost / (model.vertex_cost * left)) ** 0.5
     vertices = max(round(float(np.clip(share, model.least_vertices, 1)) * samples), 1)
-    shared = model.vertex_variance * samples / vertices
+    # Where all vertices are lit, none is chosen
+    choice, lights = model.vertex_variance * (samples / vertices - 1), 0.0
     if light_paths:
-        shared += samples * model.light_variance * _indirect_variance(evidence, option) / light_paths
-    plan = Plan(light_paths, option.emitters, error, vertices, left, shared, cost, cuts * rays, "")
-    return cost * left**model.denoised_power, plan
+        lights = samples * model.light_variance * _indirect_variance(evidence, option) / light_paths
+    plan = Plan(light_paths, option.emitters, error, vertices, left, choice + lights, cost, cuts * rays, "")
+    return cost * (left + choice + model.shared * lights) ** model.denoised_power, plan
 
 
 def _cut_rays(rest: float, cuts: float, samples: int, model: CostModel) -> tuple[float, float]:

@@ -56,8 +56,9 @@ def smooth_tile(folder):
 def always():
     """Lights stand for emitters even in small images, because the cost model has all lights for nothing."""
     free = dict.fromkeys(("fixed_cost", "light_path_cost", "ray_cost", "emitter_cuts"), 1e-9)
-    # All vertices are lit
-    with plugin_with_model(pays_below=1e30, fewest_light_paths=4000, vertex_variance=1e9, **free):
+    # All vertices are lit, and lights have no noise
+    noise = {"vertex_variance": 1e9, "light_variance": 1e-9}
+    with plugin_with_model(pays_below=1e30, fewest_light_paths=4000, **noise, **free):
         yield
 
 
