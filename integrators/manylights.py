@@ -315,12 +315,13 @@ class ManyLightsIntegrator(PassRenderer):
         seed = sampler.pass_seed if isinstance(sampler, LatticeSampler) else int(bits[0])
         count, pixels = dr.width(ray), cells.rays.pixels
         dr.make_opaque(ray, active)
-        # A shared start serves larger passes, too
-        shared = self._pass.shared
-        usual = max(count, _SHARED_SAMPLES * pixels) if shared else count
-        learning = max(usual, shared.learning) if shared else count
-        # For many pixels and little time, 16 samples of each would be more than the render has
-        planned = max(count, shared.rays, min(usual, self.cost_model.root_from)) if shared else count
+        learning = planned = count
+        if shared := self._pass.shared:
+            # A shared start serves larger passes, too
+            usual = max(count, _SHARED_SAMPLES * pixels)
+            learning = max(usual, shared.learning)
+            # For many pixels and little time, 16 samples of each would be more than the render has
+            planned = max(count, shared.rays, min(usual, self.cost_model.root_from))
         groups = EmitterGroups(scene, self.light_groups) if self.light_groups and not known else None
         emitters = known.emitters if known else emitter_sampler(scene, learning_rays(learning), groups)
         return View(

@@ -79,6 +79,9 @@ def swept(tmp_path_factory, variant):
 
 @pytest.fixture
 def lights_cost_nothing():
-    """Let ``manylights`` use virtual lights wherever lights can carry anything, as if they had no noise."""
+    """Let ``manylights`` use virtual lights wherever lights can carry anything, as if they had no noise.
+
+    Without noise they have the least number, which is about the usual one of the images of the tests.
+    """
     with plugin_with_model(pays_below=1e30, light_variance=1e-9, fewest_light_paths=8000):
         yield

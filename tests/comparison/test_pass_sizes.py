@@ -285,7 +285,7 @@ def second_size(growth=(), compiled=0.0, time=10.0, **limits):
     and predicts the costs `growth` of 16, 32, ... samples; the rest of `time` is left."""
     sizes = TimedSizes(SQUARE // 2, time, in_parts=True, **limits)
     # Ratios of sizes, as the integrator gives them
-    costs = [(16 * 2**index / 4, cost) for index, cost in enumerate(growth)]
+    costs = [(4.0 * 2**index, cost) for index, cost in enumerate(growth)]
     statistics = {"seconds": {Stage.TRACED: 0.3}} | ({"growth": costs} if costs else {})
     first = Pass(0, sizes.next([], 0.0), 0.4 + (compiled or 0), statistics, compiled)
     size = sizes.next([first], 0.4)

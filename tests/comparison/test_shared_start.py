@@ -60,9 +60,11 @@ def test_limits_of_a_render_determine_the_rays_of_the_start(limits, rays, learni
 
 @pytest.mark.parametrize(("learning", "size"), [(0, 16 * 16 * 16), (10**5, 10**5)])
 def test_long_renders_learn_emitters_for_all_of_their_rays(learning, size):
+    """Their pilots do not grow with these rays."""
     shared = SharedStart(learning=learning)
     render_pass(scene(), 0, plugin(), *FIRST, shared=shared)
     assert shared.start.paths == size
+    assert len(shared.start.pilot.radiance) == 256
 
 
 @pytest.mark.parametrize(("with_checkpoint", "rays"), [(False, 8 * 16 * 16), (True, 0)])

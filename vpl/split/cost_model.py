@@ -121,8 +121,8 @@ class CostModel:
     shared: float = _constant(
         4.0,
         "ratio",
-        "Weight of the variance that neighbouring pixels share, in images that are denoised: a denoiser keeps half of "
-        "it, and 7 to 16% of the rest.",
+        "Weight of the noise of lights in their price and number, in images that are denoised: neighbouring pixels "
+        "share it, and a denoiser keeps half of it, and 7 to 16% of other noise.",
         f"{_LIGHTS} and --parts denoised",
     )
     set_error: float = _constant(
@@ -141,7 +141,7 @@ class CostModel:
     vertex_variance: float = _constant(
         0.06,
         "relative variance",
-        "Relative variance of a single gather vertex that stands for its pixel.",
+        "Relative variance of a single gather vertex that stands for its pixel; none where all vertices are lit.",
         "0.018 kitchen to 0.23 veach_ajar",
     )
 
@@ -166,7 +166,8 @@ class CostModel:
     pays_below: float = _constant(
         1.0,
         "ratio",
-        "Lights are used where variance × cost with lights is below this multiple of that without.",
+        "Lights are used where variance × cost with lights, their noise included, is below this multiple of that "
+        "without.",
         "definition",
     )
     denoised_power: float = _constant(

@@ -2,9 +2,10 @@
 
 An :class:`Option` is a choice of light kinds.  :func:`price` predicts the variance × cost of an option by the cost
 model; :func:`choose` measures the options that may pay, and takes the one with the least product, or no lights.  The
-variance is that of the paths, of the choice of lit vertices and of the lights.  In images that are denoised, the
-product has a power of the variance: what a denoiser leaves is in part made at edges, which virtual lights do not
-change.  There, the noise of lights has a larger weight, as neighbouring pixels share it.
+variance is that of the paths, of the choice of lit vertices and of the lights on surfaces.  In images that are
+denoised, the product has a power of the variance: what a denoiser leaves is in part made at edges, which virtual lights
+do not change.  A denoiser keeps more of the noise of lights, which neighbouring pixels share, so this noise has the
+weight ``shared`` there.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ class Plan:
 
     ``light_paths``: number of lines for drawing virtual lights on surfaces, 0 for none; ``emitters``: whether virtual
     lights represent emitters; ``error``: bound of the cuts, as a fraction of the pixel; ``vertices``: lit vertices per
-    pixel; ``variance``: remaining relative variance of a camera path; ``shared``: variance of the lights and of the
-    choice of lit vertices, in the same unit; ``cost`` of a path with its share of lights and cuts, over that of a path
-    alone; ``rays``: shadow rays of a pixel's cuts; ``reason`` in words.
+    pixel; ``variance``: remaining relative variance of a camera path; ``of_lights``: variance of the lights on surfaces
+    and of the choice of lit vertices, in the same unit; ``cost`` of a path with its share of lights and cuts, over that
+    of a path alone; ``rays``: shadow rays of a pixel's cuts; ``reason`` in words.
     """
 
     light_paths: int
@@ -39,7 +40,7 @@ class Plan:
     error: float
     vertices: int
     variance: float
-    shared: float
+    of_lights: float
     cost: float
     rays: float
     reason: str
@@ -83,7 +84,7 @@ class Option:
         return len(self.indirect) * np.sum(self.indirect**2) / total**2 if total else 0.0
 
     def least(self, evidence: Evidence) -> float:
-        """Relative variance of a path that remains at least, if lights carry all that they can."""
+        """Relative variance of a path if lights carry all that they can: the least that remains."""
         return min(evidence.variance(self.expected), evidence.variance(self.traced))
 
     def remaining(self, evidence: Evidence) -> float:
@@ -188,7 +189,7 @@ class Decision:
         Independent of the random numbers of passes that share the start of an earlier pass, so it may weight them in a
         mean.  The first pass shares its camera rays with the pilot, and no other random numbers.
         """
-        variance = self.plan.variance + self.plan.shared if self.plan.gathers else self.evidence.whole
+        variance = self.plan.variance + self.plan.of_lights if self.plan.gathers else self.evidence.whole
         return samples / variance if variance > 0 else float(samples)
 
 
@@ -207,7 +208,7 @@ def choose(evidence: Evidence, options: list[Option], measures: bool = True) -> 
             product, plan = _priced(evidence, option)
         found.append((product, plan))
     product, best = min(found, key=lambda priced: priced[0])
-    remains = best.variance / max(evidence.whole, _TINY)
+    remains = (best.variance + best.of_lights) / max(evidence.whole, _TINY)
     if product > most:
         costs = f"virtual lights would cost {best.cost - 1:.2g} times as much as the paths"
         return without_lights(f"{costs} and leave {remains:.0%} of the variance")
@@ -230,16 +231,16 @@ def _most_to_pay(evidence: Evidence) -> float:
 
 
 def _priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:
-    """(:func:`price`, best plan) with the lights of an option."""
+    """(:func:`price`, plan) with the lights of an option."""
     least, rest = option.least(evidence), option.remaining(evidence)
     found, plan = _planned(evidence, option, rest)
-    # At least the price before measuring, so that the order of measurements does not matter: the number of shadow rays
-    # is the best one for the variance of paths, and the price counts that of the lights, too
+    # A measured price is not below the price before measuring, so the order of measurements does not matter. It could
+    # be below: the numbers of rays, vertices and light paths are not those of the least price
     return max(found, _planned(evidence, option, least)[0]) if rest > least else found, plan
 
 
 def _planned(evidence: Evidence, option: Option, rest: float) -> tuple[float, Plan]:
-    """(Price, best plan) with the lights of an option, where paths leave the relative variance ``rest``."""
+    """(Price, plan) with the lights of an option, where paths leave the relative variance ``rest``."""
     model, paths, samples = evidence.model, evidence.paths, evidence.samples
     cuts = model.emitter_cuts * option.emitters + option.surfaces
     rays, error = _cut_rays(rest, cuts, samples, model)
@@ -249,7 +250,8 @@ def _planned(evidence: Evidence, option: Option, rest: float) -> tuple[float, Pl
         light_paths = _light_paths(evidence, option, left)
     fixed = (model.fixed_cost + model.light_path_cost * light_paths) / paths
     cost = 1 + cuts * model.ray_cost * rays / samples + fixed
-    # The least of (left + vertex variance / share) × (cost + vertex cost × share)
+    # The least of (left + vertex variance / share) × (cost + vertex cost × share). The price leaves out the cost of
+    # vertices: predicted costs without it are 0.9 to 1.25 times those of renders (decisions.md)
     share = (model.vertex_variance * cost / (model.vertex_cost * left)) ** 0.5
     vertices = max(round(float(np.clip(share, model.least_vertices, 1)) * samples), 1)
     # Where all vertices are lit, none is chosen
@@ -284,10 +286,11 @@ def _indirect_variance(evidence: Evidence, option: Option) -> float:
 
 
 def _light_paths(evidence: Evidence, option: Option, left: float) -> int:
-    """Number of light paths: the least of (left / samples + light variance / light paths) × cost, within limits."""
+    """Number of light paths: the least of (left / samples + shared × light variance / light paths) × cost, within
+    limits."""
     model, paths = evidence.model, evidence.paths
-    of_lights = model.shared * model.light_variance * _indirect_variance(evidence, option)
-    balanced = (of_lights * evidence.samples * paths / (model.light_path_cost * left)) ** 0.5
+    weighted = model.shared * model.light_variance * _indirect_variance(evidence, option)
+    balanced = (weighted * evidence.samples * paths / (model.light_path_cost * left)) ** 0.5
     wanted = max(balanced, option.concentration / model.set_error**2)
     wanted = np.clip(wanted, model.least_light_share * paths, model.most_light_share * paths)
     return int(np.clip(wanted, model.fewest_light_paths, model.most_light_paths))

@@ -83,6 +83,34 @@ def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
     assert balanced(0.1 * direct, indirect, 10**8, 64, left=0.95 * indirect).light_paths == 0
 
 
+def priced(samples=64, **constants):
+    """Price of lights on surfaces that carry all of an image's noise but a tenth, with as many lights in any case."""
+    rng = np.random.default_rng(0)
+    indirect, direct = rng.exponential(size=(2, 10_000))
+    model = replace(MODEL, fewest_light_paths=10**5, most_light_paths=10**5, **constants)
+    traced = 0.3 * direct + indirect
+    evidence = Evidence(traced, UNSEEN, 0.3 * direct, np.ones(10_000), 10**6, samples, False, model)
+    option = Option(True, False, traced, indirect)
+    return price(evidence, option), choose(evidence, [option])
+
+
+def test_the_noise_of_lights_counts_in_their_price():
+    """With the weight of noise that a denoiser leaves."""
+    (none, plan), (usual, _), (heavy, _) = (
+        priced(light_variance=noise, shared=shared) for noise, shared in ((0.0, 1.0), (50.0, 1.0), (50.0, 4.0))
+    )
+    assert heavy - none == pytest.approx(4 * (usual - none)) and usual > 1.01 * none
+    assert plan.light_paths == 10**5 and priced(light_variance=5000.0)[1].light_paths == 0
+
+
+def test_the_choice_of_lit_vertices_counts_in_the_price_unless_all_are_lit():
+    prices = [priced(vertex_variance=noise, least_vertices=1.0)[0] for noise in (0.03, 0.06)]
+    assert prices[0] == prices[1]
+    # An eighth of the vertices is lit
+    few = [priced(vertex_variance=noise, vertex_cost=1e6)[0] for noise in (0.03, 0.06)]
+    assert few[1] - few[0] == pytest.approx(few[0] - priced(vertex_variance=0.0, vertex_cost=1e6)[0])
+
+
 @pytest.mark.parametrize("power", (0.2, 0.45, 1.0))
 def test_cuts_have_the_shadow_rays_of_the_least_price(power):
     unlimited = replace(MODEL, denoised_power=power, most_rays=1e9, finest_error=1e-12, coarsest_error=1e12)
@@ -188,7 +216,8 @@ def test_a_choice_is_independent_of_earlier_measurements(emitters, model):
 
 @pytest.mark.parametrize("samples", (16, 64))
 def test_no_residual_lowers_a_price(samples):
-    """Other numbers of rays than the best would let the price fall by half a percent where more variance remains."""
+    """Other numbers of rays than the best, and the noise of lights, would let the price fall by half a percent where
+    more variance remains."""
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
     evidence = Evidence(direct + indirect, UNSEEN, 0 * direct, np.ones(10_000), 10**9, samples, True, DENOISED)
