@@ -62,7 +62,7 @@ def split_images() -> dict[str, np.ndarray]:
         scene = mi.load_file(str(ROOT / "scenes" / f"{name}.xml"), resx=SPLIT_SIZE, resy=SPLIT_SIZE)
         for lights in (True, False):
             plugin = mi.load_dict({"type": "manylights", "max_depth": 6, "virtual_lights": lights})
-            plugin.cost_model = CostModel(pays_below=1e30, light_variance=1e-9, fewest_light_paths=8000)
+            plugin.cost_model = CostModel(pays_below=1e30, fewest_light_paths=4000)
             label = f"{name}: manylights" + ("" if lights else ", traced")
             found[label] = np.array(mi.render(scene, integrator=plugin, spp=SPLIT_SPP, seed=1))
             print(label, file=sys.stderr, flush=True)

@@ -79,9 +79,6 @@ def swept(tmp_path_factory, variant):
 
 @pytest.fixture
 def lights_cost_nothing():
-    """Let ``manylights`` use virtual lights wherever lights can carry anything, as if they had no noise.
-
-    Without noise they have the least number, which is about the usual one of the images of the tests.
-    """
-    with plugin_with_model(pays_below=1e30, light_variance=1e-9, fewest_light_paths=8000):
+    """Let ``manylights`` use virtual lights wherever lights can carry anything."""
+    with plugin_with_model(pays_below=1e30, fewest_light_paths=4000):
         yield

@@ -2,10 +2,9 @@
 
 An :class:`Option` is a choice of light kinds.  :func:`price` predicts the variance × cost of an option by the cost
 model; :func:`choose` measures the options that may pay, and takes the one with the least product, or no lights.  The
-variance is that of the paths, of the choice of lit vertices and of the lights on surfaces.  In images that are
-denoised, the product has a power of the variance: what a denoiser leaves is in part made at edges, which virtual lights
-do not change.  A denoiser keeps more of the noise of lights, which neighbouring pixels share, so this noise has the
-weight ``shared`` there.
+variance is that of the paths.  In images that are denoised, that of the choice of lit vertices and of the lights on
+surfaces adds to it: neighbouring pixels share the noise of lights, and a denoiser keeps more of it.  There, the product
+has a power of the variance: what a denoiser leaves is in part made at edges, which virtual lights do not change.
 """
 
 from __future__ import annotations
@@ -259,7 +258,8 @@ def _planned(evidence: Evidence, option: Option, rest: float) -> tuple[float, Pl
     if light_paths:
         lights = samples * model.light_variance * _indirect_variance(evidence, option) / light_paths
     plan = Plan(light_paths, option.emitters, error, vertices, left, choice + lights, cost, cuts * rays, "")
-    return cost * (left + choice + model.shared * lights) ** model.denoised_power, plan
+    noise = model.noise_of_lights * (choice + model.shared * lights)
+    return cost * (left + noise) ** model.denoised_power, plan
 
 
 def _cut_rays(rest: float, cuts: float, samples: int, model: CostModel) -> tuple[float, float]:
@@ -271,7 +271,7 @@ def _cut_rays(rest: float, cuts: float, samples: int, model: CostModel) -> tuple
     """
     power, rest = model.denoised_power, max(rest, 1e-9)
     half = 0.5 * (1 - power) * cuts * model.cut_variance / rest
-    squared = power * model.cut_variance / (model.ray_cost * rest)
+    squared = power * model.cut_variance / (model.chosen_ray_cost * rest)
     # The root as a fraction, because a difference would cancel for a small rest
     wanted = squared / (half + (half**2 + squared) ** 0.5)
     rays = samples * min(max(wanted, _FEWEST_RAYS), model.most_rays)

@@ -55,10 +55,10 @@ def smooth_tile(folder):
 @pytest.fixture
 def always():
     """Lights stand for emitters even in small images, because the cost model has all lights for nothing."""
-    free = dict.fromkeys(("fixed_cost", "light_path_cost", "ray_cost", "emitter_cuts"), 1e-9)
-    # All vertices are lit, and lights have no noise
-    noise = {"vertex_variance": 1e9, "light_variance": 1e-9}
-    with plugin_with_model(pays_below=1e30, fewest_light_paths=4000, **noise, **free):
+    costs = "fixed_cost", "light_path_cost", "ray_cost", "raw_chosen_ray_cost", "emitter_cuts"
+    free = dict.fromkeys(costs, 1e-9)
+    # All vertices are lit
+    with plugin_with_model(pays_below=1e30, fewest_light_paths=4000, vertex_variance=1e9, **free):
         yield
 
 
@@ -74,6 +74,7 @@ def assert_lights_stand_for_emitters(integrator, scene, spp):
     assert integrator.statistics["lights"]["emitters"] > 0
 
 
+@pytest.mark.usefixtures("lights_cost_nothing")
 def test_lights_that_promise_less_are_not_measured(monkeypatch):
     """The decision equals the decision after all lights are measured."""
     rng = np.random.default_rng(5)
@@ -86,7 +87,7 @@ def test_lights_that_promise_less_are_not_measured(monkeypatch):
         return choose(evidence, options, **more)
 
     for choice in (choose, after_all):
-        with monkeypatch.context() as patch, plugin_with_model(pays_below=1e30, fewest_light_paths=4000):
+        with monkeypatch.context() as patch:
             measured = calls_of(patch, start, "mean_radiance")
             patch.setattr(estimator, "choose", choice)
             integrator = mi.load_dict({"type": "manylights", "max_depth": 5})

@@ -101,6 +101,9 @@ def test_the_noise_of_lights_counts_in_their_price():
     )
     assert heavy - none == pytest.approx(4 * (usual - none)) and usual > 1.01 * none
     assert plan.light_paths == 10**5 and priced(light_variance=5000.0)[1].light_paths == 0
+    # It does not count in raw images
+    assert MODEL.without_denoiser().noise_of_lights == 0
+    assert priced(light_variance=5000.0, shared=1.0, noise_of_lights=0.0)[0] == pytest.approx(none)
 
 
 def test_the_choice_of_lit_vertices_counts_in_the_price_unless_all_are_lit():
@@ -117,7 +120,7 @@ def test_cuts_have_the_shadow_rays_of_the_least_price(power):
     tried = np.geomspace(1e-3, 1e3, 100_001)
     for rest in (1e-4, 0.01, 1.0, 100.0):
         for cuts in (0.4, 1.0, 1.4):
-            variance, cost = cuts * unlimited.cut_variance / tried, cuts * unlimited.ray_cost * tried
+            variance, cost = cuts * unlimited.cut_variance / tried, cuts * unlimited.chosen_ray_cost * tried
             rays, _ = plan._cut_rays(rest, cuts, 64, unlimited)
             assert rays / 64 == pytest.approx(tried[np.argmin((rest + variance) ** power * (1 + cost))], rel=0.01)
 
