@@ -296,7 +296,8 @@ class CostModel:
         return int(self.trimmed * errors)
 
     def without_denoiser(self) -> CostModel:
-        """The model of images that are not denoised: all variance has the same weight."""
+        """The model of images that are not denoised: shared and other variance have the same weight, and lights pay by
+        the variance of paths alone."""
         return replace(
             self, shared=1.0, denoised_power=1.0, noise_of_lights=0.0, pilot_share=self.large_pilot_share,
             c_per_spacing=self.raw_c_per_spacing, chosen_ray_cost=self.raw_chosen_ray_cost,

@@ -231,11 +231,12 @@ def _most_to_pay(evidence: Evidence) -> float:
 
 def _priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:
     """(:func:`price`, plan) with the lights of an option."""
-    least, rest = option.least(evidence), option.remaining(evidence)
-    found, plan = _planned(evidence, option, rest)
+    found, plan = _planned(evidence, option, option.remaining(evidence))
+    if option.residual is None:
+        return found, plan
     # A measured price is not below the price before measuring, so the order of measurements does not matter. It could
     # be below: the numbers of rays, vertices and light paths are not those of the least price
-    return max(found, _planned(evidence, option, least)[0]) if rest > least else found, plan
+    return max(found, _planned(evidence, option, option.least(evidence))[0]), plan
 
 
 def _planned(evidence: Evidence, option: Option, rest: float) -> tuple[float, Plan]:
