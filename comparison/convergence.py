@@ -80,16 +80,23 @@ class ErrorEstimate:
         if not finite.any():
             return None
         relative = _over_scale(variance, mean, finite)
-        shared = _box_sum(relative) / np.maximum(_box_sum(finite.astype(np.float64)), 1)
+        # Rounding can make sums of zeros negative
+        shared = np.maximum(_box_sum(relative), 0) / np.maximum(_box_sum(finite.astype(np.float64)), 1)
         return float(np.sqrt(np.percentile(shared[finite], 100 * SHARE)))
 
 
 def relative_squares(first, second, image):
     """Return the squared difference of two images (height, width, channels), a mean over channels, relative to the
     squared scale of relMSE of another `image`; 0 where it is not finite. (height, width) float64."""
-    first, second, image = (np.asarray(one, np.float64) for one in (first, second, image))
-    squares, mean = np.square(first - second).mean(axis=-1), image.mean(axis=-1)
-    return _over_scale(squares, mean, np.isfinite(squares) & np.isfinite(mean))
+    difference = np.asarray(first, np.float64) - np.asarray(second, np.float64)
+    return relative_products(difference, difference, image)
+
+
+def relative_products(first, second, image):
+    """Return the product of two images (height, width, channels), in the form of `relative_squares`."""
+    products = (np.asarray(first, np.float64) * np.asarray(second, np.float64)).mean(axis=-1)
+    mean = np.asarray(image, np.float64).mean(axis=-1)
+    return _over_scale(products, mean, np.isfinite(products) & np.isfinite(mean))
 
 
 def box_mean(plane):
@@ -97,13 +104,13 @@ def box_mean(plane):
     return _box_sum(plane) / _box_sum(np.ones_like(plane))
 
 
-def _over_scale(squares, mean, finite):
-    """Return `squares` over m² + (0.1 a)², for an image m of one channel with the mean a; 0 where not `finite`."""
+def _over_scale(products, mean, finite):
+    """Return `products` over m² + (0.1 a)², for an image m of one channel with the mean a; 0 where not `finite`."""
     result = np.zeros_like(mean)
     if not finite.any():
         return result
     scale = np.square(mean) + np.square(DARK * np.abs(mean[finite]).mean())
-    return np.divide(squares, scale, out=result, where=finite & (scale > 0))
+    return np.divide(products, scale, out=result, where=finite & (scale > 0))
 
 
 def _box_sum(plane):
@@ -113,7 +120,7 @@ def _box_sum(plane):
         total = np.cumsum(np.pad(plane, widths), axis=axis)
         size, step = plane.shape[axis], 2 * NEIGHBOURS + 1
         plane = np.take(total, range(step, step + size), axis) - np.take(total, range(size), axis)
-    return np.maximum(plane, 0)
+    return plane
 
 
 def effective_number(weight, weight_squared):

@@ -318,8 +318,7 @@ class _Render:
             self._ending.goal.warn_if_missed(self._error, self._ended_by)
         image, took = self._image(), self._took()
         if denoiser:
-            one, took.raw = self.progressive, image
-            image = self._complete(denoiser.denoise_fine(np.float32(one.fine_image), one.channels))
+            took.raw, image = image, self._complete(denoiser.denoise_passes(self.progressive))
             took.denoise_seconds, took.denoiser = denoiser.seconds, denoiser.description
             took.seconds = self._elapsed()
         return image, took

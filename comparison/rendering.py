@@ -26,7 +26,8 @@ _CONTINUED_STREAM = 0x5EC0
 class Passes:
     """Running average of the passes of a render by their weights (`Pass.weight`).
 
-    The average depends only on the passes and their order. `parts`, `filter`: of the film that passes are rendered
+    The average depends only on the passes and their order. `sums`: those of two halves of the passes, for the detail of
+    denoised images (detail.py). `parts`, `filter`: of the film that passes are rendered
     with, see fine_film.py. `channels`: names of the channels ("R", "G", "B", AOVs), empty before the first pass;
     `passes`: a list of `Pass`; `estimate`: the `ErrorEstimate` of the passes.
     """
@@ -37,14 +38,16 @@ class Passes:
 
     def restart(self):
         """Remove all passes."""
-        self.passes, self.channels, self.sum, self.estimate = [], [], 0.0, ErrorEstimate()
+        self.passes, self.channels, self.sums, self.estimate = [], [], [0.0, 0.0], ErrorEstimate()
 
     def add(self, image):
         """Add a `PassImage`, and return its `Pass`."""
         # In double precision, as long sums of single-precision numbers drift
         planes, one = image.planes.astype(np.float64), image.taken
         self.channels = image.channels
-        self.sum = self.sum + one.weight * planes
+        first, second = self.half_weights
+        half = int(second < first)
+        self.sums = [total + one.weight * planes if half == k else total for k, total in enumerate(self.sums)]
         level = _shown(planes, self.channels).mean(axis=-1, keepdims=True)
         self.estimate.add(self.merged(level), one.weight)
         self.passes.append(one)
@@ -74,9 +77,22 @@ class Passes:
         return sum(one.seconds for one in self.passes)
 
     @property
+    def half_weights(self):
+        """Weights of the two halves of the passes: a pass belongs to the half with the smaller weight before."""
+        weights = [0.0, 0.0]
+        for one in self.passes:
+            weights[weights[1] < weights[0]] += one.weight
+        return weights
+
+    @property
+    def fine_halves(self):
+        """The averages of the halves, at least two passes, in the form of `fine_image`."""
+        return [total / weight for total, weight in zip(self.sums, self.half_weights, strict=True)]
+
+    @property
     def fine_image(self):
         """The average in the resolution of the film, (height, width, channels) float64."""
-        return self.sum / sum(one.weight for one in self.passes)
+        return (self.sums[0] + self.sums[1]) / sum(self.half_weights)
 
     @property
     def image(self):

@@ -184,7 +184,7 @@ def _denoise(job, scene, progressive, denoiser, described):
     seconds = []
     for one in (denoiser, _denoiser(scene, job, denoiser.parts)):
         begin = time.perf_counter()
-        image = one.denoise_fine(progressive.fine_image, progressive.channels)
+        image = one.denoise_passes(progressive)
         seconds.append(one.start_seconds + time.perf_counter() - begin)
     described = described | {"run": job.run or "", "denoise_seconds": seconds[1]} | denoiser.description
     images.write_exr(job.denoised_output, image, progressive.channels, described)

@@ -40,13 +40,13 @@ def half_the_samples(arrays):
 
 
 ALTERATIONS = {
-    "another shape": lambda arrays: arrays.update(sum=arrays["sum"][:2]),
-    "another type": lambda arrays: arrays.update(sum=arrays["sum"].astype(np.float32)),
-    "not a number": lambda arrays: arrays.update(sum=arrays["sum"] * np.nan),
-    "a brighter sum": lambda arrays: arrays.update(sum=arrays["sum"] * 2),
+    "another shape": lambda arrays: arrays.update({"sum.0": arrays["sum.0"][:2]}),
+    "another type": lambda arrays: arrays.update({"sum.1": arrays["sum.1"].astype(np.float32)}),
+    "not a number": lambda arrays: arrays.update({"sum.0": arrays["sum.0"] * np.nan}),
+    "a brighter sum": lambda arrays: arrays.update({"sum.1": arrays["sum.1"] * 2}),
     "fewer samples": half_the_samples,
     "another weight": lambda arrays: arrays.update({"estimate._weight": np.array(1)}),
-    "no sum": lambda arrays: arrays.pop("sum"),
+    "no sum": lambda arrays: arrays.pop("sum.1"),
     "no description": lambda arrays: arrays.pop("described"),
     "no digest": lambda arrays: arrays.pop("digest"),
     "one array more": lambda arrays: arrays.update({"estimate._more": np.zeros(3)}),

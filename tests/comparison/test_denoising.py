@@ -13,7 +13,7 @@ import compare
 import manylights
 from comparison import images
 from comparison import render as rendering_module
-from comparison.denoising import Denoiser
+from comparison.denoising import DETAIL_SHARE, SAMPLES, Denoiser
 from tests.support.comparisons import results_of
 from tests.support.marks import stress
 from tests.support.paths import CORNELL
@@ -259,6 +259,45 @@ def test_the_resolution_suits_the_time(share, parts, chosen, monkeypatch):
 def test_the_network_at_twice_the_resolution_suits_the_samples(spp, chosen):
     assert Denoiser(cornell(16).load(), spp=spp, parts=2).quality == chosen
     assert Denoiser(cornell(16).load(), spp=spp, quality="high", parts=2).quality == "high"
+
+
+@pytest.mark.parametrize(
+    ("spp", "parts", "copies"), [(4, 2, 1), (64, 2, 1), (256, 2, 2), (1024, 2, 4), (16, 1, 1), (64, 1, 2), (None, 2, 1)]
+)
+def test_copies_suit_the_samples(spp, parts, copies):
+    found = Denoiser(cornell(16).load(), spp=spp, parts=parts)
+    assert found.copies == found.description["denoise_copies"] == copies
+    assert Denoiser(cornell(16).load(), spp=spp, quality="fast", parts=parts).copies == 1
+
+
+@pytest.mark.parametrize(("share", "copies"), [(0.2, 1), (0.1, 1), (0.03, 2), (0.005, 4)])
+def test_copies_suit_the_time(share, copies, monkeypatch):
+    times = made_up_networks(monkeypatch, share)
+    found = Denoiser(cornell(40).load(), time_limit=1000, parts=1)
+    assert (found.quality, found.copies) == ("high", copies)
+    halves = 2 * SAMPLES["fast"] / SAMPLES["high"] * times["high"]
+    reserved = halves if halves <= DETAIL_SHARE * 1000 else 0
+    assert found.expected_seconds == pytest.approx(copies * times["high"] + reserved)
+
+
+def test_copies_are_mirrored_back_and_averaged(monkeypatch):
+    """A made-up denoiser moves the image to the right and upwards: its errors are mirrored."""
+    monkeypatch.setattr(
+        Denoiser,
+        "_filtered",
+        lambda self, inputs, network: np.roll(inputs["color"] * inputs["albedo"], (-1, 2), (0, 1)),
+    )
+    found, rng = Denoiser(cornell(32).load(), spp=16, parts=1), np.random.default_rng(2)
+    image = rng.random((32, 32, 3)).astype(np.float32)
+    given = image * found.merged_features["albedo"]
+    moves = [(-1, 2), (1, -2), (-1, -2), (1, 2)]
+    for copies in (1, 2, 4):
+        found.copies = copies
+        expected = np.mean([np.roll(given, move, (0, 1)) for move in moves[:copies]], axis=0)
+        np.testing.assert_allclose(found.denoise(image, ["R", "G", "B"]), expected, rtol=1e-5)
+        # A network that is asked for has one copy
+        alone = found.denoise(image, ["R", "G", "B"], "fast")
+        np.testing.assert_allclose(alone, np.roll(given, moves[0], (0, 1)), rtol=1e-5)
 
 
 def test_the_smallest_image_in_the_shortest_time():
