@@ -30,7 +30,7 @@ from .pilot import error_scale
 from .pixel_clusters import PixelClusters, light_clusters
 from .pixel_rays import PixelRays
 from .plan import Decision, Plan, choose, without_lights
-from .roulette import OutgoingRadiance, best_multiple
+from .roulette import best_multiple
 from .spread_light import spread
 from .start import Start, evidence_of
 from .surface_lights import KeptLights, surface_lights
@@ -96,7 +96,7 @@ def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
     pilot, onward, model = decision.pilot, decision.pilot.onward, view.model
     if len(onward.path) == 0:
         return view, {}
-    outgoing, predicted = OutgoingRadiance.learned(onward.position, onward.normal, onward.sent, model)
+    outgoing, predicted = pilot.outgoing
     of_paths, of_pixels = pilot.unseen
     relative = onward.throughput / error_scale(of_paths, model)[onward.path]
     whole = decision.evidence.whole

@@ -18,6 +18,7 @@ from .cost_model import CostModel
 from .gather_vertices import GatherVertices, SecondVertices
 from .line_sampling import LineSampler
 from .path_tracer import Traced
+from .roulette import OutgoingRadiance
 from .view import Gathering, Stream, View, ViewLights
 
 
@@ -100,6 +101,13 @@ class Pilot:
         )
         octree.choose_by_radiance(arrivals.radiance)
         return LineSampler(octree)
+
+    @cached_property
+    def outgoing(self) -> tuple[OutgoingRadiance, np.ndarray]:
+        """Radiance that surfaces send back, and the radiance that it predicts for each vertex of ``onward``: for
+        Russian roulette in all passes of a render."""
+        onward = self.onward
+        return OutgoingRadiance.learned(onward.position, onward.normal, onward.sent, self.model)
 
     @property
     def brightness(self) -> np.ndarray:

@@ -111,7 +111,10 @@ def best_multiple(
     kept = max(len(brought) - model.left_out(paths), 0)
     for multiple in _MULTIPLES:
         survival = np.clip(multiple * expected, model.least_survival, 1)
-        of_multiple = variance + np.sum(np.sort(brought**2 * (1 / survival - 1))[:kept]) / paths
+        rises = brought**2 * (1 / survival - 1)
+        if kept < len(rises):
+            rises = np.partition(rises, kept)[:kept]
+        of_multiple = variance + np.sum(rises) / paths
         product = of_multiple * (model.first_edges + np.sum(edges * survival) / paths)
         if product < least:
             best, least = multiple, product
