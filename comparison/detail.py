@@ -19,7 +19,7 @@ import numpy as np
 
 from .convergence import box_mean, relative_products
 
-QUALITY = "fast"  # network of the halves. Error with "fast" and with "high", 60 s, four scenes: 0.926 and 0.929
+QUALITY = "fast"  # network of the halves. Error with "fast" and with "high", 60 s, four scenes: 0.919 and 0.928
 # Of the weight of the passes, for the smaller half: halves have similar noise. Passes that double their samples have a
 # third
 LEAST_SHARE = 0.3
