@@ -18,14 +18,15 @@ import numpy as np
 
 from benchmarks import scenes
 from benchmarks.rivals import SAMPLERS, TRIMMED, Rival, Timed, load, measure_in_turn
-from comparison.convergence import box_mean
+from comparison.convergence import smoothed
 from comparison.denoising import FALL, Denoiser
+from comparison.detail import LEAST_SAMPLES
 from comparison.fine_film import PARTS
 from comparison.rendering import Passes
 from comparison.single_pass import Pass, PassImage
 
-# Seconds of each of the two renders of a reference, over those of an image
-REFERENCE_TIMES = 3
+# Seconds of a render that stands for the truth, over those of an image
+REFERENCE_TIMES = 2
 # Stands for an error that is below the noise of the reference
 LEAST_ERROR = 1e-9
 # Seeds of these renders, in units of the benchmark's seeds
@@ -42,8 +43,8 @@ class Truth:
 
     @classmethod
     def of(cls, name: str, scene, seconds: float, width: int) -> Truth:
-        """The reference of a scene and a render by ``manylights`` of at least three times the ``seconds`` of an image;
-        without a reference of this ``width``, two renders.
+        """The reference of a scene and a render by ``manylights`` of twice the ``seconds`` of an image; without a
+        reference of this ``width``, two renders.
 
         The standard error of a reference cannot stand for a second estimate: it misses rare light as the reference
         does (classroom: relative squares of the standard errors 0.093, of the deviations from two renders 0.18).
@@ -51,14 +52,14 @@ class Truth:
         known = scenes.reference_at(name, width)
         rendered = Timed(scene, "manylights", "independent", REFERENCE_TIMES * seconds)
         images = [known[0]] if known else []
-        return cls(*(images + [rendered.render(seed)[0] for seed in REFERENCE_SEEDS])[:2])
+        return cls(*images, *(rendered.render(seed)[0] for seed in REFERENCE_SEEDS[len(images) :]))
 
     @property
     def scale(self) -> np.ndarray:
         """Denominator of relative squared errors, smoothed over 5 × 5 pixels: noise of the truth would raise the
         errors, because it is in the numerator as well."""
         mean = 0.5 * (self.first + self.second)
-        return scenes.scale_of_truth(np.stack([box_mean(mean[..., channel]) for channel in range(3)], axis=-1))
+        return scenes.scale_of_truth(np.stack([smoothed(mean[..., channel]) for channel in range(3)], axis=-1))
 
     def error(self, images: list) -> float:
         """Relative squared error of images, without the pixels of the least and the largest ones."""
@@ -76,9 +77,11 @@ class Several(Rival):
 
     def __init__(self, name: str, scene, sampler: str, width: int, seconds: float, parts: int):
         super().__init__(name, scene, "path", sampler, width, seconds, parts=parts)
-        # Two halves of equal weight, for detail
-        self.count = 2 * max(round(seconds / self.pass_seconds / 2), 1) if seconds > 1.5 * self.pass_seconds else 1
-        # Mitsuba rounds the samples of `multijitter` to squares
+        passes = seconds / self.pass_seconds
+        if passes > 1.5:
+            # Two halves of equal weight, for detail; Mitsuba rounds the samples of `multijitter` to squares
+            self.count = 2 * int(np.ceil(passes / 2))
+            self.spp = max(round((self.spp * passes / self.count) ** 0.5), 1) ** 2
         self._fewer = self.spp if self.count > 1 else max(int(self.spp**0.5) // 2, 1) ** 2
         self.shorter, self.doublings = [], float(np.log2(self.spp * self.count / self._fewer))
 
@@ -94,10 +97,16 @@ class Several(Rival):
             return self._passes(self.render(1000 * seed)[0])
 
     def _passes(self, *images: np.ndarray) -> Passes:
-        passes = Passes(0, self.parts, self.scene.sensors()[self.sensor].film().rfilter())
-        for image in images:
-            passes.add(PassImage(image, ["R", "G", "B"], Pass(0, self.spp * self.parts**2, 0.0)))
-        return passes
+        return passes_of(self.scene, self.sensor, self.parts, self.spp * self.parts**2, *images)
+
+
+def passes_of(scene, sensor: int, parts: int, spp: int, *images: np.ndarray) -> Passes:
+    """Passes of ``spp`` samples for each pixel, from their ``images`` in the resolution of a film of ``parts``."""
+    passes = Passes(0, parts, scene.sensors()[sensor].film().rfilter())
+    passes.keeps_halves = True
+    for image in images:
+        passes.add(PassImage(image, ["R", "G", "B"], Pass(0, spp, 0.0)))
+    return passes
 
 
 @dataclass
@@ -156,11 +165,7 @@ def compare(names, width: int, seconds: float, passes: int) -> dict:
 def _warm_denoiser(scene, seconds: float, parts: int) -> Denoiser:
     """A denoiser that has denoised an image of ``seconds``, after another one that compiled; see :class:`Denoiser`."""
     denoiser = [Denoiser(scene, time_limit=seconds, parts=parts) for _ in range(2)][-1]
-    image, channels = denoiser.features["albedo"], ["R", "G", "B"]
-    if denoiser.restores:
-        denoiser.denoise_halves([image, image], 0.5, channels)
-    else:
-        denoiser.denoise_fine(image, channels)
+    denoiser.denoise_passes(passes_of(scene, 0, parts, LEAST_SAMPLES, *[denoiser.features["albedo"]] * 2))
     return denoiser
 
 

@@ -11,6 +11,7 @@
 `occasional`    files written periodically
 `cluster/`      passes and runs on several processes or machines
 `denoising`     Open Image Denoise with albedo and normal
+`detail`        detail that the denoiser removes, from the raw image
 `fine_film`     films of twice the resolution for images that will be denoised
 `sample_density`
                 more samples where the denoiser leaves noise

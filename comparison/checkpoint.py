@@ -20,7 +20,8 @@ from .single_pass import Pass
 SUFFIX = ".checkpoint.npz"
 CHECKPOINT_SECONDS = 10.0
 # Prefixes of the names of arrays
-_SUM, _ESTIMATE, _DECISIONS = "sum.", "estimate.", "decisions."
+_ESTIMATE, _DECISIONS = "estimate.", "decisions."
+_FIRST = "first_sum"  # array of `Passes.first_sum`
 # Exceptions of NumPy, zipfile and zlib for a file that is damaged, or is no archive of arrays
 _UNREADABLE = (
     OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error,
@@ -54,9 +55,10 @@ class Checkpoint:
         other = [name for name in self._made_by if described["made_by"].get(name) != self._made_by[name]]
         if other:
             raise ValueError(f"'{self.path}' is of a render with another {other[0]}; delete it to begin anew")
-        passes.channels = described["channels"]
-        # Without a second pass, the sum of the second half is a number
-        passes.sums = [arrays[_SUM + half] for half in "01"]
+        passes.channels, passes.sum = described["channels"], arrays["sum"]
+        # A render without a denoiser keeps no halves
+        passes.keeps_halves &= _FIRST in arrays
+        passes.first_sum = arrays.get(_FIRST, 0.0)
         passes.passes = [Pass(**one) for one in described["passes"]]
         passes.estimate.state, passes.decisions = (_below(prefix, arrays) for prefix in (_ESTIMATE, _DECISIONS))
         return described["seconds"]
@@ -86,10 +88,10 @@ class Checkpoint:
             "channels": passes.channels,
             "passes": list(passes.passes),
         }
-        sums = {_SUM + str(half): np.asarray(total) for half, total in enumerate(passes.sums)}
         estimate = {_ESTIMATE + name: value for name, value in passes.estimate.state.items()}
         decisions = {_DECISIONS + name: value for name, value in passes.decisions.items()}
-        self._kept = described, {**sums, **estimate, **decisions}
+        halves = {_FIRST: passes.first_sum} if passes.keeps_halves else {}
+        self._kept = described, {"sum": passes.sum, **halves, **estimate, **decisions}
         self._writer.offer(self.save)
 
     def save(self):

@@ -80,8 +80,7 @@ class ErrorEstimate:
         if not finite.any():
             return None
         relative = _over_scale(variance, mean, finite)
-        # Rounding can make sums of zeros negative
-        shared = np.maximum(_box_sum(relative), 0) / np.maximum(_box_sum(finite.astype(np.float64)), 1)
+        shared = _box_sum(relative) / np.maximum(_box_sum(finite.astype(np.float64)), 1)
         return float(np.sqrt(np.percentile(shared[finite], 100 * SHARE)))
 
 
@@ -99,9 +98,17 @@ def relative_products(first, second, image):
     return _over_scale(products, mean, np.isfinite(products) & np.isfinite(mean))
 
 
-def box_mean(plane):
-    """Return the mean over the neighbours of each pixel inside the image, (height, width)."""
-    return _box_sum(plane) / _box_sum(np.ones_like(plane))
+def smoothed(plane, times=1):
+    """Return the means of a plane over the neighbours of each pixel inside the image, 5 × 5 pixels, by a filter that is
+    applied some `times`; (height, width)."""
+    return filtered(plane, times) / filtered(np.ones_like(plane), times)
+
+
+def filtered(plane, times=1):
+    """Return `smoothed` with zeros outside the image."""
+    for _ in range(times):
+        plane = _box_sum(plane) / (2 * NEIGHBOURS + 1) ** 2
+    return plane
 
 
 def _over_scale(products, mean, finite):
@@ -114,12 +121,14 @@ def _over_scale(products, mean, finite):
 
 
 def _box_sum(plane):
-    """Return the sums over the neighbours of each pixel inside the image, (height, width)."""
+    """Return the sums over the neighbours of each pixel inside the image, (height, width).
+
+    Differences of running sums would leave rounding errors of bright regions in dark ones.
+    """
     for axis in (0, 1):
-        widths = [(NEIGHBOURS + 1, NEIGHBOURS) if along == axis else (0, 0) for along in (0, 1)]
-        total = np.cumsum(np.pad(plane, widths), axis=axis)
-        size, step = plane.shape[axis], 2 * NEIGHBOURS + 1
-        plane = np.take(total, range(step, step + size), axis) - np.take(total, range(size), axis)
+        widths = [(NEIGHBOURS, NEIGHBOURS) if along == axis else (0, 0) for along in (0, 1)]
+        padded, size = np.pad(plane, widths), plane.shape[axis]
+        plane = sum(np.take(padded, range(first, first + size), axis) for first in range(2 * NEIGHBOURS + 1))
     return plane
 
 

@@ -44,13 +44,14 @@ SAMPLES = dict(zip(QUALITIES, (3.2, 1.4, 0.75), strict=True))
 # Denoised errors fall by this factor where samples double: mean of the scenes with references, of 1.15 to 1.6
 FALL = 1.37
 POWER = -math.log2(FALL)  # of the samples, to which denoised errors are proportional
-# Fraction of the remaining time below which the best network is not compared: all of it would lower the error by 10%
+# Fraction of the remaining time below which the best network is not compared with others: all of it would lower the
+# error by 10%
 NEGLIGIBLE = 0.2
 # Largest fraction of a limit of time for the fastest network at twice the resolution. From a half, less error would
 # remain in the usual resolution; a first pass, of four samples, takes 1.3 times as long as the network
 FINE_SHARE = 1 / 3
-# Largest fraction of a limit of time for the halves of an image with detail, which lowers the error of an image of a
-# minute by 4 to 14%
+# Largest fraction of a limit of time for the halves of an image with detail. They take as long as six samples of `path`
+# at twice the resolution, and images of some 500 samples or more gain
 DETAIL_SHARE = 0.01
 # Width of the tile whose denoising is timed, pixels; least fraction of the seconds of the image that it takes, within
 # limits in seconds; smaller tiles are doubled. On two cores a tile of 64 takes 0.013 s, and a pixel of it 1.05 to 1.2
@@ -89,7 +90,7 @@ class Denoiser:
     `quality`, or else the fastest one, would take more than a third of the `time_limit`. `quality`: one of `QUALITIES`;
     by default the one that leaves the least error, as the time that it saves is for samples. With `parts` of 1 and no
     time limit it is the best one. `copies`: number of denoised copies, 1 by networks other than the best one.
-    `restores`: whether time allows detail (detail.py).
+    `restores`: whether time allows detail (detail.py); `has_detail`: whether the last image of `denoise_passes` has it.
     """
 
     def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None, parts=1):
@@ -108,11 +109,7 @@ class Denoiser:
         self.quality, self.copies = self._usual_way(ways, spp, time_limit)
         if time_limit is not None:
             self._choose(ways, time_limit - (time.perf_counter() - begin))
-        self.expected_seconds = self.copies * self._expected(self.quality)
-        of_halves = 2 * SAMPLES[detail.QUALITY] / SAMPLES[self.quality] * self._expected(self.quality)
-        self.restores = time_limit is None or of_halves <= DETAIL_SHARE * time_limit
-        if self.restores and time_limit is not None:
-            self.expected_seconds += of_halves
+        self._reserve(time_limit)
         self.seconds = self.start_seconds = time.perf_counter() - begin
 
     @property
@@ -120,7 +117,7 @@ class Denoiser:
         """Return metadata for denoised images."""
         return {
             "denoise_quality": self.quality, "denoise_copies": self.copies, "denoise_feature_spp": self.feature_spp,
-            "denoise_resolution": self.parts,
+            "denoise_resolution": self.parts, "denoise_detail": self.has_detail,
         }  # fmt: skip
 
     def denoise(self, image, channels, quality=None):
@@ -135,23 +132,19 @@ class Denoiser:
         return merged(self._denoised(image, channels, quality, self.features), self.parts, self._filter)
 
     def denoise_passes(self, passes):
-        """Denoise the colour of the image of `rendering.Passes`, as `denoise_fine`, with detail where they suit."""
-        if not (self.restores and detail.suits(passes)):
-            return self.denoise_fine(np.float32(passes.fine_image), passes.channels)
-        first, second = passes.half_weights
-        return self.denoise_halves(passes.fine_halves, first / (first + second), passes.channels)
-
-    def denoise_halves(self, halves, share, channels):
-        """Denoise the colour of the mean of two independent images, the first of which has the fraction `share` of the
-        weight, as `denoise_fine`, with detail that the denoiser removes (detail.py)."""
-        raw = share * halves[0] + (1 - share) * halves[1]
-        image = self.denoise_fine(np.float32(raw), channels)
-        denoised = [self.denoise_fine(np.float32(half), channels, detail.QUALITY) for half in halves]
-        begin, where = time.perf_counter(), _where(channels)
-        raw, *halves = (merged(one, self.parts, self._filter)[..., where] for one in (raw, *halves))
-        left = [one[..., where] for one in denoised]
-        image[..., where] = detail.restored(image[..., where], raw, halves, left, share)
-        self.seconds += time.perf_counter() - begin
+        """Denoise the colour of the image of `rendering.Passes`, as `denoise_fine`, with detail if they suit."""
+        image = self.denoise_fine(np.float32(passes.fine_image), passes.channels)
+        self.has_detail = self.restores and detail.suits(passes)
+        if self.has_detail:
+            begin, before, where = time.perf_counter(), self.seconds, _colour_indices(passes.channels)
+            names = [passes.channels[index] for index in where]
+            fine = [np.float32(half[..., where]) for half in passes.fine_halves]
+            denoised = [self.denoise_fine(half, names, detail.QUALITY) for half in fine]
+            halves = [merged(half, self.parts, self._filter) for half in fine]
+            raw, share = passes.image[..., where], passes.half_weights[0] / sum(passes.half_weights)
+            image[..., where] = detail.restored(image[..., where], raw, halves, denoised, share)
+            # Not twice
+            self.seconds = before + time.perf_counter() - begin
         return image
 
     @cached_property
@@ -165,8 +158,8 @@ class Denoiser:
         rgb = np.nan_to_num(colour(planes, channels), nan=0.0, posinf=0.0, neginf=0.0)
         inputs = {"color": rgb, **{name: features[name] for name in GUIDES}}
         network, copies = self._networks[quality or self.quality], 1 if quality else self.copies
-        filtered = np.mean([self._mirrored(inputs, network, axes) for axes in MIRRORED[:copies]], axis=0)
-        where = _where(channels)
+        filtered = sum(self._mirrored(inputs, network, axes) for axes in MIRRORED[:copies]) / np.float32(copies)
+        where = _colour_indices(channels)
         planes[..., where] = filtered if len(where) == 3 else filtered.mean(axis=-1, keepdims=True)
         self.seconds += time.perf_counter() - begin
         return type(image)(planes) if isinstance(image, mi.TensorXf) else planes
@@ -197,6 +190,16 @@ class Denoiser:
         errors = {way: self._error_of(way) * (left - spent) ** POWER for way, spent in seconds.items() if spent < left}
         cheapest = [way for way in ways if way[1] == 1][-1]
         self.quality, self.copies = min(errors, key=errors.get, default=cheapest)
+
+    def _reserve(self, time_limit):
+        """Set the expected time, and whether it allows detail."""
+        of_image = self._expected(self.quality)
+        of_halves = 2 * SAMPLES[detail.QUALITY] / SAMPLES[self.quality] * of_image
+        self.has_detail, self.restores = False, time_limit is None or of_halves <= DETAIL_SHARE * time_limit
+        self.expected_seconds = self.copies * of_image
+        # Without a limit of time, nothing is reserved, and few images have detail
+        if self.restores and time_limit is not None:
+            self.expected_seconds += of_halves
 
     def _expected(self, quality):
         """Return the seconds that denoising an image is expected to take."""
@@ -245,7 +248,7 @@ class Denoiser:
         return output
 
 
-def _where(channels):
+def _colour_indices(channels):
     """Return the indices of the colour among the names of channels: R, G and B, or Y."""
     return [list(channels).index(name) for name in (("R", "G", "B") if "R" in channels else ("Y",))]
 

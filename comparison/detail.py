@@ -1,42 +1,44 @@
-"""Detail that a denoiser removed, taken back from the raw image.
+"""Detail that a denoiser removes, taken back from the raw image.
 
-An image of many samples has little noise, and the denoiser still blurs detail that albedo and normal do not show. So
-long renders would keep the errors of the denoiser. The result is D + a (F − D), where F is the raw image, D the
+An image of many samples has little noise, and the denoiser still blurs detail that albedo and normal do not show. Long
+renders would therefore keep the errors of the denoiser. The result is D + a (F − D), where F is the raw image, D the
 denoised one, and a a number from 0 to 1 for each pixel. The a of the least expected squared error is
 
     a = 1 − E[n (n − d)] / E[(F − D)²],
 
 where n is the noise of F and d the noise that it causes in D [Stein 1981, "Estimation of the mean of a multivariate
-normal distribution"]. The halves A and B of the passes, with the fractions w and 1 − w of the weight, tell both:
-√(w (1 − w)) (A − B) has the variance of n, and the same difference of the denoised halves responds as D does. Means
-over neighbours stand for the expectations. Twice their standard error is subtracted from a, so that a is 0 where they
-are uncertain.
+normal distribution"]. Both follow from the halves A and B of the passes, with the fractions w and 1 − w of the weight.
+If their variances are in inverse proportion to these weights, √(w (1 − w)) (A − B) has the variance of n. The same
+difference of the denoised halves stands for d. Means over neighbours stand for the expectations. Twice their standard
+error is subtracted from a, so that a is 0 where they are uncertain.
 
-Noise that both halves share, as virtual lights of a pass have, is blurred: D and F contain it alike.
+Errors of these assumptions: A half has more noise than the image, and the denoiser smooths it more, so d and a are too
+small. Where passes continue lattices, A and B deviate in opposite directions, so n is too large and a too small. Noise
+that neighbouring pixels share, as that of virtual lights, stays in D as in F: n − d and F − D hardly contain it. A wide
+filter of the film correlates neighbouring pixels, and the standard error is then too small.
 """
 
 import numpy as np
 
-from .convergence import box_mean, relative_products
+from .convergence import filtered, relative_products, smoothed
 
 QUALITY = "fast"  # network of the halves. Error with "fast" and with "high", 60 s, four scenes: 0.919 and 0.928
-# Of the weight of the passes, for the smaller half: halves have similar noise. Passes that double their samples have a
-# third
-LEAST_SHARE = 0.3
-# Least samples per pixel. Error over that without, two standard errors subtracted: 500 to 2000 samples 0.89 to 0.99 in
-# six scenes; 228 to 404 samples 0.92 to 1.02 in six
+LEAST_SHARE = 0.4  # of the weight, for the smaller half
+# Least samples per pixel. Error over that without: 500 to 2000 samples 0.87 to 0.99 in five scenes; 228 to 404 samples
+# 0.93 to 1.01 in seven
 LEAST_SAMPLES = 200
 DOUBT = 2.0  # standard errors. With 1: 0.919 and 0.990 in images of 60 s and 30 s, with 2: 0.926 and 0.981
-OUTLIERS = 0.999  # quantile of the absolute values that limits them: fireflies
+OUTLIERS = 0.999  # quantile of the products; pixels with larger ones, such as fireflies, stay denoised
 SMOOTHED = 4  # times that products are averaged over 5 × 5 pixels: as by a Gaussian filter of 2.8 pixels
-# Pixels of such a mean: 4π times the variance of the filter, 2 for each time
+# Number of independent pixels of such a mean: 4π times the variance of the filter, 2 for each time
 AVERAGED = 4 * np.pi * 2 * SMOOTHED
 
 
 def suits(passes):
     """Return whether `rendering.Passes` are enough for their image to show detail that a denoiser removes."""
     weights = passes.half_weights
-    return passes.spp >= LEAST_SAMPLES and min(weights) >= LEAST_SHARE * sum(weights)
+    enough = passes.keeps_halves and passes.spp >= LEAST_SAMPLES
+    return enough and min(weights) >= LEAST_SHARE * sum(weights)
 
 
 def restored(denoised, raw, halves, denoised_halves, share):
@@ -45,31 +47,28 @@ def restored(denoised, raw, halves, denoised_halves, share):
     `halves`: two images of which `raw` is the mean, the first with the fraction `share` of the weight;
     `denoised_halves`: both denoised. Pixels that are not finite stay denoised.
     """
-    noise, left = (
-        (share * (1 - share)) ** 0.5 * (np.asarray(first, np.float64) - second)
-        for first, second in (halves, denoised_halves)
-    )
-    detail = np.asarray(raw, np.float64) - denoised
     with np.errstate(invalid="ignore"):
-        seen, noisy = (
-            _limited(relative_products(*pair, denoised)) for pair in ((detail, detail), (noise, noise - left))
+        noise, denoised_noise = (
+            (share * (1 - share)) ** 0.5 * (np.asarray(first, np.float64) - second)
+            for first, second in (halves, denoised_halves)
         )
-    scale = np.maximum(_smoothed(seen), np.finfo(np.float64).tiny)
-    fraction = _smoothed(noisy) / scale
-    variance = np.maximum(_smoothed(np.square(noisy - fraction * seen)), 0) / AVERAGED
-    kept = np.clip(1 - fraction - DOUBT * np.sqrt(variance) / scale, 0, 1)
-    kept = kept[..., None] * np.isfinite(detail).all(axis=-1, keepdims=True)
-    return denoised + kept * np.nan_to_num(detail, posinf=0.0, neginf=0.0)
+        detail = np.asarray(raw, np.float64) - denoised
+        seen = relative_products(detail, detail, denoised)
+        noisy = relative_products(noise, noise - denoised_noise, denoised)
+    usual = (seen <= np.quantile(seen, OUTLIERS)) & (np.abs(noisy) <= np.quantile(np.abs(noisy), OUTLIERS))
+    usual &= np.isfinite(detail).all(axis=-1)
+    kept = np.where(usual, _fractions(seen * usual, noisy * usual), 0)
+    return denoised + kept[..., None] * np.where(usual[..., None], detail, 0)
 
 
-def _limited(products):
-    """Return products (height, width) with outliers limited."""
-    largest = np.quantile(np.abs(products), OUTLIERS)
-    return np.clip(products, -largest, largest)
-
-
-def _smoothed(products):
-    """Return means over neighbours, (height, width)."""
-    for _ in range(SMOOTHED):
-        products = box_mean(products)
-    return products
+def _fractions(seen, noisy):
+    """Return the fraction a (height, width) of each pixel, from its (F − D)² and n (n − d)."""
+    mean = smoothed(seen, SMOOTHED)
+    # Rounding of larger numbers nearby decides below this
+    is_known = mean > 1e-9 * seen.max()
+    scale = np.where(is_known, mean, 1)
+    fraction = np.where(is_known, smoothed(noisy, SMOOTHED) / scale, 1)
+    # At the border of the image, means are over fewer pixels
+    number = AVERAGED * filtered(np.ones_like(seen), SMOOTHED)
+    variance = smoothed(np.square(noisy - fraction * seen), SMOOTHED) / number
+    return np.clip(1 - fraction - DOUBT * np.sqrt(variance) / scale, 0, 1)

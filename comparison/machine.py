@@ -13,7 +13,8 @@ SOURCES = (
     "integrators/*.py", "vpl/**/*.py",
     "comparison/worker.py", "comparison/rendering.py", "comparison/single_pass.py", "comparison/measuring.py",
     "comparison/pass_sizes.py", "comparison/timed_sizes.py", "comparison/sample_density.py", "comparison/features.py",
-    "comparison/fine_film.py", "comparison/denoising.py", "comparison/scene_files.py", "comparison/convergence.py",
+    "comparison/fine_film.py", "comparison/denoising.py", "comparison/detail.py", "comparison/scene_files.py",
+    "comparison/convergence.py",
 )  # fmt: skip
 
 

@@ -92,7 +92,9 @@ def render(
     pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py), by
     the network "high", "balanced" or "fast", or, if True, by the one that suits the `time` or the samples, and, where
     time and memory allow, at twice the resolution, with a multiple of four samples; an integrator given by name is then
-    created with its property `denoised`, if it has one. `manylights` with this property gives more samples to
+    created with its property `denoised`, if it has one. An image of
+    many samples is the mean of mirrored copies that are denoised, and gets back detail that the denoiser removes
+    (detail.py). `manylights` with this property gives more samples to
     pixels where the denoiser leaves noise (sample_density.py), unless there is an `error`.
     `progress`: called after each pass with the cost and the image so far; integrators of this project also call it at
     the start of each stage of a pass, with None for the image. If it returns False, no other pass begins; an exception
@@ -136,6 +138,7 @@ def render(
     # Without a limit of time for a checkpoint, which may go on with another one or on other machines
     limits = {} if checkpoint else {"seconds": time, "spp": spp}
     progressive = Progressive(scene, seed, sensor, integrator, chooses, denoiser.parts if denoiser else 1, **limits)
+    progressive.keeps_halves = bool(denoiser) and denoiser.restores
     reserved = denoiser.expected_seconds if denoiser else 0.0
     sizes = sizes_of(progressive, spp, time and time - reserved, pass_spp, error is not None)
     ending = Ending(spp, time and time - reserved, error, reserved)

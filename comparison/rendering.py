@@ -26,11 +26,14 @@ _CONTINUED_STREAM = 0x5EC0
 class Passes:
     """Running average of the passes of a render by their weights (`Pass.weight`).
 
-    The average depends only on the passes and their order. `sums`: those of two halves of the passes, for the detail of
-    denoised images (detail.py). `parts`, `filter`: of the film that passes are rendered
+    The average depends only on the passes and their order. `parts`, `filter`: of the film that passes are rendered
     with, see fine_film.py. `channels`: names of the channels ("R", "G", "B", AOVs), empty before the first pass;
-    `passes`: a list of `Pass`; `estimate`: the `ErrorEstimate` of the passes.
+    `passes`: a list of `Pass`; `estimate`: the `ErrorEstimate` of the passes; `keeps_halves`: whether there is an
+    average of each of two halves of the passes, for the detail of denoised images (detail.py). It is set before the
+    first pass.
     """
+
+    keeps_halves = False
 
     def __init__(self, seed, parts=1, filter=None):
         self.seed, self.parts, self.filter = seed, parts, filter
@@ -38,16 +41,17 @@ class Passes:
 
     def restart(self):
         """Remove all passes."""
-        self.passes, self.channels, self.sums, self.estimate = [], [], [0.0, 0.0], ErrorEstimate()
+        self.passes, self.channels, self.sum, self.estimate = [], [], 0.0, ErrorEstimate()
+        self.first_sum = 0.0  # of the passes of the first half
 
     def add(self, image):
         """Add a `PassImage`, and return its `Pass`."""
         # In double precision, as long sums of single-precision numbers drift
         planes, one = image.planes.astype(np.float64), image.taken
         self.channels = image.channels
-        first, second = self.half_weights
-        half = int(second < first)
-        self.sums = [total + one.weight * planes if half == k else total for k, total in enumerate(self.sums)]
+        self.sum = self.sum + one.weight * planes
+        if self.keeps_halves and _lighter(self.half_weights) == 0:
+            self.first_sum = self.first_sum + one.weight * planes
         level = _shown(planes, self.channels).mean(axis=-1, keepdims=True)
         self.estimate.add(self.merged(level), one.weight)
         self.passes.append(one)
@@ -81,18 +85,19 @@ class Passes:
         """Weights of the two halves of the passes: a pass belongs to the half with the smaller weight before."""
         weights = [0.0, 0.0]
         for one in self.passes:
-            weights[weights[1] < weights[0]] += one.weight
+            weights[_lighter(weights)] += one.weight
         return weights
 
     @property
     def fine_halves(self):
-        """The averages of the halves, at least two passes, in the form of `fine_image`."""
-        return [total / weight for total, weight in zip(self.sums, self.half_weights, strict=True)]
+        """The averages of the halves, in the form of `fine_image`, of at least two passes."""
+        first, second = self.half_weights
+        return [self.first_sum / first, (self.sum - self.first_sum) / second]
 
     @property
     def fine_image(self):
         """The average in the resolution of the film, (height, width, channels) float64."""
-        return (self.sums[0] + self.sums[1]) / sum(self.half_weights)
+        return self.sum / sum(one.weight for one in self.passes)
 
     @property
     def image(self):
@@ -211,6 +216,11 @@ class Progressive(Passes):
     def pixels(self):
         """Number of pixels of the image."""
         return int(np.prod(self._scene.sensors()[self._sensor].film().crop_size()))
+
+
+def _lighter(weights):
+    """Return the index of the smaller one of two weights, 0 if they are equal."""
+    return int(weights[1] < weights[0])
 
 
 def _shown(planes, channels):

@@ -17,7 +17,7 @@ import numpy as np
 
 from vpl.split.pixel_rays import MULTIPLE, PixelRays
 
-from .convergence import box_mean, relative_squares
+from .convergence import relative_squares, smoothed
 from .images import colour
 
 QUALITY = "fast"  # of the denoiser: a quarter of the time of "high", and the same error in three scenes
@@ -96,7 +96,6 @@ class SampleDensity:
 def _smoothed(squares):
     """Return squared differences (height, width) without outliers, as means over neighbours."""
     squares = np.minimum(squares, np.quantile(squares, OUTLIERS))
-    for _ in range(SMOOTHED):
-        squares = box_mean(squares)
+    squares = smoothed(squares, SMOOTHED)
     # The logarithm of the density must be finite, and without this minimum, black pixels would have no samples
     return np.maximum(squares, 1e-6 * squares.max())

@@ -56,6 +56,7 @@ class DistributedRender:
                 check_layers(layers, self._scene.integrator)
             limits = {"seed": self._seed, "spp": self.spp, "time_limit": self._time}
             denoiser = Denoiser(scene, self._sensor, **limits, quality=quality_of(denoise)) if denoise else None
+            self.passes.keeps_halves = bool(denoiser) and denoiser.restores
             planes = layers_of(layers, scene, self._sensor, denoiser, **limits)
             reserved = denoiser.expected_seconds if denoiser else 0.0
             ending = Ending(self.spp, self._time and self._time - reserved, self._error, reserved)

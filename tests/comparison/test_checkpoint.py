@@ -16,6 +16,7 @@ from tests.support.paths import CORNELL
 def file(tmp_path):
     """A checkpoint of two passes."""
     passes, checkpoint = Passes(0), Checkpoint(tmp_path / "a.checkpoint.npz", {})
+    passes.keeps_halves = True
     checkpoint.restore(passes)
     for value in (1.0, 3.0):
         passes.add(pass_of(value))
@@ -40,19 +41,44 @@ def half_the_samples(arrays):
 
 
 ALTERATIONS = {
-    "another shape": lambda arrays: arrays.update({"sum.0": arrays["sum.0"][:2]}),
-    "another type": lambda arrays: arrays.update({"sum.1": arrays["sum.1"].astype(np.float32)}),
-    "not a number": lambda arrays: arrays.update({"sum.0": arrays["sum.0"] * np.nan}),
-    "a brighter sum": lambda arrays: arrays.update({"sum.1": arrays["sum.1"] * 2}),
+    "another shape": lambda arrays: arrays.update(sum=arrays["sum"][:2]),
+    "another type": lambda arrays: arrays.update(sum=arrays["sum"].astype(np.float32)),
+    "not a number": lambda arrays: arrays.update(sum=arrays["sum"] * np.nan),
+    "a brighter sum": lambda arrays: arrays.update(sum=arrays["sum"] * 2),
     "fewer samples": half_the_samples,
     "another weight": lambda arrays: arrays.update({"estimate._weight": np.array(1)}),
-    "no sum": lambda arrays: arrays.pop("sum.1"),
+    "other halves": lambda arrays: arrays.update(first_sum=arrays["sum"]),
+    "no sum": lambda arrays: arrays.pop("sum"),
     "no description": lambda arrays: arrays.pop("described"),
     "no digest": lambda arrays: arrays.pop("digest"),
     "one array more": lambda arrays: arrays.update({"estimate._more": np.zeros(3)}),
     "a description of objects": lambda arrays: arrays.update(described=np.array([{}])),
     "a list for a description": lambda arrays: arrays.update(described=np.array("[]")),
 }
+
+
+@pytest.mark.parametrize("denoises", [True, False])
+def test_halves_continue_if_the_render_denoises(file, denoises):
+    passes = Passes(0)
+    passes.keeps_halves = denoises
+    Checkpoint(file, {}).restore(passes)
+    assert passes.keeps_halves is denoises and passes.image.mean() == 2
+    if denoises:
+        assert [half.mean() for half in passes.fine_halves] == [1, 3]
+        passes.add(pass_of(8.0))
+        assert [half.mean() for half in passes.fine_halves] == [4.5, 3]
+
+
+def test_a_checkpoint_without_halves_has_none(tmp_path):
+    kept, restored = Passes(0), Passes(0)
+    checkpoint = Checkpoint(tmp_path / "a.checkpoint.npz", {})
+    checkpoint.restore(kept)
+    kept.add(pass_of(1.0))
+    checkpoint.keep(1.0)
+    checkpoint.save()
+    restored.keeps_halves = True
+    Checkpoint(checkpoint.path, {}).restore(restored)
+    assert not restored.keeps_halves and restored.image.mean() == 1
 
 
 @pytest.mark.parametrize("alteration", ALTERATIONS)
