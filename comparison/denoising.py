@@ -90,7 +90,7 @@ class Denoiser:
     `quality`, or else the fastest one, would take more than a third of the `time_limit`. `quality`: one of `QUALITIES`;
     by default the one that leaves the least error, as the time that it saves is for samples. With `parts` of 1 and no
     time limit it is the best one. `copies`: number of denoised copies, 1 by networks other than the best one.
-    `restores`: whether time allows detail (detail.py); `has_detail`: whether the last image of `denoise_passes` has it.
+    `restores`: whether the limits allow detail (detail.py); `has_detail`: whether the last image of `denoise_passes` has it.
     """
 
     def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None, parts=1):
@@ -109,7 +109,7 @@ class Denoiser:
         self.quality, self.copies = self._usual_way(ways, spp, time_limit)
         if time_limit is not None:
             self._choose(ways, time_limit - (time.perf_counter() - begin))
-        self._reserve(time_limit)
+        self._reserve(spp, time_limit)
         self.seconds = self.start_seconds = time.perf_counter() - begin
 
     @property
@@ -191,11 +191,13 @@ class Denoiser:
         cheapest = [way for way in ways if way[1] == 1][-1]
         self.quality, self.copies = min(errors, key=errors.get, default=cheapest)
 
-    def _reserve(self, time_limit):
-        """Set the expected time, and whether it allows detail."""
+    def _reserve(self, spp, time_limit):
+        """Set the expected time, and whether the limits of the image allow detail."""
         of_image = self._expected(self.quality)
         of_halves = 2 * SAMPLES[detail.QUALITY] / SAMPLES[self.quality] * of_image
-        self.has_detail, self.restores = False, time_limit is None or of_halves <= DETAIL_SHARE * time_limit
+        self.has_detail, self.restores = False, spp is None or spp >= detail.LEAST_SAMPLES
+        if time_limit is not None:
+            self.restores &= of_halves <= DETAIL_SHARE * time_limit
         self.expected_seconds = self.copies * of_image
         # Without a limit of time, nothing is reserved, and few images have detail
         if self.restores and time_limit is not None:

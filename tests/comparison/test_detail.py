@@ -168,10 +168,16 @@ def test_renders_of_many_samples_have_detail(spp, has_detail, monkeypatch):
         assert share == 0.5 and {one.shape for one in (denoised, *left)} == {(16, 16, 3)}
 
 
+@pytest.mark.parametrize(("spp", "restores"), [(199, False), (200, True), (None, True)])
+def test_images_of_few_samples_keep_no_halves(spp, restores):
+    assert Denoiser(cornell(16).load(), spp=spp, parts=1).restores is restores
+
+
 @pytest.mark.parametrize(("seconds", "restores"), [(0.01, True), (0.03, False)])
 def test_detail_takes_a_hundredth_of_the_time_at_most(seconds, restores, monkeypatch):
     """Where "high" takes 0.03 s, "fast" takes 0.007 s for each half of the passes."""
     monkeypatch.setattr(Denoiser, "_expected", lambda self, quality: seconds)
     found = Denoiser(cornell(16).load(), time_limit=1, parts=1)
     assert found.restores is restores
+    assert not Denoiser(cornell(16).load(), spp=199, time_limit=1, parts=1).restores
     assert found.expected_seconds == pytest.approx(found.copies * seconds + (0.0046875 if restores else 0))
