@@ -90,7 +90,8 @@ class Denoiser:
     `quality`, or else the fastest one, would take more than a third of the `time_limit`. `quality`: one of `QUALITIES`;
     by default the one that leaves the least error, as the time that it saves is for samples. With `parts` of 1 and no
     time limit it is the best one. `copies`: number of denoised copies, 1 by networks other than the best one.
-    `restores`: whether the limits allow detail (detail.py); `has_detail`: whether the last image of `denoise_passes` has it.
+    `restores`: whether the limits allow detail (detail.py); `has_detail`: whether the last image of `denoise_passes` has
+    it.
     """
 
     def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None, parts=1):
@@ -199,7 +200,7 @@ class Denoiser:
         if time_limit is not None:
             self.restores &= of_halves <= DETAIL_SHARE * time_limit
         self.expected_seconds = self.copies * of_image
-        # Without a limit of time, nothing is reserved, and few images have detail
+        # Without a limit of time, nothing is reserved
         if self.restores and time_limit is not None:
             self.expected_seconds += of_halves
 
