@@ -90,8 +90,8 @@ class Denoiser:
     `quality`, or else the fastest one, would take more than a third of the `time_limit`. `quality`: one of `QUALITIES`;
     by default the one that leaves the least error, as the time that it saves is for samples. With `parts` of 1 and no
     time limit it is the best one. `copies`: number of denoised copies, 1 by networks other than the best one.
-    `restores`: whether the limits allow detail (detail.py); `has_detail`: whether the last image of `denoise_passes` has
-    it.
+    `restores`: whether the limits allow detail (detail.py); `has_detail`: whether the last image of `denoise_passes`
+    has it.
     """
 
     def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None, parts=1):
