@@ -57,8 +57,7 @@ class Checkpoint:
             raise ValueError(f"'{self.path}' is of a render with another {other[0]}; delete it to begin anew")
         passes.channels, passes.sum = described["channels"], arrays["sum"]
         # A render without a denoiser keeps no halves
-        passes.keeps_halves &= _FIRST in arrays
-        passes.first_sum = arrays.get(_FIRST, 0.0)
+        passes.first_sum = arrays.get(_FIRST)
         passes.passes = [Pass(**one) for one in described["passes"]]
         passes.estimate.state, passes.decisions = (_below(prefix, arrays) for prefix in (_ESTIMATE, _DECISIONS))
         return described["seconds"]
@@ -90,7 +89,7 @@ class Checkpoint:
         }
         estimate = {_ESTIMATE + name: value for name, value in passes.estimate.state.items()}
         decisions = {_DECISIONS + name: value for name, value in passes.decisions.items()}
-        halves = {_FIRST: passes.first_sum} if passes.keeps_halves else {}
+        halves = {_FIRST: passes.first_sum} if passes.has_halves else {}
         self._kept = described, {"sum": passes.sum, **halves, **estimate, **decisions}
         self._writer.offer(self.save)
 

@@ -37,7 +37,7 @@ AVERAGED = 4 * np.pi * 2 * SMOOTHED
 def suits(passes):
     """Return whether `rendering.Passes` are enough for their image to show detail that a denoiser removes."""
     weights = passes.half_weights
-    enough = passes.keeps_halves and passes.spp >= LEAST_SAMPLES
+    enough = passes.has_halves and passes.spp >= LEAST_SAMPLES
     return enough and min(weights) >= LEAST_SHARE * sum(weights)
 
 

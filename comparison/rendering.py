@@ -42,7 +42,7 @@ class Passes:
     def restart(self):
         """Remove all passes."""
         self.passes, self.channels, self.sum, self.estimate = [], [], 0.0, ErrorEstimate()
-        self.first_sum = 0.0  # of the passes of the first half
+        self.first_sum = 0.0  # of the passes of the first half; None for passes of a checkpoint without halves
 
     def add(self, image):
         """Add a `PassImage`, and return its `Pass`."""
@@ -50,7 +50,7 @@ class Passes:
         planes, one = image.planes.astype(np.float64), image.taken
         self.channels = image.channels
         self.sum = self.sum + one.weight * planes
-        if self.keeps_halves and _lighter(self.half_weights) == 0:
+        if self.has_halves and _lighter(self.half_weights) == 0:
             self.first_sum = self.first_sum + one.weight * planes
         level = _shown(planes, self.channels).mean(axis=-1, keepdims=True)
         self.estimate.add(self.merged(level), one.weight)
@@ -79,6 +79,11 @@ class Passes:
     def seconds(self):
         """Sum of the wall-clock seconds of all passes."""
         return sum(one.seconds for one in self.passes)
+
+    @property
+    def has_halves(self):
+        """Whether the averages of the halves are known."""
+        return self.keeps_halves and self.first_sum is not None
 
     @property
     def half_weights(self):

@@ -57,28 +57,36 @@ ALTERATIONS = {
 }
 
 
+@pytest.mark.parametrize("is_told_before", [True, False])
 @pytest.mark.parametrize("denoises", [True, False])
-def test_halves_continue_if_the_render_denoises(file, denoises):
+def test_halves_continue_if_the_render_denoises(file, denoises, is_told_before):
+    """Renders on workers restore a checkpoint before they have a denoiser."""
     passes = Passes(0)
-    passes.keeps_halves = denoises
+    if is_told_before:
+        passes.keeps_halves = denoises
     Checkpoint(file, {}).restore(passes)
-    assert passes.keeps_halves is denoises and passes.image.mean() == 2
+    passes.keeps_halves = denoises
+    assert passes.has_halves is denoises and passes.image.mean() == 2
     if denoises:
         assert [half.mean() for half in passes.fine_halves] == [1, 3]
         passes.add(pass_of(8.0))
         assert [half.mean() for half in passes.fine_halves] == [4.5, 3]
 
 
-def test_a_checkpoint_without_halves_has_none(tmp_path):
+@pytest.mark.parametrize("is_told_before", [True, False])
+def test_a_checkpoint_without_halves_has_none(tmp_path, is_told_before):
     kept, restored = Passes(0), Passes(0)
     checkpoint = Checkpoint(tmp_path / "a.checkpoint.npz", {})
     checkpoint.restore(kept)
     kept.add(pass_of(1.0))
     checkpoint.keep(1.0)
     checkpoint.save()
-    restored.keeps_halves = True
+    restored.keeps_halves = is_told_before
     Checkpoint(checkpoint.path, {}).restore(restored)
-    assert not restored.keeps_halves and restored.image.mean() == 1
+    restored.keeps_halves = True
+    assert not restored.has_halves and restored.image.mean() == 1
+    restored.add(pass_of(3.0))
+    assert not restored.has_halves and restored.image.mean() == 2
 
 
 @pytest.mark.parametrize("alteration", ALTERATIONS)

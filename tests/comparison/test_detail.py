@@ -144,9 +144,9 @@ def test_passes_belong_to_two_halves_of_similar_weight():
     [([9, 9], 200, True), ([9, 9], 199, False), ([4, 6], 400, True), ([39, 61], 400, False), ([1, 0], 9999, False)],
 )
 def test_few_samples_and_unequal_halves_do_not_suit(weights, spp, suited):
-    passes = SimpleNamespace(half_weights=weights, spp=spp, keeps_halves=True)
+    passes = SimpleNamespace(half_weights=weights, spp=spp, has_halves=True)
     assert detail.suits(passes) is suited
-    passes.keeps_halves = False
+    passes.has_halves = False
     assert not detail.suits(passes)
 
 
