@@ -75,6 +75,10 @@ class ManyLightsIntegrator(PassRenderer):
     emitter.  Environments, directional emitters, and meshes with vertex normals other than their geometric normals are
     traced.
 
+    **Direct light.** Where small emitters, penumbras or the choice among emitters make the noise at x1, the pixel takes
+    up to 16 emitter samples there instead of one, by the difference of two samples that the pilot measures.  A sample
+    costs a shadow ray.  ``statistics`` holds the mean number, ``emitter_samples``.
+
     **Decisions.** A pilot of a 36th of the camera rays (a 16th in raw images), a smaller part in long renders, decides
     whether virtual lights pay, how many there are, where they lie, and how many samples of a pixel they light.  Without
     lights, ``manylights`` is ``path`` with stratified samples.  The decision is in ``statistics``, in the log (level
@@ -327,7 +331,8 @@ class ManyLightsIntegrator(PassRenderer):
         emitters = known.emitters if known else emitter_sampler(scene, learning_rays(learning), groups)
         return View(
             scene, emitters, Perturbed(scene), PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray,
-            active, cells.width, cells.rays, seed, dr.opaque(mi.Float, 1.0, pixels), OutgoingRadiance.unknown(),
+            active, cells.width, cells.rays, seed, dr.opaque(mi.Float, 1.0, pixels),
+            dr.opaque(mi.UInt32, 1, pixels), OutgoingRadiance.unknown(),
             learning, planned, self.cost_model if self.denoised else self.cost_model.without_denoiser(),
             Layers(bool(self.layers), emitters.groups),
         )  # fmt: skip

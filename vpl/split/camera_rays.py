@@ -20,13 +20,15 @@ from .view import FirstEdge, PathSettings, View
 class CameraRays:
     """Some camera rays of a view.
 
-    ``ray``; ``active``; ``importance`` of radiance, for Russian roulette; ``places`` in pixels; ``sizes``: the
-    different numbers of rays of pixels; ``cells`` of the film in a pixel.
+    ``ray``; ``active``; ``importance`` of radiance, for Russian roulette; ``direct_samples``: number of emitter samples
+    at the first scattering vertex; ``places`` in pixels; ``sizes``: the different numbers of rays of pixels; ``cells``
+    of the film in a pixel.
     """
 
     ray: mi.Ray3f
     active: mi.Bool
     importance: mi.Float
+    direct_samples: mi.UInt32
     places: RayNumbers
     sizes: tuple[int, ...]
     cells: int
@@ -39,14 +41,16 @@ class CameraRays:
         # All numbers of rays, and counted and chosen lanes, use the same kernel
         dr.eval(lane, places)
         importance = dr.gather(mi.Float, view.importance, places.pixel)
-        return cls(part, dr.gather(mi.Bool, view.active, lane), importance, places, view.rays.sizes, view.rays.cells)
+        samples = dr.gather(mi.UInt32, view.direct_samples, places.pixel)
+        active = dr.gather(mi.Bool, view.active, lane)
+        return cls(part, active, importance, samples, places, view.rays.sizes, view.rays.cells)
 
     def trace(
         self, scene, emitters: EmitterSampler, seed: int, settings: PathSettings, sums: LayerSums | None = None,
         lattice: Lattice | None = None,
     ) -> Traced:  # fmt: skip
         """Trace paths from the camera; ``sums`` by layer; ``lattice``: None for one of these rays alone."""
-        edge = FirstEdge.of_camera(self.ray, self.importance, self.active)
+        edge = FirstEdge.of_camera(self.ray, self.importance, self.active, self.direct_samples)
         if lattice is None:
             lattice = Lattice(self.places, self.sizes, derived_seed(seed, 0), cells=self.cells)
         sampler = independent_sampler(derived_seed(seed, 1), dr.width(self.places.pixel))

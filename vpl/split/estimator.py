@@ -72,12 +72,13 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
     """
     view = replace(view, emitters=start.emitters_for(view.count))
     decision = decide(view, start)
+    view, samples = with_emitter_samples(view, decision)
     view, roulette = with_roulette(view, decision)
     mi.Log(mi.LogLevel.Info, f"manylights: {decision.plan}")
     lights, of_lights = make_lights(view, decision, kept, clock)
     radiance, valid, layers, of_image = render_image(view, lights, decision, stopped, clock)
     precision = {"precision": decision.precision(view.samples)}
-    statistics = {"plan": decision.plan.reason} | precision | roulette | of_lights | of_image
+    statistics = {"plan": decision.plan.reason} | precision | samples | roulette | of_lights | of_image
     return Estimate(radiance, valid, layers, decision, statistics | {"seconds": clock.seconds})
 
 
@@ -88,7 +89,13 @@ def decide(view: View, start: Start) -> Decision:
     """Compare the kinds of virtual lights for a view of a certain size."""
     evidence = evidence_of(view, start)
     plan = without_lights(start.refusal) if start.refusal else choose(evidence, start.options)
-    return Decision(start.pilot, evidence, plan, start.options)
+    return Decision(start.pilot, evidence, plan, start.options, start.effects)
+
+
+def with_emitter_samples(view: View, decision: Decision) -> tuple[View, dict]:
+    """(View with numbers of emitter samples; their mean, as a statistic)."""
+    numbers = decision.effect.numbers(decision.samples.multiple)
+    return replace(view, direct_samples=upload(mi.UInt32, numbers)), {"emitter_samples": float(np.mean(numbers))}
 
 
 def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:

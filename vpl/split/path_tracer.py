@@ -20,8 +20,6 @@ subtraction, and the surfaces for placing virtual lights.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
@@ -30,99 +28,17 @@ from ..core.loops import recorded_once
 from ..direct.emitter_sampling import power_heuristic
 from ..points.camera_paths import SceneTraits
 from ..transport.carried_share import carried_share
-from ..transport.minorant import agrees, is_diffuse, minorant_of, side_of
+from ..transport.minorant import agrees
 from .contributions import Contributions, LayerSums
 from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
 from .gather_vertices import Gathered, GatherVertices, SecondVertices
 from .lattice import Lattice
+from .path_state import Hit, Path, Traced
 from .roulette import residual_survival, throughput_survival
-from .view import Edge, FirstEdge, Gathering, PathSettings, State
+from .view import FirstEdge, Gathering, PathSettings, State
 
-# ---------------------- State of the loop ----------------------
-
-
-@dataclass
-class Path(Edge):
-    """Paths on their current edges.
-
-    ``depth``: edges before; ``eta``: as in ``path``; ``scattered``: number of scattering vertices; ``valid``: whether
-    the path met a surface counted in the film's alpha; ``carried``: β F1 before x2, w β F1 F2 at x2; ``cosine``: cosθ1.
-    """
-
-    depth: mi.UInt32
-    eta: mi.Float
-    scattered: mi.UInt32
-    valid: mi.Bool
-    carried: mi.UnpolarizedSpectrum
-    cosine: mi.Float
-
-    @classmethod
-    def of(cls, first: FirstEdge) -> Path:
-        """Paths on the first edges: copies, because the loop changes the arrays."""
-        fields = (type(value)(value) for value in vars(first).values())
-        carried = dr.zeros(mi.UnpolarizedSpectrum, dr.width(first.throughput))
-        return cls(*fields, mi.UInt32(0), mi.Float(1), mi.UInt32(0), mi.Bool(False), carried, mi.Float(1))
-
-
-@dataclass
-class Hit:
-    """Surfaces that paths hit.
-
-    ``si``; ``bsdf`` with its ``flags``; ``side``, ``minorant``: see :mod:`vpl.transport.minorant`; ``hidden``: whether
-    the surface is an emitter hidden from the camera; ``goes_on``: whether the path may continue; ``smooth``: whether
-    the path continues at a BSDF with a density.
-    """
-
-    si: mi.SurfaceInteraction3f
-    bsdf: mi.BSDFPtr
-    flags: mi.UInt32
-    side: mi.Float
-    minorant: mi.UnpolarizedSpectrum
-    hidden: mi.Bool
-    goes_on: mi.Bool
-    smooth: mi.Bool
-
-    @classmethod
-    def of(cls, scene, path: Path, settings: PathSettings) -> Hit:
-        """Intersect the rays with the scene."""
-        si = scene.ray_intersect(path.ray, mi.RayFlags.All, coherent=path.depth == 0, active=path.active)
-        bsdf, hidden = si.bsdf(path.ray), mi.Bool(False)
-        if settings.hide_emitters:
-            from_camera = path.active & (path.depth == 0) & (path.state == State.SEEKING)
-            from_camera &= settings.gathering != Gathering.PLACING
-            hidden = from_camera & (~si.is_valid() | si.shape.is_emitter())
-        goes_on = path.active & si.is_valid() & (path.depth + 1 < settings.max_depth) & ~hidden
-        flags, side = bsdf.flags(), side_of(si)
-        smooth = goes_on & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-        minorant = minorant_of(si, bsdf, side, settings.perturbed, smooth & (settings.gathering >= path.state))
-        return cls(si, bsdf, flags, side, minorant, hidden, goes_on, smooth)
-
-    @property
-    def is_diffuse(self) -> mi.Bool:
-        """Whether the BSDF has only a diffuse lobe."""
-        return is_diffuse(self.flags)
-
-
-@dataclass
-class Traced:
-    """Result of :func:`trace_paths`, one record per lane, evaluated.
-
-    ``radiance``; ``drawn``: a contribution over its probability, from a path of ``length`` edges to an emitter of
-    ``group``; ``seen``: emission at the end of the first edge, mean over channels; ``valid``: whether a surface counts
-    in the film's alpha; ``edges`` without the last; ``gathered``: gather vertices.
-    """
-
-    radiance: mi.UnpolarizedSpectrum
-    drawn: mi.UnpolarizedSpectrum
-    length: mi.UInt32
-    group: mi.UInt32
-    seen: mi.Float
-    valid: mi.Bool
-    edges: mi.UInt32
-    gathered: Gathered
-
-
-# ---------------------- Estimator ----------------------
+# The golden ratio less one: multiples are spread evenly modulo 1
+_GOLDEN = (5**0.5 - 1) / 2
 
 
 @recorded_once
@@ -136,17 +52,17 @@ def trace_paths(
     ``lattice``: numbers for the choice of emitter, point, lobe and direction at each vertex; ``sampler``: the remaining
     random numbers; ``sums`` by layer, for camera rays.
     """
-    context, count = mi.BSDFContext(), dr.width(first.throughput)
+    count = dr.width(first.throughput)
     path, found, gathered = Path.of(first), Contributions.none(count, sums), Gathered.none(count)
-    lane, seen = dr.arange(mi.UInt32, count), mi.Float(0)
+    lane, seen, difference = dr.arange(mi.UInt32, count), mi.Float(0), mi.Float(0)
 
-    while dr.hint(path.active, exclude=[first, lattice, settings, emitters, context, lane]):
+    while dr.hint(path.active, exclude=[first, lattice, settings, emitters, lane]):
         # ---------------------- Hit ----------------------
         hit = Hit.of(scene, path, settings)
 
         # ---------------------- Emission, by BSDF sampling ----------------------
         met = emitters.met(path.vertex, path.cell, path.ray, hit.si, ~path.delta, path.active & ~hit.hidden)
-        mis = power_heuristic(path.density, met.density)
+        mis = power_heuristic(path.density, met.density * mi.Float(path.samples))
         emission = _less_carried(path, met, settings) * met.radiance * mis
         found.add(emission, path.depth + 1, met.group, sampler.next_1d(), lane)
         seen += dr.select(path.depth == 0, channel_mean(emission), 0)
@@ -162,25 +78,18 @@ def trace_paths(
         hit.goes_on &= settings.gathering != Gathering.PLACING
         hit.smooth &= hit.goes_on
 
-        # ---------------------- Next-event estimation ----------------------
-        chosen, place, lobe, turn = lattice.at(path.depth)
+        # ---------------------- Next-event estimation, and a sample of the BSDF ----------------------
         path.scattered += dr.select(hit.smooth, 1, 0)
-        cell, member = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side), sampler.next_1d()
-        sample = emitters.sample(hit.si, cell, chosen, member, place, hit.smooth)
-        # A single call: each call adds the code of every material to the kernel. A path that ends needs the sample only
-        # to tell whether the surface counts in alpha
-        toward, scatters = hit.si.to_local(sample.direction), path.active & ~hit.hidden & (hit.goes_on | ~path.valid)
-        value, density, turned, bsdf_weight = hit.bsdf.eval_pdf_sample(context, hit.si, toward, lobe, turn, scatters)
-        lit, beyond = _lit(path, hit, sample, toward.z, value, density, weight, settings, sampler)
-        edges = path.depth + 2
-        arriving, crossings = sample.arriving(
-            scene, emitters.traits, settings.max_depth - edges, dr.max(dr.abs(beyond)) > 0
+        samples = dr.select(hit.smooth & (path.scattered == 1), first.direct_samples, 1)
+        cell = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side)
+        numbers = lattice.at(path.depth)
+        turned, bsdf_weight, of_vertex = _light(
+            scene, emitters, path, hit, weight, cell, samples, numbers, settings, sampler, found, lane
         )
-        lit = dr.select(crossings > 0, beyond, lit)
-        found.add(lit * arriving, edges + crossings, sample.group, sampler.next_1d(), lane)
+        difference += of_vertex
 
         # ---------------------- BSDF sampling ----------------------
-        survival = _turn(path, hit, turned, bsdf_weight, gathers, weight, cell, emitters.traits)
+        survival = _turn(path, hit, turned, bsdf_weight, gathers, weight, cell, samples, emitters.traits)
 
         # ---------------------- Russian roulette: residual of the direction, and throughput ----------------------
         _end_at_direction(path, hit, survival, settings, sampler.next_1d())
@@ -188,9 +97,61 @@ def trace_paths(
             _pass_hidden(path, hit, first)
 
     gathered.finish()
-    traced = Traced(found.radiance, found.one, found.length, found.group, seen, path.valid, path.depth, gathered)
+    traced = Traced(
+        found.radiance, found.one, found.length, found.group, seen, difference, path.valid, path.depth, gathered
+    )  # fmt: skip
     dr.eval(traced)
     return traced
+
+
+@dr.syntax
+def _light(
+    scene, emitters: EmitterSampler, path: Path, hit: Hit, weight, cell, samples: mi.UInt32, numbers: tuple,
+    settings: PathSettings, sampler, found: Contributions, lane,
+):  # fmt: skip
+    """Add the light of emitters by ``samples`` samples at each vertex to ``found``.
+
+    ``numbers`` of the lattice; ``weight`` of the gather vertex.  Returns (sample of the BSDF; its weight; contributions
+    of the samples with even numbers less those of the others, mean over channels, 0 for a single sample).
+    """
+    context, count = mi.BSDFContext(), dr.width(cell)
+    # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
+    scatters, share = path.active & ~hit.hidden & (hit.goes_on | ~path.valid), dr.rcp(mi.Float(samples))
+    turned, bsdf_weight = dr.zeros(mi.BSDFSample3f, count), dr.zeros(mi.Spectrum, count)
+    number, difference, edges = dr.zeros(mi.UInt32, count), dr.zeros(mi.Float, count), path.depth + 2
+    while dr.hint(
+        number < samples,
+        exclude=[
+            scene, emitters, path, hit, weight, cell, samples, numbers, settings, lane, context, scatters, share, edges
+        ],
+    ):  # fmt: skip
+        chosen, place, lobe, turn = _numbers_of_sample(numbers, number, share)
+        sample = emitters.sample(hit.si, cell, chosen, sampler.next_1d(), place, hit.smooth)
+        # A single call for both: each call adds the code of every material to the kernel
+        toward = hit.si.to_local(sample.direction)
+        value, density, turned, bsdf_weight = hit.bsdf.eval_pdf_sample(context, hit.si, toward, lobe, turn, scatters)
+        lit, beyond = _lit(path, hit, sample, toward.z, value, density, weight, share, settings, sampler)
+        arriving, crossings = sample.arriving(
+            scene, emitters.traits, settings.max_depth - edges, dr.max(dr.abs(beyond)) > 0
+        )
+        lit = dr.select(crossings > 0, beyond, lit) * arriving
+        found.add(lit, edges + crossings, sample.group, sampler.next_1d(), lane)
+        level = channel_mean(lit)
+        difference += dr.select(samples > 1, dr.select((number & 1) == 0, level, -level), 0)
+        number += 1
+    return turned, bsdf_weight, difference
+
+
+def _numbers_of_sample(numbers: tuple, number: mi.UInt32, share: mi.Float) -> tuple:
+    """The ``numbers`` of a vertex for one of 1 / ``share`` emitter samples: those for the emitter and the point on it
+    are shifted, so that they are spread over the samples like a lattice.  The BSDF is sampled once."""
+
+    def shifted(value, step):
+        moved = value + mi.Float(number) * step
+        return dr.minimum(moved - dr.floor(moved), dr.one_minus_epsilon(mi.Float))
+
+    chosen, place, lobe, turn = numbers
+    return shifted(chosen, share), mi.Point2f(shifted(place.x, share), shifted(place.y, _GOLDEN)), lobe, turn
 
 
 def _less_carried(path: Path, met: MetEmitter, settings: PathSettings):
@@ -254,11 +215,14 @@ def _gather(path: Path, hit: Hit, settings: PathSettings, gathered: Gathered, sa
     return gathers, weight
 
 
-def _lit(path: Path, hit: Hit, sample: EmitterSample, height, value, density, weight, settings: PathSettings, sampler):
+def _lit(
+    path: Path, hit: Hit, sample: EmitterSample, height, value, density, weight, share, settings: PathSettings, sampler
+):  # fmt: skip
     """Factors of the sampled emitters' light: β f, minus the parts carried by virtual lights; and the same for light
     that passes null surfaces, which virtual lights that represent emitters do not carry.
 
-    ``height``: cosine of the direction; ``value``, ``density``: of the BSDF; ``weight`` of the gather vertex.
+    ``height``: cosine of the direction; ``value``, ``density``: of the BSDF; ``weight`` of the gather vertex; ``share``
+    of the sample in the light, one over the number of samples.
     """
     full = path.throughput * mi.unpolarized_spectrum(value)
     cosine = dr.select(height * hit.side > 0, dr.abs(height), 0)
@@ -270,15 +234,16 @@ def _lit(path: Path, hit: Hit, sample: EmitterSample, height, value, density, we
         survival = residual_survival(value, full, settings.emitters_carried)
         survives = sampler.next_1d() < survival
         value, beyond = (dr.select(survives, one / survival, 0) for one in (value, beyond))
-    mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, density))
-    mis = dr.select(hit.smooth & (sample.density > 0), mis, 0)
+    mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, density * share))
+    mis = dr.select(hit.smooth & (sample.density > 0), share * mis, 0)
     return value * mis, beyond * mis
 
 
-def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight, cell, traits: SceneTraits):
+def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight, cell, samples, traits: SceneTraits):
     """Continue along a BSDF sample ``bs`` with its weight; returns the survival probability by the residual.
 
-    ``gathers``, ``weight``: mask and weights of gather vertices, carried on by the path; ``cell`` of the vertex.
+    ``gathers``, ``weight``: mask and weights of gather vertices, carried on by the path; ``cell`` of the vertex, and
+    its number of emitter ``samples``.
 
     A path that passes a null surface keeps the vertex and the density of its direction: next-event estimation passes
     null surfaces as well.
@@ -306,6 +271,7 @@ def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight, cell, traits: 
         told = mi.unpolarized_spectrum(hit.bsdf.eval_null_transmission(hit.si, null & path.active))
         turns = ~(null & (dr.max(told) > 0))
     path.vertex, path.cell = dr.select(turns, hit.si.p, path.vertex), dr.select(turns, cell, path.cell)
+    path.samples = dr.select(turns, samples, path.samples)
     path.density, path.delta = dr.select(turns, bs.pdf, path.density), dr.select(turns, delta, path.delta)
     path.depth += dr.select(hit.goes_on, 1, 0)
     return survival

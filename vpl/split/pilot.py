@@ -21,6 +21,9 @@ from .path_tracer import Traced
 from .roulette import OutgoingRadiance
 from .view import Gathering, Stream, View, ViewLights
 
+# Emitter samples at the first scattering vertex of a path of the pilot: two tell how much they differ
+PILOT_SAMPLES = 2
+
 
 @dataclass(frozen=True)
 class Arrivals:
@@ -53,10 +56,11 @@ class Onward:
 class Pilot:
     """Paths in pairs of neighbouring samples, usually of the same pixel.
 
-    ``pixel``, ``radiance`` (n,): of each path; ``seen`` (n,): emission on the first edge; ``indirect`` (n,): part of
-    the radiance through arrivals.  Values may be negative if virtual lights carry a part.  ``vertices``: positions and
-    normals (k, 3) of first and second vertices; ``size``: width of the image and number of pixels; ``scene``;
-    ``seed`` of the octree.
+    ``pixel``, ``radiance`` (n,): of each path, with one emitter sample at each vertex; ``seen`` (n,): emission on the
+    first edge; ``difference`` (n,): half of the difference that the choice between two emitter samples at the first
+    scattering vertex makes to the radiance; ``indirect`` (n,): part of the radiance through arrivals.  Values may be
+    negative if virtual lights carry a part.  ``vertices``: positions and normals (k, 3) of first and second vertices;
+    ``size``: width of the image and number of pixels; ``scene``; ``seed`` of the octree.
     """
 
     arrivals: Arrivals
@@ -65,6 +69,7 @@ class Pilot:
     pixel: np.ndarray
     radiance: np.ndarray
     seen: np.ndarray
+    difference: np.ndarray
     indirect: np.ndarray
     size: tuple[int, int]
     scene: mi.Scene
@@ -83,13 +88,15 @@ class Pilot:
     @classmethod
     def of(cls, traced: Traced, view: View, pixel: np.ndarray) -> Pilot:
         """The pilot of traced paths in the pixels ``pixel`` (n,) of a view."""
-        radiance, seen = mean_radiance(traced.radiance), _finite(traced.seen)
+        radiance, seen, difference = single_sample_radiance(traced), _finite(traced.seen), _finite(traced.difference)
         edges = download(traced.edges).astype(np.int64)
-        arrivals, onward, indirect = _second_vertices(traced.gathered.second, radiance, edges)
+        arrivals, onward, indirect = _second_vertices(traced.gathered.second, radiance, difference, edges)
         first, facing = _first_vertices(traced.gathered.first)
         vertices = np.concatenate([first, arrivals.position]), np.concatenate([facing, arrivals.normal])
         size, seed = (view.width, view.pixels), derived_seed(view.seed, Stream.OCTREE)
-        return cls(arrivals, onward, vertices, pixel, radiance, seen, indirect, size, view.scene, seed, view.model)
+        return cls(
+            arrivals, onward, vertices, pixel, radiance, seen, difference, indirect, size, view.scene, seed, view.model
+        )
 
     @cached_property
     def line_sampler(self) -> LineSampler:
@@ -144,19 +151,24 @@ def pilot_lanes(view: View) -> np.ndarray:
     return view.pairs(view.model.pilot_size(view.planned_count))
 
 
-def mean_radiance(radiance) -> np.ndarray:
-    """Mean over channels (n,), float64; 0 where it is not finite."""
-    return _finite(channel_mean(radiance))
+def single_sample_radiance(traced: Traced) -> np.ndarray:
+    """Radiance of the paths of a pilot with the first emitter sample at each vertex, mean over channels (n,), float64;
+    0 where it is not finite.
+
+    The radiance of a path is the mean of that with either of the samples.
+    """
+    return _finite(channel_mean(traced.radiance)) + _finite(traced.difference)
 
 
 def _finite(values: mi.Float) -> np.ndarray:
     return np.nan_to_num(download(values).astype(np.float64), posinf=0, neginf=0)
 
 
-def _second_vertices(second: SecondVertices, radiance: np.ndarray, edges: np.ndarray):
+def _second_vertices(second: SecondVertices, radiance: np.ndarray, difference: np.ndarray, edges: np.ndarray):
     """(Arrivals, second vertices, radiance (n,) through arrivals) of paths."""
     position, normal, weight, throughput, before = (download(x) for x in vars(second).values())
-    beyond = np.maximum(radiance - np.nan_to_num(before), 0)
+    # The radiance before the vertex is that with both emitter samples
+    beyond = np.maximum(radiance - difference - np.nan_to_num(before), 0)
     known = np.isfinite(position).all(1)
     onward = (throughput > 0) & np.isfinite(throughput) & known
     path, throughput = np.flatnonzero(onward), throughput[onward].astype(np.float64)

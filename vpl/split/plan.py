@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from .cost_model import CostModel
+from .emitter_samples import EmitterSamples, Samples
 from .pilot import Pilot, relative_variance
 from .view import ViewLights
 
@@ -124,18 +125,17 @@ class Evidence:
         fraction n^-0.5 [Mitchell 1996, "Consequences of stratified sampling in graphics"].  Of the noise of direct
         light they retain more, by the constants ``stratified_power`` and ``stratified_many``.
         """
-        model, edges = self.model, self.samples**-0.5
-        retained = self.samples**-model.stratified_power
-        if self.emitters:
-            retained = max(model.stratified_many, retained)
+        edges = self.samples**-0.5
         whole = self.relative(radiance)
         unseen = min(self.relative(radiance, without_seen=True), whole)
         direct = min(self.relative(self.direct), unseen)
-        return edges * (whole - unseen) + unseen - (1 - retained) * direct
+        return edges * (whole - unseen) + unseen - (1 - self.retained) * direct
 
-    def cost(self, plan: Plan, excess: float) -> float:
-        """Cost of a path with a ``plan`` whose cuts take 1 + ``excess`` times the expected shadow rays."""
-        return plan.cost + excess * self.model.ray_cost * plan.rays / self.samples
+    @property
+    def retained(self) -> float:
+        """Fraction of the variance of direct light that stratified samples retain, by the constants of the model."""
+        retained = self.samples**-self.model.stratified_power
+        return max(self.model.stratified_many, retained) if self.emitters else retained
 
     def relative(self, values: np.ndarray, without_seen: bool = False) -> float:
         """Relative variance of the ``values`` (n,) of paths, or of the values less ``seen``.
@@ -153,12 +153,34 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Decision:
-    """A ``plan`` with the ``evidence`` of the ``pilot`` and the ``options`` that were compared."""
+    """A ``plan`` with the ``evidence`` of the ``pilot`` and the ``options`` that were compared; ``effects`` of more
+    emitter samples with and without virtual lights that represent emitters."""
 
     pilot: Pilot
     evidence: Evidence
     plan: Plan
     options: list[Option]
+    effects: dict[bool, EmitterSamples]
+
+    @property
+    def effect(self) -> EmitterSamples:
+        """Effect of more emitter samples with the lights of the plan."""
+        return self.effects[self.plan.emitters]
+
+    @cached_property
+    def samples(self) -> Samples:
+        """Choice of the numbers of emitter samples."""
+        return self._samples(self.evidence, self.plan)
+
+    def _samples(self, evidence: Evidence, plan: Plan) -> Samples:
+        """Choice of the numbers of emitter samples for another size of the image and its plan.
+
+        Lights are chosen before.  Their choice counts the variance of direct light by constants, this one at least as
+        much as measured.
+        """
+        effect, variance = self.effects[plan.emitters], plan.variance if plan.gathers else evidence.whole
+        more = max(effect.retained(evidence.samples) - evidence.retained, 0)
+        return effect.best(variance + more * evidence.relative(evidence.direct), plan.cost, evidence.samples)
 
     def expected_light(self, lights: ViewLights) -> np.ndarray:
         """Expected radiance of ``lights`` in each pixel of the view, (pixels,)."""
@@ -179,8 +201,14 @@ class Decision:
         paths = round(self.evidence.paths * samples / self.evidence.samples)
         other = replace(self.evidence, paths=paths, samples=samples)
         excess = rays / self.plan.rays - 1 if rays is not None and self.plan.rays else 0.0
-        of_other = other.cost(choose(other, self.options, measures=False), excess)
-        return of_other / self.evidence.cost(self.plan, excess)
+        return self._cost(other, choose(other, self.options, measures=False), excess) / self._cost(
+            self.evidence, self.plan, excess
+        )
+
+    def _cost(self, evidence: Evidence, plan: Plan, excess: float) -> float:
+        """Cost of a path whose cuts take 1 + ``excess`` times the expected shadow rays."""
+        of_cuts = self.evidence.model.ray_cost * plan.rays / evidence.samples
+        return self._samples(evidence, plan).cost + excess * of_cuts
 
     def precision(self, samples: int) -> float:
         """Expected inverse of the relative variance of a pixel with ``samples``; ``samples`` for a black image.
@@ -188,7 +216,7 @@ class Decision:
         Independent of the random numbers of passes that share the start of an earlier pass, so it may weight them in a
         mean.  The first pass shares its camera rays with the pilot, and no other random numbers.
         """
-        variance = self.plan.variance + self.plan.of_lights if self.plan.gathers else self.evidence.whole
+        variance = self.samples.left + self.plan.of_lights
         return samples / variance if variance > 0 else float(samples)
 
 

@@ -16,10 +16,11 @@ from ..core.arrays import upload
 from ..core.sampling import derived_seed
 from .camera_rays import CameraRays
 from .cost_model import CostModel
+from .emitter_samples import EmitterSamples, retained_fraction
 from .emitters.base import EmitterSampler
 from .emitters.cell_choice import learning_rays
 from .local_c import LocalC
-from .pilot import Pilot, mean_radiance, pilot_lanes, relative_errors
+from .pilot import PILOT_SAMPLES, Pilot, pilot_lanes, relative_errors, single_sample_radiance
 from .plan import Evidence, Option
 from .view import Gathering, Stream, View, ViewLights
 
@@ -29,7 +30,8 @@ class Start:
     """Knowledge at the beginning of a pass: the ``pilot``; the sampler of ``emitters``, after learning from the pilot
     if ``learned``; ``options``: kinds of lights to compare, empty if ``refusal`` holds a reason against lights.
 
-    ``paths``: number of camera rays that sized the learning; ``seed`` of the first pass; ``later``: samplers of
+    ``effects`` of more emitter samples, with and without virtual lights that represent emitters; ``paths``: number of
+    camera rays that sized the learning; ``seed`` of the first pass; ``later``: samplers of
     emitters by the size of passes, see :meth:`emitters_for`; ``known``: see :class:`vpl.split.plan.Evidence`.
     """
 
@@ -38,6 +40,7 @@ class Start:
     learned: bool
     options: list[Option]
     refusal: str
+    effects: dict[bool, EmitterSamples]
     paths: int
     seed: int
     later: dict[int, EmitterSampler] = field(default_factory=dict)
@@ -70,9 +73,14 @@ class Start:
 
 def make_start(view: View, virtual_lights: bool) -> Start:
     """Trace the pilot of a view, and learn from it.  ``virtual_lights``: whether virtual lights are allowed."""
+    view = replace(view, direct_samples=dr.opaque(mi.UInt32, PILOT_SAMPLES, view.pixels))
     (pilot, learned), refusal = learning_pilot(view), _refusal(view, virtual_lights)
-    options = [] if refusal else _options(view, pilot)
-    return Start(pilot, view.emitters, learned, options, refusal, view.learning_count, view.seed)
+    fraction = retained_fraction(view)
+    effects, options = {False: EmitterSamples.of(pilot, pilot.difference, fraction)}, []
+    if not refusal:
+        options, difference = _options(view, pilot)
+        effects[True] = EmitterSamples.of(pilot, difference, fraction)
+    return Start(pilot, view.emitters, learned, options, refusal, effects, view.learning_count, view.seed)
 
 
 def learning_pilot(view: View) -> tuple[Pilot, bool]:
@@ -127,14 +135,16 @@ def _refusal(view: View, virtual_lights: bool) -> str:
     return ""
 
 
-def _options(view: View, pilot: Pilot) -> list[Option]:
-    """Kinds of virtual lights that are possible."""
+def _options(view: View, pilot: Pilot) -> tuple[list[Option], np.ndarray]:
+    """(Kinds of virtual lights that are possible; difference of emitter samples where virtual lights represent
+    emitters)."""
     if not _may_carry_emitters(view):
-        return _with_surfaces(view, pilot, ViewLights())
+        return _with_surfaces(view, pilot, ViewLights()), pilot.difference
     emitters = ViewLights(emitters=view.light_set([]), emitters_c=view.emitters_c)
     traced = Pilot.trace(view, emitters)
     only_emitters = Option(False, True, traced.radiance, traced.indirect)
-    return [only_emitters, *_with_surfaces(view, pilot, ViewLights()), *_with_surfaces(view, traced, emitters)]
+    options = [only_emitters, *_with_surfaces(view, pilot, ViewLights()), *_with_surfaces(view, traced, emitters)]
+    return options, traced.difference
 
 
 def _with_surfaces(view: View, traced: Pilot, lights: ViewLights) -> list[Option]:
@@ -151,10 +161,10 @@ def _with_surfaces(view: View, traced: Pilot, lights: ViewLights) -> list[Option
     settings = view.settings(with_surfaces, Gathering.AT_FIRST)
     rays = CameraRays.of(view, upload(mi.UInt32, pilot_lanes(view)))
     # Otherwise the rays would keep those of the view
-    dr.eval(rays.ray, rays.active, rays.importance, rays.places)
+    dr.eval(rays.ray, rays.active, rays.importance, rays.direct_samples, rays.places)
     measured = partial(rays.trace, view.scene, view.emitters, derived_seed(view.seed, Stream.PILOT), settings)
 
     def residual():
-        return mean_radiance(measured().radiance)
+        return single_sample_radiance(measured())
 
     return [Option(True, lights.emitters is not None, traced.radiance, traced.indirect, residual)]

@@ -124,7 +124,7 @@ def _places_with_minorants(scene, emitters, rays, settings: PathSettings, seed: 
     settings = replace(settings, max_depth=depth, gathering=gathering, emitters_carried=dr.opaque(mi.Bool, True))
     lattice = Lattice.of_lanes(dr.arange(mi.UInt32, count), 1, derived_seed(seed, 0))
     sampler = independent_sampler(derived_seed(seed, 1), count)
-    edge = FirstEdge.of_camera(rays, 1.0, True)
+    edge = FirstEdge.of_camera(rays, 1.0, True, 1)
     met = trace_paths(scene, emitters, edge, lattice, sampler, settings).gathered.first
     index = dr.compress((met.depth > 0) & (dr.max(met.weight) > 0))
     met = met.select(index)

@@ -35,6 +35,7 @@ class Stream(IntEnum):
     EMITTER_LIGHTS = 7
     ALPHA = 8
     OCTREE = 9
+    STRATA = 10
 
 
 class State:
@@ -91,8 +92,8 @@ class Edge:
 
     ``vertex``: origin; ``ray``; ``throughput``: β; ``density`` of the direction, 1 / sr; ``delta``: whether the
     direction has no density; ``state``: a :class:`State`; ``cell`` of the origin, see
-    :class:`vpl.split.emitters.base.EmitterSampler`; ``importance``: see
-    :meth:`vpl.split.roulette.OutgoingRadiance.survival`; ``active``.
+    :class:`vpl.split.emitters.base.EmitterSampler`; ``samples``: number of emitter samples at the origin;
+    ``importance``: see :meth:`vpl.split.roulette.OutgoingRadiance.survival`; ``active``.
     """
 
     vertex: mi.Point3f
@@ -102,22 +103,30 @@ class Edge:
     delta: mi.Bool
     state: mi.UInt32
     cell: mi.UInt32
+    samples: mi.UInt32
     importance: mi.Float
     active: mi.Bool
 
 
 @dataclass
 class FirstEdge(Edge):
-    """First edges of paths, evaluated."""
+    """First edges of paths, evaluated; ``direct_samples``: number of emitter samples at the first scattering vertex."""
+
+    direct_samples: mi.UInt32
 
     @classmethod
-    def of_camera(cls, ray, importance, active) -> FirstEdge:
+    def of_camera(cls, ray, importance, active, direct_samples) -> FirstEdge:
         """Rays without a surface at the origin, for example camera rays."""
         density = dr.opaque(mi.Float, 1.0, dr.width(ray.d))
-        return cls.of(ray.o, ray, ones(len(density)), density, True, State.SEEKING, mi.UInt32(0), importance, active)
+        return cls.of(
+            ray.o, ray, ones(len(density)), density, True, State.SEEKING, mi.UInt32(0), importance, active,
+            direct_samples,
+        )  # fmt: skip
 
     @classmethod
-    def of(cls, vertex, ray, throughput, density, delta: bool, state: int, cell, importance, active) -> FirstEdge:
+    def of(
+        cls, vertex, ray, throughput, density, delta: bool, state: int, cell, importance, active, direct_samples=1
+    ) -> FirstEdge:  # fmt: skip
         """Rays whose directions have a ``density``."""
         count = dr.width(ray.d)
         # Arrays of full width, opaque and distinct, give a single kernel for every use
@@ -133,8 +142,10 @@ class FirstEdge(Edge):
             wide == (0 if delta else 1),
             dr.full(mi.UInt32, state, count),
             cell + dr.opaque(mi.UInt32, 0, count),
+            dr.full(mi.UInt32, 1, count),
             importance + wide,
             active,
+            direct_samples + dr.opaque(mi.UInt32, 0, count),
         )
         dr.make_opaque(edge)
         return edge
@@ -166,6 +177,7 @@ class View:
     ``scene``; ``emitters``: emitter sampler; ``perturbed``: shapes without a minorant; ``rules`` of the paths; ``ray``,
     ``active``: of the camera, evaluated, by pixel as in ``rays``; ``width`` of the image in pixels;
     ``seed``; ``importance`` of radiance in each pixel and ``outgoing`` radiance of surfaces: for Russian roulette;
+    ``direct_samples``: number of emitter samples at the first scattering vertices of each pixel;
     ``learning_count``: number of camera rays, for the size of the emitter sampler's learning; ``planned_count``: the
     same for the size of the pilot; ``model``: constants of the decisions; ``layers`` of the image.
     """
@@ -180,6 +192,7 @@ class View:
     rays: PixelRays
     seed: int
     importance: mi.Float
+    direct_samples: mi.UInt32
     outgoing: OutgoingRadiance
     learning_count: int
     planned_count: int

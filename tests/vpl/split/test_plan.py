@@ -7,6 +7,7 @@ import pytest
 
 from vpl.split import plan
 from vpl.split.cost_model import CostModel, table
+from vpl.split.emitter_samples import EmitterSamples
 from vpl.split.plan import Decision, Evidence, Option, choose, price
 
 DENOISED = CostModel()
@@ -235,7 +236,8 @@ def decision(samples, pixels=10**6):
     indirect = 3 * np.random.default_rng(0).exponential(size=10_000)
     option = Option(True, False, indirect, indirect, residual=0.1**0.5 * indirect)
     evidence = Evidence(indirect, UNSEEN, 0 * indirect, np.ones(10_000), samples * pixels, samples, False, MODEL)
-    return Decision(None, evidence, choose(evidence, [option]), [option])
+    same = EmitterSamples(0.0, np.zeros(1), np.zeros(1), np.zeros(1), 1.0, MODEL)
+    return Decision(None, evidence, choose(evidence, [option]), [option], {False: same, True: same})
 
 
 def test_samples_of_larger_passes_share_cuts():

@@ -1,0 +1,96 @@
+"""State of the loop of :mod:`vpl.split.path_tracer`: paths, the surfaces that they hit, and the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.minorant import is_diffuse, minorant_of, side_of
+from .gather_vertices import Gathered
+from .view import Edge, FirstEdge, Gathering, PathSettings, State
+
+
+@dataclass
+class Path(Edge):
+    """Paths on their current edges.
+
+    ``depth``: edges before; ``eta``: as in ``path``; ``scattered``: number of scattering vertices; ``valid``: whether
+    the path met a surface counted in the film's alpha; ``carried``: β F1 before x2, w β F1 F2 at x2; ``cosine``: cosθ1.
+    """
+
+    depth: mi.UInt32
+    eta: mi.Float
+    scattered: mi.UInt32
+    valid: mi.Bool
+    carried: mi.UnpolarizedSpectrum
+    cosine: mi.Float
+
+    @classmethod
+    def of(cls, first: FirstEdge) -> Path:
+        """Paths on the first edges: copies, because the loop changes the arrays."""
+        own = (getattr(first, field.name) for field in fields(Edge))
+        copies = (type(value)(value) for value in own)
+        carried = dr.zeros(mi.UnpolarizedSpectrum, dr.width(first.throughput))
+        return cls(*copies, mi.UInt32(0), mi.Float(1), mi.UInt32(0), mi.Bool(False), carried, mi.Float(1))
+
+
+@dataclass
+class Hit:
+    """Surfaces that paths hit.
+
+    ``si``; ``bsdf`` with its ``flags``; ``side``, ``minorant``: see :mod:`vpl.transport.minorant`; ``hidden``: whether
+    the surface is an emitter hidden from the camera; ``goes_on``: whether the path may continue; ``smooth``: whether
+    the path continues at a BSDF with a density.
+    """
+
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    flags: mi.UInt32
+    side: mi.Float
+    minorant: mi.UnpolarizedSpectrum
+    hidden: mi.Bool
+    goes_on: mi.Bool
+    smooth: mi.Bool
+
+    @classmethod
+    def of(cls, scene, path: Path, settings: PathSettings) -> Hit:
+        """Intersect the rays with the scene."""
+        si = scene.ray_intersect(path.ray, mi.RayFlags.All, coherent=path.depth == 0, active=path.active)
+        bsdf, hidden = si.bsdf(path.ray), mi.Bool(False)
+        if settings.hide_emitters:
+            from_camera = path.active & (path.depth == 0) & (path.state == State.SEEKING)
+            from_camera &= settings.gathering != Gathering.PLACING
+            hidden = from_camera & (~si.is_valid() | si.shape.is_emitter())
+        goes_on = path.active & si.is_valid() & (path.depth + 1 < settings.max_depth) & ~hidden
+        flags, side = bsdf.flags(), side_of(si)
+        smooth = goes_on & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+        minorant = minorant_of(si, bsdf, side, settings.perturbed, smooth & (settings.gathering >= path.state))
+        return cls(si, bsdf, flags, side, minorant, hidden, goes_on, smooth)
+
+    @property
+    def is_diffuse(self) -> mi.Bool:
+        """Whether the BSDF has only a diffuse lobe."""
+        return is_diffuse(self.flags)
+
+
+@dataclass
+class Traced:
+    """Result of :func:`trace_paths`, one record per lane, evaluated.
+
+    ``radiance``; ``drawn``: a contribution over its probability, from a path of ``length`` edges to an emitter of
+    ``group``; ``seen``: emission at the end of the first edge, mean over channels; ``difference``: contributions of the
+    emitter samples with even numbers at the first scattering vertex less those with odd numbers, mean over channels;
+    ``valid``: whether a surface counts in the film's alpha; ``edges`` without the last; ``gathered``: gather vertices.
+    """
+
+    radiance: mi.UnpolarizedSpectrum
+    drawn: mi.UnpolarizedSpectrum
+    length: mi.UInt32
+    group: mi.UInt32
+    seen: mi.Float
+    difference: mi.Float
+    valid: mi.Bool
+    edges: mi.UInt32
+    gathered: Gathered
