@@ -75,16 +75,16 @@ class ManyLightsIntegrator(PassRenderer):
     emitter.  Environments, directional emitters, and meshes with vertex normals other than their geometric normals are
     traced.
 
-    **Direct light.** Where small emitters, penumbras or the choice among emitters make the noise at x1, the pixel takes
-    up to 16 emitter samples there instead of one, by the difference of two samples that the pilot measures.  A sample
-    costs a shadow ray.  ``statistics`` holds the mean number, ``emitter_samples``.
+    **Direct light.** Where small emitters, penumbras or the choice among emitters make the noise, a pixel takes up to
+    16 emitter samples at the first surface that scatters, by the difference of two samples that the pilot measures.
+    A further sample costs a shadow ray.  ``statistics`` holds the mean number, ``emitter_samples``.
 
-    **Decisions.** A pilot of a 36th of the camera rays (a 16th in raw images), a smaller part in long renders, decides
-    whether virtual lights pay, how many there are, where they lie, and how many samples of a pixel they light.  Without
-    lights, ``manylights`` is ``path`` with stratified samples.  The decision is in ``statistics``, in the log (level
-    Info) and in the files that the command writes.  It depends on the seed and the limit of time, not on the clock.
-    The passes of ``manylights.render`` and of the command share the pilot of the first pass; each pass draws its own
-    lights.
+    **Decisions.** A pilot of a 36th of the camera rays (a 16th in raw images), a smaller part in long renders,
+    decides whether virtual lights pay, how many there are, where they lie, and how many samples of a pixel they
+    light.  Without lights, ``manylights`` is ``path`` with stratified samples and more emitter samples.  The
+    decision is in ``statistics``, in the log (level Info) and in the files that the command writes.  It depends on
+    the seed and the limit of time, not on the clock.  The passes of ``manylights.render`` and of the command share
+    the pilot of the first pass; each pass draws its own lights.
 
     **Gradients.** ``mi.render(scene, params, integrator=...)`` has gradients in ``*_ad_*`` variants.  The image is that
     of ``manylights``, and its derivatives are those of ``prb`` with the same ``max_depth``, ``rr_depth`` and

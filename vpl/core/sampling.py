@@ -71,15 +71,16 @@ def stratified(sampler, count: int, first: int, total: int):
     return dr.minimum(sample, dr.one_minus_epsilon(mi.Float))
 
 
-# Steps of the additive recurrences: powers of 1/g, where g is the root of g^4 = g + 1, the 3D golden ratio
-_STEPS = [int(2**32 * 1.2207440846057596**-k) for k in (1, 2, 3)]
+# Steps of the additive recurrences: powers of 1/g, where g is the root of g^4 = g + 1, the 3D golden ratio [Roberts
+# 2018, "The unreasonable effectiveness of quasirandom sequences"]
+SPREAD_STEPS = tuple(1.2207440846057596**-k for k in (1, 2, 3))
 
 
 class SpreadSamples:
     """Low-discrepancy sequences in the unit cube, one per lane, with less variance than independent samples.
 
-    An additive recurrence [Roberts 2018, "The unreasonable effectiveness of quasirandom sequences"] with a random start
-    [Cranley and Patterson 1976], so that each single number is uniform. ``start``: Vector3u, multiples of 2^-32.
+    An additive recurrence with the steps :data:`SPREAD_STEPS` and a random start [Cranley and Patterson 1976], so that
+    each single number is uniform. ``start``: Vector3u, multiples of 2^-32.
     """
 
     def __init__(self, start):
@@ -101,7 +102,8 @@ class SpreadSamples:
     def at(self, number) -> mi.Point3f:
         """Element ``number`` (UInt32) of each sequence, in [0, 1)^3."""
         # Fixed-point fractions wrap around without rounding; their upper 24 bits convert to a float below 1
-        members = (start + number * mi.UInt32(step) for start, step in zip(self.start, _STEPS, strict=True))
+        steps = (mi.UInt32(int(2**32 * step)) for step in SPREAD_STEPS)
+        members = (start + number * step for start, step in zip(self.start, steps, strict=True))
         return mi.Point3f(*(mi.Float(member >> 8) * 2.0**-24 for member in members))
 
 

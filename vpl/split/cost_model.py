@@ -15,8 +15,11 @@ import math
 from dataclasses import dataclass, field, fields, replace
 
 
-def _constant(default: float, unit: str, meaning: str, evidence: str, most: float = math.inf) -> float:
-    return field(default=default, metadata={"unit": unit, "meaning": meaning, "evidence": evidence, "most": most})
+def _constant(
+    default: float, unit: str, meaning: str, evidence: str, most: float = math.inf, least: float = 0
+) -> float:  # fmt: skip
+    about = {"unit": unit, "meaning": meaning, "evidence": evidence, "most": most, "least": least}
+    return field(default=default, metadata=about)
 
 
 _SENSITIVITY = "benchmarks/cost_model.py"
@@ -214,7 +217,7 @@ class CostModel:
         0.7,
         "exponent",
         "The same power of the variance where the number of emitter samples is chosen: direct light makes more of the "
-        "noise that a denoiser removes.",
+        "noise that a denoiser removes. Between the measured values.",
         "denoised error, 10 s, two images, over that with one sample, with 0.45 and 1: dining_room 0.88, 0.80, "
         "bistro_interior 0.85, 0.91, living_room 1.00, 1.01, kitchen 1.11, 0.96, staircase2 1.05, 1.01, sponza_crytek "
         "0.88, 0.85",
@@ -271,7 +274,11 @@ class CostModel:
     )
     most_emitter_points: int = _constant(200_000, "points", "Largest number of lights on area emitters.", _SENSITIVITY)
     most_emitter_samples: int = _constant(
-        16, "samples", "Most emitter samples at the first scattering vertex of a path.", _SENSITIVITY
+        16,
+        "samples",
+        "Most emitter samples at the first scattering vertex of a path.",
+        "mean numbers at 96 samples: dining_room 4.7, bistro_interior 4.1, living_room 2.4",
+        least=1,
     )
     least_vertices: float = _constant(
         1 / 8, "fraction", "Least fraction of a pixel's samples that are lit.", _SENSITIVITY, most=1
@@ -325,9 +332,9 @@ class CostModel:
 
     def __post_init__(self):
         for one in fields(self):
-            value, most = getattr(self, one.name), one.metadata["most"]
-            if not 0 <= value <= most:
-                limit = "at least 0" if most == math.inf else f"from 0 to {most:g}"
+            value, least, most = getattr(self, one.name), one.metadata["least"], one.metadata["most"]
+            if not least <= value <= most:
+                limit = f"at least {least:g}" if most == math.inf else f"from {least:g} to {most:g}"
                 raise ValueError(f"{one.name} must be {limit}, got {value!r}")
 
 

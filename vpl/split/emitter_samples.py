@@ -7,7 +7,8 @@ the numbers with the least predicted variance × cost.
 
 A pixel takes m s samples, rounded, from one to a largest number.  s is the expected difference of two samples, relative
 to the brightness of the pixel: for a fixed cost, numbers in proportion to the standard deviation leave the least
-variance [Neyman 1934].  The multiple m is the same in the whole image.
+variance [Neyman 1934].  s is a mean of absolute values instead, on which single paths have less influence.  The
+multiple m is the same in the whole image.
 
 Stratified samples of a pixel remove a part of the noise as well.  :func:`retained_fraction` measures the fraction that
 remains, with groups of paths that are stratified like those of a pixel.
@@ -29,19 +30,20 @@ from .pilot import Pilot, error_scale, means_of_others, pixel_means
 from .pixel_rays import RayNumbers
 from .view import Stream, View, ViewLights
 
-# Candidate multiples, powers of two at half steps; 0 for one sample everywhere
+# Candidate multiples, powers of two at half steps; 0 for one sample everywhere. Expected differences of 0.01 to 10 get
+# the largest number by one of them
 _MULTIPLES = np.concatenate([[0.0], 2.0 ** np.arange(-3, 7, 0.5)])
-# Paths of a group that measures the effect of stratification, and largest number of groups. Larger groups retain as
-# much: 8, 32, 64 paths 0.76, 0.64, 0.77 (dining_room), 0.82, 0.70, 0.72 (bistro_interior), 0.45, 0.39, 0.53 (kitchen)
+# Paths of a group that measures the effect of stratification, and largest number of groups. What 8 paths retain, 64
+# nearly retain, too (decisions.md)
 _GROUP, _GROUPS = 16, 1024
 
 
 @dataclass(frozen=True)
-class Samples:
-    """Choice of a ``multiple``: the relative variance ``left`` of a path, and the ``cost`` of a path."""
+class SampleChoice:
+    """A ``multiple``, the fraction of the variance of a path that ``remains``, and the ``cost`` of a path."""
 
     multiple: float
-    left: float
+    remains: float
     cost: float
 
 
@@ -49,9 +51,10 @@ class Samples:
 class EmitterSamples:
     """Effect of more emitter samples in the image of a pilot.
 
-    ``whole``: relative variance of a path due to one sample, not stratified; ``removed`` (m,): part of it that each
-    candidate multiple removes; ``added`` (m,): mean number of samples added to a path; ``expected`` (pixels,): expected
-    relative difference of two samples; ``fraction``: of the variance that stratified samples retain.
+    ``whole``: relative variance of a path due to one sample, not stratified, as if two samples were independent;
+    ``removed`` (m,): part of it that each candidate multiple removes; ``added`` (m,): mean number of samples added to a
+    path; ``expected`` (pixels,): expected relative difference of two samples; ``fraction``: of the variance that
+    stratified samples retain.
     """
 
     whole: float
@@ -68,27 +71,30 @@ class EmitterSamples:
         relative = np.abs(difference) / error_scale(pilot.brightness, model)
         # Without the path itself and its neighbour: otherwise, the prediction would be too good
         others, priors = means_of_others(relative, pilot.pixel, *pilot.size, model)
-        number = _numbers(_MULTIPLES[:, None] * others, model)
         # The largest ones are left out, as in the variance of a path
         kept = np.argsort(relative)[: len(relative) - model.left_out(len(relative))]
         # Twice the mean square of half of the difference
         variance = 2 * relative[kept] ** 2
-        removed = np.mean(variance * (1 - 1 / number[:, kept]), axis=1)
+        removed, added = np.zeros(len(_MULTIPLES)), np.zeros(len(_MULTIPLES))
+        for k, multiple in enumerate(_MULTIPLES):
+            number = _numbers(multiple * others, model)
+            removed[k], added[k] = np.mean(variance * (1 - 1 / number[kept])), np.mean(number - 1)
         expected = pixel_means(relative, pilot.pixel, *pilot.size, priors)
-        return cls(float(np.mean(variance)), removed, np.mean(number - 1, axis=1), expected, fraction, model)
+        return cls(float(np.mean(variance)), removed, added, expected, fraction, model)
 
     def retained(self, samples: int) -> float:
         """Fraction of the variance that so many stratified samples retain."""
         return self.fraction ** min(np.log(max(samples, 1)) / np.log(_GROUP), 1)
 
-    def best(self, variance: float, cost: float, samples: int) -> Samples:
+    def best(self, variance: float, cost: float, samples: int) -> SampleChoice:
         """The choice with the least variance × cost, in images that are denoised with a power of the variance, for
         paths of a relative ``variance`` and a ``cost``, of which a pixel has so many ``samples``."""
         # All of the noise may be that of emitter samples, but not more
         of_samples = min(self.retained(samples), variance / self.whole) if self.whole > 0 else 0.0
         left, costs = variance - of_samples * self.removed, cost + self.model.emitter_sample_cost * self.added
         chosen = int(np.argmin(left**self.model.samples_power * costs))
-        return Samples(float(_MULTIPLES[chosen]), float(left[chosen]), float(costs[chosen]))
+        remains = left[chosen] / variance if variance > 0 else 1.0
+        return SampleChoice(float(_MULTIPLES[chosen]), float(remains), float(costs[chosen]))
 
     def numbers(self, multiple: float) -> np.ndarray:
         """Number of samples in each pixel, (pixels,) uint32."""
@@ -105,6 +111,8 @@ def retained_fraction(view: View) -> float:
     The view has :data:`PILOT_SAMPLES` samples at these vertices.  Half of their difference has the mean 0.  The mean
     square of its sum over a group, over the sum of its mean squares, is 1 for independent samples.
     """
+    if view.model.most_emitter_samples == 1:
+        return 1.0
     size = min(_GROUP, view.count)
     groups = max(min(_GROUPS, view.model.pilot_size(view.planned_count) // size), 1)
     first = np.arange(groups) * (view.count // size) // groups * size
@@ -113,8 +121,7 @@ def retained_fraction(view: View) -> float:
     places = RayNumbers.of_lanes(dr.arange(mi.UInt32, len(lane)), size)
     rays = replace(CameraRays.of(view, upload(mi.UInt32, lane)), places=places, sizes=(size,), cells=1)
     dr.eval(rays.places)
-    # The second edge is that of the emitter
-    settings = replace(view.settings(ViewLights()), max_depth=dr.opaque(mi.UInt32, 2))
+    settings = view.settings(ViewLights())
     traced = rays.trace(view.scene, view.emitters, derived_seed(view.seed, Stream.STRATA), settings)
     difference, radiance = (
         np.nan_to_num(download(x).astype(np.float64), posinf=0, neginf=0).reshape(groups, size)

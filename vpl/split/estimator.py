@@ -94,8 +94,8 @@ def decide(view: View, start: Start) -> Decision:
 
 def with_emitter_samples(view: View, decision: Decision) -> tuple[View, dict]:
     """(View with numbers of emitter samples; their mean, as a statistic)."""
-    numbers = decision.effect.numbers(decision.samples.multiple)
-    return replace(view, direct_samples=upload(mi.UInt32, numbers)), {"emitter_samples": float(np.mean(numbers))}
+    numbers = decision.effect.numbers(decision.emitter_samples.multiple)
+    return replace(view, direct_samples=upload(mi.UInt32, numbers)), {"emitter_samples": f"{np.mean(numbers):.3g}"}
 
 
 def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
@@ -111,9 +111,8 @@ def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
     multiple = best_multiple(relative * predicted, relative * onward.sent, onward.edges, paths, whole, model)
     if not np.isfinite(multiple):
         return view, {}
-    if decision.plan.gathers:
-        # The less variance remains, the more a contribution matters
-        multiple *= (whole / max(decision.plan.variance, 1e-9)) ** 0.5
+    # The less variance remains, the more a contribution matters
+    multiple *= (whole / max(decision.variance, 1e-9)) ** 0.5
     importance = upload(mi.Float, multiple / error_scale(of_pixels, model))
     return replace(view, outgoing=outgoing, importance=importance), {"roulette": f"{multiple:.3g}"}
 

@@ -25,6 +25,7 @@ import mitsuba as mi
 
 from ..core.arrays import LARGEST_VALUE, channel_mean, select_record
 from ..core.loops import recorded_once
+from ..core.sampling import SPREAD_STEPS
 from ..direct.emitter_sampling import power_heuristic
 from ..points.camera_paths import SceneTraits
 from ..transport.carried_share import carried_share
@@ -36,9 +37,6 @@ from .lattice import Lattice
 from .path_state import Hit, Path, Traced
 from .roulette import residual_survival, throughput_survival
 from .view import FirstEdge, Gathering, PathSettings, State
-
-# The golden ratio less one: multiples are spread evenly modulo 1
-_GOLDEN = (5**0.5 - 1) / 2
 
 
 @recorded_once
@@ -62,7 +60,7 @@ def trace_paths(
 
         # ---------------------- Emission, by BSDF sampling ----------------------
         met = emitters.met(path.vertex, path.cell, path.ray, hit.si, ~path.delta, path.active & ~hit.hidden)
-        mis = power_heuristic(path.density, met.density * mi.Float(path.samples))
+        mis = power_heuristic(path.density, met.density * mi.Float(path.emitter_samples))
         emission = _less_carried(path, met, settings) * met.radiance * mis
         found.add(emission, path.depth + 1, met.group, sampler.next_1d(), lane)
         seen += dr.select(path.depth == 0, channel_mean(emission), 0)
@@ -78,17 +76,17 @@ def trace_paths(
         hit.goes_on &= settings.gathering != Gathering.PLACING
         hit.smooth &= hit.goes_on
 
-        # ---------------------- Next-event estimation, and a sample of the BSDF ----------------------
+        # ---------------------- Next-event estimation, with a sample of the BSDF ----------------------
         path.scattered += dr.select(hit.smooth, 1, 0)
         samples = dr.select(hit.smooth & (path.scattered == 1), first.direct_samples, 1)
         cell = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side)
         numbers = lattice.at(path.depth)
-        turned, bsdf_weight, of_vertex = _light(
+        turned, bsdf_weight, of_vertex = _sample_emitters(
             scene, emitters, path, hit, weight, cell, samples, numbers, settings, sampler, found, lane
         )
         difference += of_vertex
 
-        # ---------------------- BSDF sampling ----------------------
+        # ---------------------- Onward by the sample of the BSDF ----------------------
         survival = _turn(path, hit, turned, bsdf_weight, gathers, weight, cell, samples, emitters.traits)
 
         # ---------------------- Russian roulette: residual of the direction, and throughput ----------------------
@@ -105,7 +103,7 @@ def trace_paths(
 
 
 @dr.syntax
-def _light(
+def _sample_emitters(
     scene, emitters: EmitterSampler, path: Path, hit: Hit, weight, cell, samples: mi.UInt32, numbers: tuple,
     settings: PathSettings, sampler, found: Contributions, lane,
 ):  # fmt: skip
@@ -114,7 +112,7 @@ def _light(
     ``numbers`` of the lattice; ``weight`` of the gather vertex.  Returns (sample of the BSDF; its weight; contributions
     of the samples with even numbers less those of the others, mean over channels, 0 for a single sample).
     """
-    context, count = mi.BSDFContext(), dr.width(cell)
+    context, count = mi.BSDFContext(), dr.width(lane)
     # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
     scatters, share = path.active & ~hit.hidden & (hit.goes_on | ~path.valid), dr.rcp(mi.Float(samples))
     turned, bsdf_weight = dr.zeros(mi.BSDFSample3f, count), dr.zeros(mi.Spectrum, count)
@@ -125,7 +123,7 @@ def _light(
             scene, emitters, path, hit, weight, cell, samples, numbers, settings, lane, context, scatters, share, edges
         ],
     ):  # fmt: skip
-        chosen, place, lobe, turn = _numbers_of_sample(numbers, number, share)
+        chosen, place, lobe, turn = _numbers_of_sample(numbers, number)
         sample = emitters.sample(hit.si, cell, chosen, sampler.next_1d(), place, hit.smooth)
         # A single call for both: each call adds the code of every material to the kernel
         toward = hit.si.to_local(sample.direction)
@@ -142,16 +140,18 @@ def _light(
     return turned, bsdf_weight, difference
 
 
-def _numbers_of_sample(numbers: tuple, number: mi.UInt32, share: mi.Float) -> tuple:
-    """The ``numbers`` of a vertex for one of 1 / ``share`` emitter samples: those for the emitter and the point on it
-    are shifted, so that they are spread over the samples like a lattice.  The BSDF is sampled once."""
+def _numbers_of_sample(numbers: tuple, number: mi.UInt32) -> tuple:
+    """The ``numbers`` of a vertex for one of its emitter samples: those for the emitter and the point on it are
+    shifted, so that they are spread over the samples, and two samples choose different emitters.  The BSDF is sampled
+    once."""
 
     def shifted(value, step):
         moved = value + mi.Float(number) * step
         return dr.minimum(moved - dr.floor(moved), dr.one_minus_epsilon(mi.Float))
 
-    chosen, place, lobe, turn = numbers
-    return shifted(chosen, share), mi.Point2f(shifted(place.x, share), shifted(place.y, _GOLDEN)), lobe, turn
+    # The last step is almost one half
+    (chosen, place, lobe, turn), (*of_place, half) = numbers, SPREAD_STEPS
+    return shifted(chosen, half), mi.Point2f(*map(shifted, place, of_place)), lobe, turn
 
 
 def _less_carried(path: Path, met: MetEmitter, settings: PathSettings):
@@ -271,7 +271,7 @@ def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight, cell, samples,
         told = mi.unpolarized_spectrum(hit.bsdf.eval_null_transmission(hit.si, null & path.active))
         turns = ~(null & (dr.max(told) > 0))
     path.vertex, path.cell = dr.select(turns, hit.si.p, path.vertex), dr.select(turns, cell, path.cell)
-    path.samples = dr.select(turns, samples, path.samples)
+    path.emitter_samples = dr.select(turns, samples, path.emitter_samples)
     path.density, path.delta = dr.select(turns, bs.pdf, path.density), dr.select(turns, delta, path.delta)
     path.depth += dr.select(hit.goes_on, 1, 0)
     return survival

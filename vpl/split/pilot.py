@@ -137,13 +137,18 @@ class Pilot:
 
         The means reach beyond single pixels: with the emission of a small lamp, pixels beside it would count as bright.
         """
-        values = self.radiance - self.seen
+        values = self._of_both - self.seen
         means, priors = means_of_others(values, self.pixel, *self.size, self.model)
         return means, pixel_means(values, self.pixel, *self.size, priors)
 
     @cached_property
     def _of_others(self) -> tuple[np.ndarray, list[float]]:
-        return means_of_others(self.radiance, self.pixel, *self.size, self.model)
+        return means_of_others(self._of_both, self.pixel, *self.size, self.model)
+
+    @property
+    def _of_both(self) -> np.ndarray:
+        """Radiance (n,) with both emitter samples at the first scattering vertex."""
+        return self.radiance - self.difference
 
 
 def pilot_lanes(view: View) -> np.ndarray:
@@ -152,12 +157,13 @@ def pilot_lanes(view: View) -> np.ndarray:
 
 
 def single_sample_radiance(traced: Traced) -> np.ndarray:
-    """Radiance of the paths of a pilot with the first emitter sample at each vertex, mean over channels (n,), float64;
-    0 where it is not finite.
+    """Radiance of the paths of a pilot with the first emitter sample at each vertex alone, mean over channels (n,),
+    float64; 0 where it is not finite.
 
-    The radiance of a path is the mean of that with either of the samples.
+    The traced radiance is the mean of that with either sample, with the weights of two samples beside those of the
+    BSDF.
     """
-    return _finite(channel_mean(traced.radiance)) + _finite(traced.difference)
+    return _finite(channel_mean(traced.radiance) + traced.difference)
 
 
 def _finite(values: mi.Float) -> np.ndarray:

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from .cost_model import CostModel
-from .emitter_samples import EmitterSamples, Samples
+from .emitter_samples import EmitterSamples, SampleChoice
 from .pilot import Pilot, relative_variance
 from .view import ViewLights
 
@@ -168,19 +168,25 @@ class Decision:
         return self.effects[self.plan.emitters]
 
     @cached_property
-    def samples(self) -> Samples:
+    def emitter_samples(self) -> SampleChoice:
         """Choice of the numbers of emitter samples."""
-        return self._samples(self.evidence, self.plan)
+        return self._emitter_samples(self.evidence, self.plan)
 
-    def _samples(self, evidence: Evidence, plan: Plan) -> Samples:
+    def _emitter_samples(self, evidence: Evidence, plan: Plan) -> SampleChoice:
         """Choice of the numbers of emitter samples for another size of the image and its plan.
 
-        Lights are chosen before.  Their choice counts the variance of direct light by constants, this one at least as
-        much as measured.
+        Lights are chosen before, with the variance of direct light by constants.  Here it counts at least as much as
+        measured.
         """
-        effect, variance = self.effects[plan.emitters], plan.variance if plan.gathers else evidence.whole
-        more = max(effect.retained(evidence.samples) - evidence.retained, 0)
-        return effect.best(variance + more * evidence.relative(evidence.direct), plan.cost, evidence.samples)
+        effect, variance = self.effects[plan.emitters], _remaining(evidence, plan)
+        direct = min(evidence.relative(evidence.direct), variance / evidence.retained)
+        variance += max(effect.retained(evidence.samples) - evidence.retained, 0) * direct
+        return effect.best(variance, plan.cost, evidence.samples)
+
+    @property
+    def variance(self) -> float:
+        """Relative variance of a camera path that remains, without that of lights."""
+        return _remaining(self.evidence, self.plan) * self.emitter_samples.remains
 
     def expected_light(self, lights: ViewLights) -> np.ndarray:
         """Expected radiance of ``lights`` in each pixel of the view, (pixels,)."""
@@ -196,8 +202,6 @@ class Decision:
 
         ``rays``: shadow rays of a pixel's cuts in this pass, None for the expected number.
         """
-        if not self.options:
-            return 1.0
         paths = round(self.evidence.paths * samples / self.evidence.samples)
         other = replace(self.evidence, paths=paths, samples=samples)
         excess = rays / self.plan.rays - 1 if rays is not None and self.plan.rays else 0.0
@@ -208,7 +212,7 @@ class Decision:
     def _cost(self, evidence: Evidence, plan: Plan, excess: float) -> float:
         """Cost of a path whose cuts take 1 + ``excess`` times the expected shadow rays."""
         of_cuts = self.evidence.model.ray_cost * plan.rays / evidence.samples
-        return self._samples(evidence, plan).cost + excess * of_cuts
+        return self._emitter_samples(evidence, plan).cost + excess * of_cuts
 
     def precision(self, samples: int) -> float:
         """Expected inverse of the relative variance of a pixel with ``samples``; ``samples`` for a black image.
@@ -216,8 +220,13 @@ class Decision:
         Independent of the random numbers of passes that share the start of an earlier pass, so it may weight them in a
         mean.  The first pass shares its camera rays with the pilot, and no other random numbers.
         """
-        variance = self.samples.left + self.plan.of_lights
+        variance = self.variance + self.plan.of_lights
         return samples / variance if variance > 0 else float(samples)
+
+
+def _remaining(evidence: Evidence, plan: Plan) -> float:
+    """Relative variance of a path with one emitter sample at each vertex that remains with a plan."""
+    return plan.variance if plan.gathers else evidence.whole
 
 
 def choose(evidence: Evidence, options: list[Option], measures: bool = True) -> Plan:

@@ -75,11 +75,14 @@ def make_start(view: View, virtual_lights: bool) -> Start:
     """Trace the pilot of a view, and learn from it.  ``virtual_lights``: whether virtual lights are allowed."""
     view = replace(view, direct_samples=dr.opaque(mi.UInt32, PILOT_SAMPLES, view.pixels))
     (pilot, learned), refusal = learning_pilot(view), _refusal(view, virtual_lights)
-    fraction = retained_fraction(view)
-    effects, options = {False: EmitterSamples.of(pilot, pilot.difference, fraction)}, []
+    # Paths whose samples never differ tell nothing
+    fraction = retained_fraction(view) if pilot.difference.any() else 1.0
+    effect = EmitterSamples.of(pilot, pilot.difference, fraction)
+    options, effects = [], {False: effect, True: effect}
     if not refusal:
         options, difference = _options(view, pilot)
-        effects[True] = EmitterSamples.of(pilot, difference, fraction)
+        if difference is not None:
+            effects[True] = EmitterSamples.of(pilot, difference, fraction)
     return Start(pilot, view.emitters, learned, options, refusal, effects, view.learning_count, view.seed)
 
 
@@ -135,11 +138,11 @@ def _refusal(view: View, virtual_lights: bool) -> str:
     return ""
 
 
-def _options(view: View, pilot: Pilot) -> tuple[list[Option], np.ndarray]:
+def _options(view: View, pilot: Pilot) -> tuple[list[Option], np.ndarray | None]:
     """(Kinds of virtual lights that are possible; difference of emitter samples where virtual lights represent
-    emitters)."""
+    emitters, None if they may not)."""
     if not _may_carry_emitters(view):
-        return _with_surfaces(view, pilot, ViewLights()), pilot.difference
+        return _with_surfaces(view, pilot, ViewLights()), None
     emitters = ViewLights(emitters=view.light_set([]), emitters_c=view.emitters_c)
     traced = Pilot.trace(view, emitters)
     only_emitters = Option(False, True, traced.radiance, traced.indirect)

@@ -92,7 +92,7 @@ class Edge:
 
     ``vertex``: origin; ``ray``; ``throughput``: β; ``density`` of the direction, 1 / sr; ``delta``: whether the
     direction has no density; ``state``: a :class:`State`; ``cell`` of the origin, see
-    :class:`vpl.split.emitters.base.EmitterSampler`; ``samples``: number of emitter samples at the origin;
+    :class:`vpl.split.emitters.base.EmitterSampler`; ``emitter_samples``: their number at the origin;
     ``importance``: see :meth:`vpl.split.roulette.OutgoingRadiance.survival`; ``active``.
     """
 
@@ -103,7 +103,7 @@ class Edge:
     delta: mi.Bool
     state: mi.UInt32
     cell: mi.UInt32
-    samples: mi.UInt32
+    emitter_samples: mi.UInt32
     importance: mi.Float
     active: mi.Bool
 
@@ -125,7 +125,7 @@ class FirstEdge(Edge):
 
     @classmethod
     def of(
-        cls, vertex, ray, throughput, density, delta: bool, state: int, cell, importance, active, direct_samples=1
+        cls, vertex, ray, throughput, density, delta: bool, state: int, cell, importance, active, direct_samples
     ) -> FirstEdge:  # fmt: skip
         """Rays whose directions have a ``density``."""
         count = dr.width(ray.d)
