@@ -30,8 +30,8 @@ with_and_without_lights = pytest.mark.parametrize("lights", LIGHTS.values(), ids
 
 @pytest.fixture(autouse=True)
 def lights_cost_nothing():
-    """Let virtual lights pay in small images, with cuts that leave the noise to the paths."""
-    with plugin_with_model(pays_below=1e30, fewest_light_paths=1000, coarsest_error=0.1):
+    """Let virtual lights pay in small images, with cuts that leave the noise to paths with one emitter sample."""
+    with plugin_with_model(pays_below=1e30, fewest_light_paths=1000, coarsest_error=0.1, most_emitter_samples=1):
         yield
 
 
