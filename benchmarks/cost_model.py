@@ -34,7 +34,7 @@ FACTORS = (0.5, 2.0)
 # Parts of the definition of the error, and constants of denoised images
 FIXED = (
     "trimmed", "black", "shared", "pilot_share", "small_pilot", "c_per_spacing", "root_from", "most_pilot_rays",
-    "spread", "noise_of_lights", "chosen_ray_cost", "samples_power",
+    "spread", "noise_of_lights", "chosen_ray_cost", "samples_power", "emitter_samples_from",
 )  # fmt: skip
 # Of a pixel, relative to the mean of the image: twice the rounding of sums over threads is far below
 LARGEST_DIFFERENCE = 1e-4

@@ -77,7 +77,8 @@ class ManyLightsIntegrator(PassRenderer):
 
     **Direct light.** Where small emitters, penumbras or the choice among emitters make the noise, a pixel takes up to
     16 emitter samples at the first surface that scatters, by the difference of two samples that the pilot measures.
-    A further sample costs a shadow ray.  ``statistics`` holds the mean number, ``emitter_samples``.
+    A further sample costs a shadow ray.  ``statistics`` holds the mean number, ``emitter_samples``.  Images that are
+    denoised take one sample if fewer than 64 samples of a pixel are expected.
 
     **Decisions.** A pilot of a 36th of the camera rays (a 16th in raw images), a smaller part in long renders,
     decides whether virtual lights pay, how many there are, where they lie, and how many samples of a pixel they

@@ -108,8 +108,8 @@ def _numbers(wanted: np.ndarray, model: CostModel) -> np.ndarray:
 def retained_fraction(view: View) -> float:
     """Fraction of the variance of the emitter samples at first scattering vertices that stratified samples retain.
 
-    The view has :data:`PILOT_SAMPLES` samples at these vertices.  Half of their difference has the mean 0.  The mean
-    square of its sum over a group, over the sum of its mean squares, is 1 for independent samples.
+    The view has :data:`vpl.split.pilot.PILOT_SAMPLES` samples at these vertices.  Half of their difference has the mean
+    0.  The mean square of its sum over a group, over the sum of its mean squares, is 1 for independent samples.
     """
     if view.model.most_emitter_samples == 1:
         return 1.0

@@ -73,9 +73,10 @@ class Start:
 
 def make_start(view: View, virtual_lights: bool) -> Start:
     """Trace the pilot of a view, and learn from it.  ``virtual_lights``: whether virtual lights are allowed."""
-    view = replace(view, direct_samples=dr.opaque(mi.UInt32, PILOT_SAMPLES, view.pixels))
+    if view.learning_count >= view.model.emitter_samples_from * view.pixels:
+        view = replace(view, direct_samples=dr.opaque(mi.UInt32, PILOT_SAMPLES, view.pixels))
     (pilot, learned), refusal = learning_pilot(view), _refusal(view, virtual_lights)
-    # Paths whose samples never differ tell nothing
+    # Single samples, and samples that never differ, tell nothing
     fraction = retained_fraction(view) if pilot.difference.any() else 1.0
     effect = EmitterSamples.of(pilot, pilot.difference, fraction)
     options, effects = [], {False: effect, True: effect}

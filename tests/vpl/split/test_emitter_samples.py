@@ -150,6 +150,13 @@ def test_layers_sum_to_the_image(four_samples):
     assert_sums(image, layers)
 
 
+@pytest.mark.parametrize(("denoised", "spp", "more"), [(True, 16, False), (True, 64, True), (False, 16, True)])
+def test_denoised_images_of_few_samples_take_one(denoised, spp, more):
+    scene = mi.load_dict(closed_box({f"lamp{n}": lamp for n, lamp in enumerate(_small_lamps())}, 16))
+    _, statistics = render_with_statistics("manylights", scene, spp, max_depth=2, hide_emitters=True, denoised=denoised)
+    assert (statistics["emitter_samples"] != "1") == more
+
+
 def test_one_sample_is_the_least():
     with pytest.raises(ValueError, match="most_emitter_samples must be at least 1, got 0"):
         CostModel(most_emitter_samples=0)
