@@ -76,16 +76,14 @@ class ManyLightsIntegrator(PassRenderer):
     traced.
 
     **Direct light.** Where small emitters, penumbras or the choice among emitters make the noise, a pixel takes up to
-    16 emitter samples at the first surface that scatters, by the difference of two samples that the pilot measures.
-    A further sample costs a shadow ray.  ``statistics`` holds the mean number, ``emitter_samples``.  Images that are
-    denoised take one sample if fewer than 64 samples of a pixel are expected.
+    16 emitter samples at the first surface that scatters, by the difference of two samples of the pilot.
+    ``statistics`` holds the mean, ``emitter_samples``.  Denoised images of fewer than 64 expected samples take one.
 
-    **Decisions.** A pilot of a 36th of the camera rays (a 16th in raw images), a smaller part in long renders,
-    decides whether virtual lights pay, how many there are, where they lie, and how many samples of a pixel they
-    light.  Without lights, ``manylights`` is ``path`` with stratified samples and more emitter samples.  The
-    decision is in ``statistics``, in the log (level Info) and in the files that the command writes.  It depends on
-    the seed and the limit of time, not on the clock.  The passes of ``manylights.render`` and of the command share
-    the pilot of the first pass; each pass draws its own lights.
+    **Decisions.** A pilot of a 36th of the camera rays (a 16th in raw images), less in long renders, decides whether
+    virtual lights pay, their number and places, and how many samples of a pixel they light.  Without lights,
+    ``manylights`` is ``path`` with stratified and more emitter samples.  The decision is in ``statistics``, in the log
+    (level Info) and in the files of the command.  It depends on the seed and the limit of time, not on the clock.  The
+    passes of ``manylights.render`` and of the command share the pilot of the first pass; each draws its own lights.
 
     **Gradients.** ``mi.render(scene, params, integrator=...)`` has gradients in ``*_ad_*`` variants.  The image is that
     of ``manylights``, and its derivatives are those of ``prb`` with the same ``max_depth``, ``rr_depth`` and
@@ -332,9 +330,9 @@ class ManyLightsIntegrator(PassRenderer):
         emitters = known.emitters if known else emitter_sampler(scene, learning_rays(learning), groups)
         return View(
             scene, emitters, Perturbed(scene), PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray,
-            active, cells.width, cells.rays, seed, dr.opaque(mi.Float, 1.0, pixels),
-            dr.opaque(mi.UInt32, 1, pixels), OutgoingRadiance.unknown(),
-            learning, planned, self.cost_model if self.denoised else self.cost_model.without_denoiser(),
+            active, cells.width, cells.rays, seed, dr.opaque(mi.Float, 1.0, pixels), dr.opaque(mi.UInt32, 1, pixels),
+            OutgoingRadiance.unknown(), learning, planned,
+            self.cost_model if self.denoised else self.cost_model.without_denoiser(),
             Layers(bool(self.layers), emitters.groups),
         )  # fmt: skip
 

@@ -22,11 +22,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, download, upload
+from ..core.arrays import channel_mean, upload
 from ..core.sampling import derived_seed
 from .camera_rays import CameraRays
 from .cost_model import CostModel
-from .pilot import Pilot, error_scale, means_of_others, pixel_means
+from .pilot import Pilot, error_scale, finite, means_of_others, pixel_means
 from .pixel_rays import RayNumbers
 from .view import Stream, View, ViewLights
 
@@ -111,24 +111,16 @@ def retained_fraction(view: View) -> float:
     The view has :data:`vpl.split.pilot.PILOT_SAMPLES` samples at these vertices.  Half of their difference has the mean
     0.  The mean square of its sum over a group, over the sum of its mean squares, is 1 for independent samples.
     """
-    if view.model.most_emitter_samples == 1:
-        return 1.0
-    size = min(_GROUP, view.count)
-    groups = max(min(_GROUPS, view.model.pilot_size(view.planned_count) // size), 1)
-    first = np.arange(groups) * (view.count // size) // groups * size
-    lane = (first[:, None] + np.arange(size)).reshape(-1)
+    lane = view.groups(min(_GROUPS * _GROUP, view.model.pilot_size(view.planned_count)), _GROUP)
     # Neighbouring pixels share a group where a pixel has few rays
-    places = RayNumbers.of_lanes(dr.arange(mi.UInt32, len(lane)), size)
-    rays = replace(CameraRays.of(view, upload(mi.UInt32, lane)), places=places, sizes=(size,), cells=1)
+    places = RayNumbers.of_lanes(dr.arange(mi.UInt32, len(lane)), _GROUP)
+    rays = replace(CameraRays.of(view, upload(mi.UInt32, lane)), places=places, sizes=(_GROUP,), cells=1)
     dr.eval(rays.places)
     settings = view.settings(ViewLights())
     traced = rays.trace(view.scene, view.emitters, derived_seed(view.seed, Stream.STRATA), settings)
-    difference, radiance = (
-        np.nan_to_num(download(x).astype(np.float64), posinf=0, neginf=0).reshape(groups, size)
-        for x in (traced.difference, channel_mean(traced.radiance))
-    )
+    difference, radiance = (finite(x).reshape(-1, _GROUP) for x in (traced.difference, channel_mean(traced.radiance)))
     relative = difference / error_scale(radiance.mean(1), view.model)[:, None]
     together, alone = np.sum(relative, axis=1) ** 2, np.sum(relative**2, axis=1)
-    kept = np.argsort(together + alone)[: groups - view.model.left_out(groups)]
+    kept = np.argsort(together + alone)[: len(alone) - view.model.left_out(len(alone))]
     whole = np.sum(alone[kept])
     return float(np.clip(np.sum(together[kept]) / whole, 0, 1)) if whole > 0 else 1.0

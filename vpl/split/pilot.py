@@ -88,9 +88,10 @@ class Pilot:
     @classmethod
     def of(cls, traced: Traced, view: View, pixel: np.ndarray) -> Pilot:
         """The pilot of traced paths in the pixels ``pixel`` (n,) of a view."""
-        radiance, seen, difference = single_sample_radiance(traced), _finite(traced.seen), _finite(traced.difference)
+        radiance, seen, difference = single_sample_radiance(traced), finite(traced.seen), finite(traced.difference)
+        both = finite(channel_mean(traced.radiance))
         edges = download(traced.edges).astype(np.int64)
-        arrivals, onward, indirect = _second_vertices(traced.gathered.second, radiance, difference, edges)
+        arrivals, onward, indirect = _second_vertices(traced.gathered.second, both, edges)
         first, facing = _first_vertices(traced.gathered.first)
         vertices = np.concatenate([first, arrivals.position]), np.concatenate([facing, arrivals.normal])
         size, seed = (view.width, view.pixels), derived_seed(view.seed, Stream.OCTREE)
@@ -153,7 +154,7 @@ class Pilot:
 
 def pilot_lanes(view: View) -> np.ndarray:
     """Indices (n,) of the camera rays of a pilot: pairs over the whole image."""
-    return view.pairs(view.model.pilot_size(view.planned_count))
+    return view.groups(view.model.pilot_size(view.planned_count), 2)
 
 
 def single_sample_radiance(traced: Traced) -> np.ndarray:
@@ -163,18 +164,18 @@ def single_sample_radiance(traced: Traced) -> np.ndarray:
     The traced radiance is the mean of that with either sample, with the weights of two samples beside those of the
     BSDF.
     """
-    return _finite(channel_mean(traced.radiance) + traced.difference)
+    return finite(channel_mean(traced.radiance) + traced.difference)
 
 
-def _finite(values: mi.Float) -> np.ndarray:
+def finite(values: mi.Float) -> np.ndarray:
+    """``values`` in double precision, (n,), 0 where they are not finite."""
     return np.nan_to_num(download(values).astype(np.float64), posinf=0, neginf=0)
 
 
-def _second_vertices(second: SecondVertices, radiance: np.ndarray, difference: np.ndarray, edges: np.ndarray):
+def _second_vertices(second: SecondVertices, radiance: np.ndarray, edges: np.ndarray):
     """(Arrivals, second vertices, radiance (n,) through arrivals) of paths."""
     position, normal, weight, throughput, before = (download(x) for x in vars(second).values())
-    # The radiance before the vertex is that with both emitter samples
-    beyond = np.maximum(radiance - difference - np.nan_to_num(before), 0)
+    beyond = np.maximum(radiance - np.nan_to_num(before), 0)
     known = np.isfinite(position).all(1)
     onward = (throughput > 0) & np.isfinite(throughput) & known
     path, throughput = np.flatnonzero(onward), throughput[onward].astype(np.float64)

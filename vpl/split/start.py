@@ -31,8 +31,8 @@ class Start:
     if ``learned``; ``options``: kinds of lights to compare, empty if ``refusal`` holds a reason against lights.
 
     ``effects`` of more emitter samples, with and without virtual lights that represent emitters; ``paths``: number of
-    camera rays that sized the learning; ``seed`` of the first pass; ``later``: samplers of
-    emitters by the size of passes, see :meth:`emitters_for`; ``known``: see :class:`vpl.split.plan.Evidence`.
+    camera rays that sized the learning; ``seed`` of the first pass; ``later``: samplers of emitters by the size of
+    passes, see :meth:`emitters_for`; ``known``: see :class:`vpl.split.plan.Evidence`.
     """
 
     pilot: Pilot
@@ -73,7 +73,8 @@ class Start:
 
 def make_start(view: View, virtual_lights: bool) -> Start:
     """Trace the pilot of a view, and learn from it.  ``virtual_lights``: whether virtual lights are allowed."""
-    if view.learning_count >= view.model.emitter_samples_from * view.pixels:
+    model = view.model
+    if model.most_emitter_samples > 1 and view.learning_count >= model.emitter_samples_from * view.pixels:
         view = replace(view, direct_samples=dr.opaque(mi.UInt32, PILOT_SAMPLES, view.pixels))
     (pilot, learned), refusal = learning_pilot(view), _refusal(view, virtual_lights)
     # Single samples, and samples that never differ, tell nothing

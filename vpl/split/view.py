@@ -214,11 +214,12 @@ class View:
         """Mean number of camera rays of a pixel."""
         return self.rays.mean
 
-    def pairs(self, most: int) -> np.ndarray:
-        """Indices of at most ``most`` rays in pairs of neighbours, evenly over the image; at least one pair."""
-        pairs = max(min(most, self.count) // 2, 1)
-        first = np.arange(pairs) * self.count // pairs // 2 * 2
-        return np.minimum(first[:, None] + [0, 1], self.count - 1).reshape(-1)
+    def groups(self, most: int, size: int) -> np.ndarray:
+        """Indices of at most ``most`` rays in groups of ``size`` neighbours, evenly over the image; at least one
+        group."""
+        groups = max(min(most, self.count) // size, 1)
+        first = np.arange(groups) * self.count // groups // size * size
+        return np.minimum(first[:, None] + np.arange(size), self.count - 1).reshape(-1)
 
     def light_set(self, groups: list[LightGroup]) -> LightSet:
         """The light set of ``groups`` in this view."""

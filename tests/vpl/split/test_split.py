@@ -244,7 +244,7 @@ def test_lights_of_a_node_are_drawn_by_their_share_of_its_intensity():
 @pytest.mark.parametrize("count", [2, 3, 4, 9, 1000, 131_072, 160_000, 163_839, 10**7])
 def test_the_pilot_has_pairs_all_over_the_image(count):
     view = SimpleNamespace(count=count)
-    rays = View.pairs(view, 1 << 15)
+    rays = View.groups(view, 1 << 15, 2)
     first, second = rays.reshape(-1, 2).T
     assert len(rays) <= max(1 << 15, 2) and (first % 2 == 0).all() and (second - first <= 1).all()
     assert (np.diff(first) > 0).all() and second[-1] < count
