@@ -14,7 +14,6 @@ from vpl.core.garbage import garbage_kept
 from vpl.core.sampling import derived_seed
 from vpl.core.stages import Stage
 from vpl.lights.emitter_groups import OTHER, EmitterGroups
-from vpl.lights.perturbed import Perturbed
 from vpl.split.contributions import LENGTHS, Layers
 from vpl.split.cost_model import CostModel
 from vpl.split.emitters import emitter_sampler
@@ -26,6 +25,7 @@ from vpl.split.roulette import OutgoingRadiance
 from vpl.split.start import Start, make_start
 from vpl.split.surface_lights import KeptLights
 from vpl.split.view import PathRules, Stream, View
+from vpl.transport.minorant import with_minorant
 
 from .camera_samples import LatticeSampler, stratified
 from .knobs import Boolean, Groups, Words
@@ -329,10 +329,10 @@ class ManyLightsIntegrator(PassRenderer):
         groups = EmitterGroups(scene, self.light_groups) if self.light_groups and not known else None
         emitters = known.emitters if known else emitter_sampler(scene, learning_rays(learning), groups)
         return View(
-            scene, emitters, Perturbed(scene), PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray,
-            active, cells.width, cells.rays, seed, dr.opaque(mi.Float, 1.0, pixels), dr.opaque(mi.UInt32, 1, pixels),
-            OutgoingRadiance.unknown(), learning, planned,
-            self.cost_model if self.denoised else self.cost_model.without_denoiser(),
+            scene, emitters, with_minorant(emitters.traits.materials),
+            PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray, active, cells.width, cells.rays, seed,
+            dr.opaque(mi.Float, 1.0, pixels), dr.opaque(mi.UInt32, 1, pixels), OutgoingRadiance.unknown(), learning,
+            planned, self.cost_model if self.denoised else self.cost_model.without_denoiser(),
             Layers(bool(self.layers), emitters.groups),
         )  # fmt: skip
 

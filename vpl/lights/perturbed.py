@@ -28,9 +28,15 @@ _COSINE_SHARE = 0.5
 _DIFFUSE_DENSITY = 1.001 / np.pi
 
 
+def is_perturbed(bsdf: mi.BSDF) -> bool:
+    """Whether a material is or contains a bump or normal map."""
+    printed = str(bsdf)
+    return any(name in printed for name in _MAPS)
+
+
 def perturbed_shapes(shapes: SceneShapes) -> tuple[int, ...]:
     """Registry indices of the shapes with a bump or normal map."""
-    return tuple(index for index, shape in shapes.of_hits if any(name in str(shape.bsdf()) for name in _MAPS))
+    return tuple(index for index, shape in shapes.of_hits if is_perturbed(shape.bsdf()))
 
 
 @dataclass(init=False)

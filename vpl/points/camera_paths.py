@@ -8,12 +8,14 @@ surface that may be gathered, it continues with both.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import add_at, channel_mean, download, finite_or_zero, ones, upload, upload_limit
+from ..core.materials import Materials
 from ..core.morton import morton_order
 from ..core.registry import RegistryTable
 from ..core.sampling import derived_seed, independent_sampler
@@ -35,8 +37,9 @@ class SceneTraits:
     registry indices of shapes with bump or normal maps; ``open_shapes``: registry indices of shapes that transmit light
     unscattered, and of instances of groups with such shapes; ``open_scene``: a scene of the open shapes alone,
     None if there are none, if a group has one, and on CUDA, where a kernel can trace rays in one scene only;
-    ``nearest_hits``: whether a shadow ray searches its nearest hit, as a path does.  On spheres of more than some
-    hundred units, Mitsuba's test for any hit reports the surface at the origin of a ray more often.
+    ``materials`` of all surfaces; ``nearest_hits``: whether a shadow ray searches its nearest hit, as a path does.  On
+    spheres of more than some hundred units, Mitsuba's test for any hit reports the surface at the origin of a ray more
+    often.
     """
 
     delta: bool
@@ -47,6 +50,7 @@ class SceneTraits:
     perturbed: tuple[int, ...]
     open_shapes: tuple[int, ...]
     open_scene: mi.Scene | None
+    materials: Materials
     nearest_hits: bool = False
 
     def is_null(self, hit):
@@ -56,6 +60,19 @@ class SceneTraits:
         """
         table = RegistryTable(self.open_shapes, 1)
         return (table.at(hit.shape) == 1) | (table.at(hit.instance) == 1)
+
+    @cached_property
+    def _open_materials(self) -> Materials:
+        return self.materials.having(mi.BSDFFlags.Null)
+
+    def transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """Fraction of light that passes surfaces unscattered; 0 where a lane is not ``active``."""
+        share = self._open_materials.call(si.bsdf(), _transmission, si, active=active)
+        return finite_or_zero(mi.unpolarized_spectrum(share))
+
+
+def _transmission(bsdf, si, active):
+    return bsdf.eval_null_transmission(si, active)
 
 
 def shape_in(shape, indices: tuple[int, ...]):
@@ -123,7 +140,7 @@ def scene_traits(scene) -> SceneTraits:
     if open_shapes and not open_groups and dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
         open_scene = mi.load_dict({"type": "scene", **{f"open_{index}": one for index, one in open_shapes.items()}})
     listed = *open_shapes, *open_instances
-    return SceneTraits(*lobes, transmissive, perturbed_shapes(shapes), listed, open_scene)
+    return SceneTraits(*lobes, transmissive, perturbed_shapes(shapes), listed, open_scene, Materials.of(shapes))
 
 
 def refuse_media(scene) -> None:

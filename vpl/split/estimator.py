@@ -19,7 +19,6 @@ from ..core.arrays import channel_mean, download, upload
 from ..core.clock import Clock
 from ..core.sampling import derived_seed
 from ..core.stages import Stage
-from ..points.camera_paths import SceneTraits
 from ..transport.evaluation import Transport
 from .camera_rays import trace_camera_rays
 from .contributions import LayerSums
@@ -40,8 +39,6 @@ from .view import PathSettings, Stream, View, ViewLights
 # is slow, which matters for small images. Dr.Jit records the kernels anew for each part, 15 to 100 ms by the number of
 # materials, as long as some 50 000 rays take
 _WAVEFRONT = 1 << 19, 1 << 20
-# Every surface blocks the light of virtual lights: light that passes a surface is traced
-_OPAQUE = SceneTraits(False, False, True, False, False, (), (), None)
 
 
 @dataclass(frozen=True)
@@ -232,7 +229,8 @@ class Gatherer:
     @classmethod
     def of(cls, view: View, lights: ViewLights, decision: Decision) -> Gatherer:
         """For the lights of a plan."""
-        traits = replace(_OPAQUE, nearest_hits=has_large_curves(view.scene))
+        # Every surface blocks the light of virtual lights: light that passes a surface is traced
+        traits = replace(view.emitters.traits, null=False, nearest_hits=has_large_curves(view.scene))
         transports = [Transport(view.scene, traits, carrying) for carrying in lights.all]
         darkest = view.model.dark_pixel * max(float(np.mean(decision.pilot.radiance)), 0.0)
         return cls(view, decision.plan, transports, decision.expected_light(lights), darkest)

@@ -66,7 +66,7 @@ class Hit:
         goes_on = path.active & si.is_valid() & (path.depth + 1 < settings.max_depth) & ~hidden
         flags, side = bsdf.flags(), side_of(si)
         smooth = goes_on & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-        minorant = minorant_of(si, bsdf, side, settings.perturbed, smooth & (settings.gathering >= path.state))
+        minorant = minorant_of(si, bsdf, side, settings.with_minorant, smooth & (settings.gathering >= path.state))
         return cls(si, bsdf, flags, side, minorant, hidden, goes_on, smooth)
 
     @property

@@ -112,7 +112,7 @@ def _sample_emitters(
     ``numbers`` of the lattice; ``weight`` of the gather vertex.  Returns (sample of the BSDF; its weight; contributions
     of the samples with even numbers less those of the others, mean over channels, 0 for a single sample).
     """
-    context, count = mi.BSDFContext(), dr.width(lane)
+    count = dr.width(lane)
     # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
     scatters, share = path.active & ~hit.hidden & (hit.goes_on | ~path.valid), dr.rcp(mi.Float(samples))
     turned, bsdf_weight = dr.zeros(mi.BSDFSample3f, count), dr.zeros(mi.Spectrum, count)
@@ -120,14 +120,16 @@ def _sample_emitters(
     while dr.hint(
         number < samples,
         exclude=[
-            scene, emitters, path, hit, weight, cell, samples, numbers, settings, lane, context, scatters, share, edges
+            scene, emitters, path, hit, weight, cell, samples, numbers, settings, lane, scatters, share, edges
         ],
     ):  # fmt: skip
         chosen, place, lobe, turn = _numbers_of_sample(numbers, number)
         sample = emitters.sample(hit.si, cell, chosen, sampler.next_1d(), place, hit.smooth)
         # A single call for both: each call adds the code of every material to the kernel
         toward = hit.si.to_local(sample.direction)
-        value, density, turned, bsdf_weight = hit.bsdf.eval_pdf_sample(context, hit.si, toward, lobe, turn, scatters)
+        value, density, turned, bsdf_weight = emitters.traits.materials.call(
+            hit.bsdf, _evaluated_and_sampled, hit.si, toward, lobe, turn, active=scatters
+        )
         lit, beyond = _lit(path, hit, sample, toward.z, value, density, weight, share, settings, sampler)
         arriving, crossings = sample.arriving(
             scene, emitters.traits, settings.max_depth - edges, dr.max(dr.abs(beyond)) > 0
@@ -138,6 +140,10 @@ def _sample_emitters(
         difference += dr.select(samples > 1, dr.select((number & 1) == 0, level, -level), 0)
         number += 1
     return turned, bsdf_weight, difference
+
+
+def _evaluated_and_sampled(bsdf, si, toward, lobe, turn, active):
+    return bsdf.eval_pdf_sample(mi.BSDFContext(), si, toward, lobe, turn, active)
 
 
 def _numbers_of_sample(numbers: tuple, number: mi.UInt32) -> tuple:
@@ -268,8 +274,7 @@ def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight, cell, samples,
     turns = mi.Bool(True)
     if traits.null:
         # Some materials do not tell what they transmit, and block shadow rays
-        told = mi.unpolarized_spectrum(hit.bsdf.eval_null_transmission(hit.si, null & path.active))
-        turns = ~(null & (dr.max(told) > 0))
+        turns = ~(null & (dr.max(traits.transmission(hit.si, null & path.active)) > 0))
     path.vertex, path.cell = dr.select(turns, hit.si.p, path.vertex), dr.select(turns, cell, path.cell)
     path.emitter_samples = dr.select(turns, samples, path.emitter_samples)
     path.density, path.delta = dr.select(turns, bs.pdf, path.density), dr.select(turns, delta, path.delta)

@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import ones
+from ..core.materials import Materials
 from ..lights.light_set import LightGroup, LightSet
-from ..lights.perturbed import Perturbed
 from .contributions import Layers
 from .cost_model import CostModel
 from .emitters.base import EmitterSampler
@@ -72,7 +72,7 @@ class PathSettings:
 
     ``max_depth``, ``rr_depth``: as in ``path``; ``c``: of lights on surfaces; ``gathering``: a :class:`Gathering`;
     ``emitters_carried``: whether virtual lights represent emitters, with ``emitters_squared_c``; ``outgoing``: for
-    Russian roulette; ``perturbed``: shapes without a minorant; ``hide_emitters``: a Python bool.
+    Russian roulette; ``with_minorant``: materials with a minorant; ``hide_emitters``: a Python bool.
     """
 
     max_depth: mi.UInt32
@@ -82,7 +82,7 @@ class PathSettings:
     emitters_carried: mi.Bool
     emitters_squared_c: mi.Float
     outgoing: OutgoingRadiance
-    perturbed: Perturbed
+    with_minorant: Materials
     hide_emitters: bool
 
 
@@ -174,9 +174,8 @@ class ViewLights:
 class View:
     """Camera rays of one image or pass.
 
-    ``scene``; ``emitters``: emitter sampler; ``perturbed``: shapes without a minorant; ``rules`` of the paths; ``ray``,
-    ``active``: of the camera, evaluated, by pixel as in ``rays``; ``width`` of the image in pixels;
-    ``seed``; ``importance`` of radiance in each pixel and ``outgoing`` radiance of surfaces: for Russian roulette;
+    ``scene``; ``emitters``: emitter sampler; ``with_minorant``: materials with a minorant; ``rules`` of the paths;
+    ``ray``, ``active``: of the camera, evaluated, by pixel as in ``rays``; ``width`` of the image in pixels; ``seed``; ``importance`` of radiance in each pixel and ``outgoing`` radiance of surfaces: for Russian roulette;
     ``direct_samples``: number of emitter samples at the first scattering vertices of each pixel;
     ``learning_count``: number of camera rays, for the size of the emitter sampler's learning; ``planned_count``: the
     same for the size of the pilot; ``model``: constants of the decisions; ``layers`` of the image.
@@ -184,7 +183,7 @@ class View:
 
     scene: mi.Scene
     emitters: EmitterSampler
-    perturbed: Perturbed
+    with_minorant: Materials
     rules: PathRules
     ray: mi.Ray3f
     active: mi.Bool
@@ -240,5 +239,5 @@ class View:
         return PathSettings(
             longest, dr.opaque(mi.UInt32, self.rules.rr_depth), lights.c, dr.opaque(mi.UInt32, gathering),
             dr.opaque(mi.Bool, lights.emitters is not None), dr.opaque(mi.Float, lights.emitters_c**2),
-            self.outgoing, self.perturbed, self.rules.hide_emitters,
+            self.outgoing, self.with_minorant, self.rules.hide_emitters,
         )  # fmt: skip

@@ -12,7 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import finite_or_zero
-from ..lights.perturbed import Perturbed
+from ..core.materials import Materials
+from ..lights.perturbed import is_perturbed
 
 # Incident and outgoing direction at which the BSDF is evaluated, on the side +z: 56 and 60 degrees from the normal and
 # close to each other. Gloss and rough metal reflect next to nothing back to where light comes from at this angle
@@ -36,21 +37,33 @@ def is_diffuse(flags: mi.UInt32) -> mi.Bool:
     return (flags & other_lobes) == 0
 
 
+def with_minorant(materials: Materials) -> Materials:
+    """Those of the ``materials`` that have a minorant.
+
+    Not those
+
+    - with a bump or normal map: no BSDF sample goes above the surface but below the perturbed normal, so a virtual
+      light there would carry light never subtracted by the traced part;
+    - without a diffuse lobe: BSDF samples rarely go to directions with a value as low as the minorant, and would
+      subtract the minorant as fireflies.
+    """
+    diffuse = materials.having(mi.BSDFFlags.DiffuseReflection)
+    return diffuse.where(lambda bsdf: not is_perturbed(bsdf))
+
+
 def minorant_of(
-    si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, side: mi.Float, perturbed: Perturbed, active: mi.Bool
+    si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, side: mi.Float, materials: Materials, active: mi.Bool
 ) -> mi.UnpolarizedSpectrum:
     """Minorant F of a BSDF (1 / sr): the value for a fixed pair of directions on one side.
 
-    ``side``: see :func:`side_of`.  F is 0
-
-    - where a lane is not ``active``;
-    - on ``perturbed`` shapes: no BSDF sample goes above the surface but below the perturbed normal, so a virtual light
-      there would carry light never subtracted by the traced part;
-    - for a BSDF without a diffuse lobe: BSDF samples rarely go to directions with a value as low as the minorant, and
-      would subtract the minorant as fireflies.
+    ``side``: see :func:`side_of`; ``materials``: see :func:`with_minorant`, F is 0 for all others, and where a lane is
+    not ``active``.
     """
-    active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & ~perturbed.at(si, active)
     turned, to_side = mi.SurfaceInteraction3f(si), mi.Vector3f(1, 1, side)
     turned.wi, out = (mi.Vector3f(*direction.tolist()) * to_side for direction in (_INCIDENT, _OUTGOING))
-    value = finite_or_zero(mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), turned, out, active)))
+    value = finite_or_zero(mi.unpolarized_spectrum(materials.call(bsdf, _value, turned, out, active=active)))
     return (value / dr.abs(out.z)) & active
+
+
+def _value(bsdf, si, out, active):
+    return bsdf.eval(mi.BSDFContext(), si, out, active)

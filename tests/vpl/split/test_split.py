@@ -12,9 +12,10 @@ from scipy import stats
 from tests.support.catalogue import EMITTERS, MATERIALS, one_of, stage
 from tests.support.properties import points, seeds, unit_vectors
 from vpl.core.arrays import download, upload, upload_vectors
+from vpl.core.materials import Materials
+from vpl.core.shapes import SceneShapes
 from vpl.direct.emitter_sampling import power_heuristic
 from vpl.lights.light_set import ScatteredGroup
-from vpl.lights.perturbed import Perturbed
 from vpl.lights.virtual_lights import DeviceLights, VirtualLights
 from vpl.points.surfaces import LambertianSurface
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
@@ -26,7 +27,7 @@ from vpl.split.view import View
 from vpl.transport.bounds import contribution_bound
 from vpl.transport.carried_share import carried_geometry_term, carried_share
 from vpl.transport.contribution import contribution
-from vpl.transport.minorant import agrees, minorant_of, side_of
+from vpl.transport.minorant import agrees, minorant_of, side_of, with_minorant
 
 # ---------------------- Minorants ----------------------
 
@@ -35,6 +36,7 @@ from vpl.transport.minorant import agrees, minorant_of, side_of
 def test_a_minorant_is_the_same_from_everywhere_on_its_side(material):
     """For the same points, seen from random directions on the same side."""
     scene = mi.load_dict(stage(EMITTERS["point"](), one_of(MATERIALS[material]()), 8))
+    materials = with_minorant(Materials.of(SceneShapes.of(scene)))
     rng, camera, found = np.random.default_rng(0), mi.Point3f(0, 0, 4), []
     target = points(rng.normal(size=(500, 3)) * 0.3 + [-0.6, -0.4, 0.3])
     first = scene.ray_intersect(mi.Ray3f(camera, dr.normalize(target - camera)))
@@ -45,7 +47,7 @@ def test_a_minorant_is_the_same_from_everywhere_on_its_side(material):
         si = scene.ray_intersect(mi.Ray3f(first.p + away * 1e-2, -away))
         same = first.is_valid() & si.is_valid() & (dr.norm(si.p - first.p) < 1e-4) & (si.shape == first.shape)
         side = side_of(si)
-        minorant = minorant_of(si, si.bsdf(), side, Perturbed(scene), agrees(si, side))
+        minorant = minorant_of(si, si.bsdf(), side, materials, agrees(si, side))
         found.append(np.where(np.array(same), np.array(minorant), np.nan))
         assert np.array(same).sum() > 50
     found = np.array(found)
@@ -74,20 +76,20 @@ def test_weights_of_two_densities_add_up_however_large_they_are(seed):
 
 
 def test_rough_metal_has_next_to_no_minorant_and_diffuse_walls_all_of_it():
-    nowhere = Perturbed(mi.load_dict({"type": "scene"}))
     for material, least, most in (("diffuse", 0.2 / np.pi, 0.7 / np.pi), ("roughconductor", 0, 1e-6)):
         bsdf = mi.load_dict(MATERIALS[material]())
-        si = dr.zeros(mi.SurfaceInteraction3f)
+        si, those = dr.zeros(mi.SurfaceInteraction3f), with_minorant(Materials([bsdf]))
         si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
-        minorant = np.array(minorant_of(si, bsdf, mi.Float(1), nowhere, mi.Bool(True)))
+        minorant = np.array(minorant_of(si, mi.BSDFPtr(bsdf), mi.Float(1), those, mi.Bool(True)))
         assert (minorant >= 0.999 * least).all() and (minorant <= 1.001 * most).all()
 
 
 def test_minorants_are_0_where_none_is_asked_for_and_the_same_elsewhere():
     bsdf, si = mi.load_dict(MATERIALS["diffuse"]()), dr.zeros(mi.SurfaceInteraction3f, 64)
     si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
-    asked, nowhere = dr.arange(mi.UInt32, 64) % 3 == 0, Perturbed(mi.load_dict({"type": "scene"}))
-    some, whole = (np.array(minorant_of(si, bsdf, mi.Float(1), nowhere, mask)) for mask in (asked, mi.Bool(True)))
+    asked, those = dr.arange(mi.UInt32, 64) % 3 == 0, with_minorant(Materials([bsdf]))
+    pointer = mi.BSDFPtr(bsdf)
+    some, whole = (np.array(minorant_of(si, pointer, mi.Float(1), those, mask)) for mask in (asked, mi.Bool(True)))
     assert (whole > 0).all() and (some == np.where(np.array(asked), whole, 0)).all()
 
 

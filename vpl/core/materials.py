@@ -1,0 +1,49 @@
+"""Calls of the materials of a scene's surfaces.
+
+Dr.Jit records the call of a BSDF pointer for every BSDF in memory: also for a BSDF inside another one, such as that of
+``twosided``, and for those of other scenes.  A surface never has such a BSDF, but its code is recorded and compiled.
+The switch of this module has the materials of surfaces alone.  In a room with 62 materials (kitchen), the kernel of
+paths has 8100 instead of 16 800 operations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+
+from .registry import RegistryTable
+from .shapes import SceneShapes
+
+
+class Materials:
+    """The materials ``bsdfs``, some or all of those of a scene's surfaces."""
+
+    def __init__(self, bsdfs: list[mi.BSDF]):
+        # A switch needs a case, even if no lane reaches it
+        self.bsdfs = bsdfs or [mi.load_dict({"type": "null"})]
+        indices = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in self.bsdfs]
+        self._numbers = RegistryTable(indices, range(1, len(indices) + 1))
+
+    @classmethod
+    def of(cls, shapes: SceneShapes) -> Materials:
+        """The materials of all surfaces of a scene."""
+        found = [shape.bsdf() for _, shape in shapes.of_hits]
+        return cls(list({id(bsdf): bsdf for bsdf in found if bsdf is not None}.values()))
+
+    def where(self, test: Callable[[mi.BSDF], bool]) -> Materials:
+        """The materials that pass a test."""
+        return Materials([bsdf for bsdf in self.bsdfs if test(bsdf)])
+
+    def having(self, flag: mi.BSDFFlags) -> Materials:
+        """The materials with a kind of lobe."""
+        return self.where(lambda bsdf: mi.has_flag(bsdf.flags(), flag))
+
+    def call(self, pointers: mi.BSDFPtr, function: Callable, *arguments, active: mi.Bool):
+        """``function(bsdf, *arguments, active)`` for the material behind each pointer, with arrays as arguments; 0 for
+        pointers to no material of this object and in lanes that are not ``active``."""
+        number = self._numbers.at(pointers, active)
+        cases = [partial(function, bsdf) for bsdf in self.bsdfs]
+        return dr.switch(number - 1, cases, *arguments, active & (number > 0))
