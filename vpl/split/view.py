@@ -175,7 +175,8 @@ class View:
     """Camera rays of one image or pass.
 
     ``scene``; ``emitters``: emitter sampler; ``with_minorant``: materials with a minorant; ``rules`` of the paths;
-    ``ray``, ``active``: of the camera, evaluated, by pixel as in ``rays``; ``width`` of the image in pixels; ``seed``; ``importance`` of radiance in each pixel and ``outgoing`` radiance of surfaces: for Russian roulette;
+    ``ray``, ``active``: of the camera, evaluated, by pixel as in ``rays``; ``width`` of the image in pixels;
+    ``seed``; ``importance`` of radiance in each pixel and ``outgoing`` radiance of surfaces: for Russian roulette;
     ``direct_samples``: number of emitter samples at the first scattering vertices of each pixel;
     ``learning_count``: number of camera rays, for the size of the emitter sampler's learning; ``planned_count``: the
     same for the size of the pilot; ``model``: constants of the decisions; ``layers`` of the image.
