@@ -14,7 +14,10 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.garbage import garbage_kept
+from vpl.core.loops import recorded_once
+from vpl.core.materials import Materials
 from vpl.core.sampling import derived_seed, independent_sampler
+from vpl.core.shapes import SceneShapes
 
 from .fine_film import fine_film
 
@@ -22,7 +25,7 @@ from .fine_film import fine_film
 # samples, both without a filter (decisions.md)
 FEATURE_SPP = 16, 128
 # Samples per pixel of a render: squares, to which some of Mitsuba's samplers round, and powers of two, which share a
-# kernel that compiles for 0.6 s in kitchen
+# kernel that compiles for 0.5 s in kitchen
 AT_ONCE = 64, 16
 FEATURE_WAVEFRONT = 1 << 22  # most samples of an image rendered at once, some 400 MB, or the least of `AT_ONCE`
 # A sample of a path takes 20 to 25 times as long. Features and image gain equally by more time if the features have
@@ -144,7 +147,9 @@ def _feature_integrator(variant):
             # Stratified numbers are for camera rays alone
             number = sampler.next_1d()
             own = independent_sampler(int(dr.reinterpret_array(mi.UInt32, number)[0]), dr.width(number))
-            albedo, normal, depth, valid = _first_rough_surface(scene, own, mi.Ray3f(ray), mi.Bool(active))
+            materials = Materials.of(SceneShapes.of(scene))
+            first = _first_rough_surface(scene, materials, own, mi.Ray3f(ray), mi.Bool(active))
+            albedo, normal, depth, valid = first
             finite = dr.all(dr.isfinite(albedo)) & dr.all(dr.isfinite(normal)) & dr.isfinite(depth)
             albedo, normal = dr.select(finite, dr.minimum(albedo, 1), 0), dr.select(finite, normal, 0)
             return mi.Spectrum(0), valid, [*albedo, *normal, dr.select(finite, depth, 0)]
@@ -152,19 +157,21 @@ def _feature_integrator(variant):
     return FeatureIntegrator(mi.Properties())
 
 
+@recorded_once
 @dr.syntax
-def _first_rough_surface(scene, sampler, ray, active):
+def _first_rough_surface(scene, materials: Materials, sampler, ray, active):
     """Trace camera rays through mirrors, glass and masks; return albedo, normal, depth, and the mask of hits."""
     throughput, bounces = mi.Color3f(1), mi.UInt32(0)
     albedo, normal, valid = mi.Color3f(0), mi.Normal3f(0), mi.Bool(False)
     depth, length = mi.Float(0), mi.Float(0)
-    while active:
+    while dr.hint(active, exclude=[scene, materials]):
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=bounces == 0, active=active)
         hit = active & si.is_valid()
         length += dr.select(hit, si.t, 0)
         albedo += throughput * _three(si.emitter(scene).eval(si, active))
         bsdf = si.bsdf(ray)
-        sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(hit), sampler.next_2d(hit), hit)
+        numbers = sampler.next_1d(hit), sampler.next_2d(hit)
+        sample, weight = materials.call(bsdf, _sampled, si, *numbers, active=hit)
         throughput *= _three(weight)
         # A surface with a delta and a smooth lobe, such as plastic, counts by its smooth lobe
         smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -179,6 +186,10 @@ def _first_rough_surface(scene, sampler, ray, active):
         bounces += 1
         active = onward & (bounces < DEEPEST)
     return albedo, normal, depth, valid
+
+
+def _sampled(bsdf, si, lobe, direction, active):
+    return bsdf.sample(mi.BSDFContext(), si, lobe, direction, active)
 
 
 def _three(value):
