@@ -26,7 +26,7 @@ from ..core.arrays import channel_mean, upload
 from ..core.sampling import derived_seed
 from .camera_rays import CameraRays
 from .cost_model import CostModel
-from .pilot import Pilot, error_scale, finite, means_of_others, pixel_means
+from .pilot import Pilot, error_scale, finite, means_of_others, pixel_means, relative_variance
 from .pixel_rays import RayNumbers
 from .view import Stream, View, ViewLights
 
@@ -55,6 +55,10 @@ class EmitterSamples:
     ``removed`` (m,): part of it that each candidate multiple removes; ``added`` (m,): mean number of samples added to a
     path; ``expected`` (pixels,): expected relative difference of two samples; ``fraction``: of the variance that
     stratified samples retain.
+
+    Samples are weighted against the BSDF by their number.  A single sample has the weight of one, and leaves another
+    variance than a sample with the weight of two, which ``whole`` is of: ``removed`` counts the difference of both in
+    the vertices with a single sample.
     """
 
     whole: float
@@ -65,20 +69,22 @@ class EmitterSamples:
     model: CostModel
 
     @classmethod
-    def of(cls, pilot: Pilot, difference: np.ndarray, fraction: float) -> EmitterSamples:
-        """From the ``difference`` (n,) of emitter samples of a pilot's paths, see :class:`vpl.split.pilot.Pilot`."""
+    def of(cls, pilot: Pilot, traced: Pilot, fraction: float) -> EmitterSamples:
+        """From the emitter samples of ``traced``, a pilot with the same paths and the lights of the image."""
         model = pilot.model
-        relative = np.abs(difference) / error_scale(pilot.brightness, model)
+        relative = np.abs(traced.difference) / error_scale(pilot.brightness, model)
         # Without the path itself and its neighbour: otherwise, the prediction would be too good
         others, priors = means_of_others(relative, pilot.pixel, *pilot.size, model)
         # The largest ones are left out, as in the variance of a path
         kept = np.argsort(relative)[: len(relative) - model.left_out(len(relative))]
         # Twice the mean square of half of the difference
         variance = 2 * relative[kept] ** 2
+        of_several, of_one = (relative_variance(x, pilot.brightness, model) for x in (traced.radiance, traced.alone))
         removed, added = np.zeros(len(_MULTIPLES)), np.zeros(len(_MULTIPLES))
         for k, multiple in enumerate(_MULTIPLES):
             number = _numbers(multiple * others, model)
             removed[k], added[k] = np.mean(variance * (1 - 1 / number[kept])), np.mean(number - 1)
+            removed[k] += (of_several - of_one) * np.mean(number[kept] == 1)
         expected = pixel_means(relative, pilot.pixel, *pilot.size, priors)
         return cls(float(np.mean(variance)), removed, added, expected, fraction, model)
 

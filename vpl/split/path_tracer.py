@@ -52,7 +52,7 @@ def trace_paths(
     """
     count = dr.width(first.throughput)
     path, found, gathered = Path.of(first), Contributions.none(count, sums), Gathered.none(count)
-    lane, seen, difference = dr.arange(mi.UInt32, count), mi.Float(0), mi.Float(0)
+    lane, seen, difference, alone = dr.arange(mi.UInt32, count), mi.Float(0), mi.Float(0), mi.Float(0)
 
     while dr.hint(path.active, exclude=[first, lattice, settings, emitters, lane]):
         # ---------------------- Hit ----------------------
@@ -61,7 +61,10 @@ def trace_paths(
         # ---------------------- Emission, by BSDF sampling ----------------------
         met = emitters.met(path.vertex, path.cell, path.ray, hit.si, ~path.delta, path.active & ~hit.hidden)
         mis = power_heuristic(path.density, met.density * mi.Float(path.emitter_samples))
-        emission = _less_carried(path, met, settings) * met.radiance * mis
+        single = power_heuristic(path.density, met.density)
+        arrived = _less_carried(path, met, settings) * met.radiance
+        emission = arrived * mis
+        alone += channel_mean(arrived) * (single - mis)
         found.add(emission, path.depth + 1, met.group, sampler.next_1d(), lane)
         seen += dr.select(path.depth == 0, channel_mean(emission), 0)
 
@@ -81,10 +84,10 @@ def trace_paths(
         samples = dr.select(hit.smooth & (path.scattered == 1), first.direct_samples, 1)
         cell = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side)
         numbers = lattice.at(path.depth)
-        turned, bsdf_weight, of_vertex = _sample_emitters(
+        turned, bsdf_weight, of_vertex, more = _sample_emitters(
             scene, emitters, path, hit, weight, cell, samples, numbers, settings, sampler, found, lane
         )
-        difference += of_vertex
+        difference, alone = difference + of_vertex, alone + more
 
         # ---------------------- Onward by the sample of the BSDF ----------------------
         survival = _turn(path, hit, turned, bsdf_weight, gathers, weight, cell, samples, emitters.traits)
@@ -96,7 +99,7 @@ def trace_paths(
 
     gathered.finish()
     traced = Traced(
-        found.radiance, found.one, found.length, found.group, seen, difference, path.valid, path.depth, gathered
+        found.radiance, found.one, found.length, found.group, seen, difference, alone, path.valid, path.depth, gathered
     )  # fmt: skip
     dr.eval(traced)
     return traced
@@ -109,14 +112,15 @@ def _sample_emitters(
 ):  # fmt: skip
     """Add the light of emitters by ``samples`` samples at each vertex to ``found``.
 
-    ``numbers`` of the lattice; ``weight`` of the gather vertex.  Returns (sample of the BSDF; its weight; contributions
-    of the samples with even numbers less those of the others, mean over channels, 0 for a single sample).
+    ``numbers`` of the lattice; ``weight`` of the gather vertex.  Returns (sample of the BSDF; its weight; parts of the
+    vertex in ``difference`` and in ``alone`` of :class:`vpl.split.path_state.Traced`, 0 for a single sample).
     """
     count = dr.width(lane)
     # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
     scatters, share = path.active & ~hit.hidden & (hit.goes_on | ~path.valid), dr.rcp(mi.Float(samples))
     turned, bsdf_weight = dr.zeros(mi.BSDFSample3f, count), dr.zeros(mi.Spectrum, count)
-    number, difference, edges = dr.zeros(mi.UInt32, count), dr.zeros(mi.Float, count), path.depth + 2
+    number, edges = dr.zeros(mi.UInt32, count), path.depth + 2
+    difference, alone = dr.zeros(mi.Float, count), dr.zeros(mi.Float, count)
     while dr.hint(
         number < samples,
         exclude=[
@@ -130,7 +134,7 @@ def _sample_emitters(
         value, density, turned, bsdf_weight = emitters.traits.materials.call(
             hit.bsdf, _evaluated_and_sampled, hit.si, toward, lobe, turn, active=scatters
         )
-        lit, beyond = _lit(path, hit, sample, toward.z, value, density, weight, share, settings, sampler)
+        lit, beyond, single = _lit(path, hit, sample, toward.z, value, density, weight, share, settings, sampler)
         arriving, crossings = sample.arriving(
             scene, emitters.traits, settings.max_depth - edges, dr.max(dr.abs(beyond)) > 0
         )
@@ -138,8 +142,9 @@ def _sample_emitters(
         found.add(lit, edges + crossings, sample.group, sampler.next_1d(), lane)
         level = channel_mean(lit)
         difference += dr.select(samples > 1, dr.select((number & 1) == 0, level, -level), 0)
+        alone += dr.select(number == 0, level * single, 0) - level
         number += 1
-    return turned, bsdf_weight, difference
+    return turned, bsdf_weight, difference, alone
 
 
 def _evaluated_and_sampled(bsdf, si, toward, lobe, turn, active):
@@ -225,7 +230,8 @@ def _lit(
     path: Path, hit: Hit, sample: EmitterSample, height, value, density, weight, share, settings: PathSettings, sampler
 ):  # fmt: skip
     """Factors of the sampled emitters' light: β f, minus the parts carried by virtual lights; and the same for light
-    that passes null surfaces, which virtual lights that represent emitters do not carry.
+    that passes null surfaces, which virtual lights that represent emitters do not carry; and the ratio of the weight as
+    a single sample to that of one of several.
 
     ``height``: cosine of the direction; ``value``, ``density``: of the BSDF; ``weight`` of the gather vertex; ``share``
     of the sample in the light, one over the number of samples.
@@ -240,9 +246,11 @@ def _lit(
         survival = residual_survival(value, full, settings.emitters_carried)
         survives = sampler.next_1d() < survival
         value, beyond = (dr.select(survives, one / survival, 0) for one in (value, beyond))
-    mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, density * share))
+    mis, single = (power_heuristic(sample.density, density * number) for number in (share, 1))
+    mis, single = (dr.select(sample.is_point, 1, one) for one in (mis, single))
+    ratio = dr.select(mis > 0, single / (share * mis), 0)
     mis = dr.select(hit.smooth & (sample.density > 0), share * mis, 0)
-    return value * mis, beyond * mis
+    return value * mis, beyond * mis, ratio
 
 
 def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight, cell, samples, traits: SceneTraits):

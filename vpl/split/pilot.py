@@ -58,9 +58,10 @@ class Pilot:
 
     ``pixel``, ``radiance`` (n,): of each path, with one emitter sample at each vertex; ``seen`` (n,): emission on the
     first edge; ``difference`` (n,): half of the difference that the choice between two emitter samples at the first
-    scattering vertex makes to the radiance; ``indirect`` (n,): part of the radiance through arrivals.  Values may be
-    negative if virtual lights carry a part.  ``vertices``: positions and normals (k, 3) of first and second vertices;
-    ``size``: width of the image and number of pixels; ``scene``; ``seed`` of the octree.
+    scattering vertex makes to the radiance; ``alone`` (n,): as ``radiance``, but with the weight of a single emitter
+    sample beside the BSDF; ``indirect`` (n,): part of the radiance through arrivals.  Values may be negative if virtual
+    lights carry a part.  ``vertices``: positions and normals (k, 3) of first and second vertices; ``size``: width of
+    the image and number of pixels; ``scene``; ``seed`` of the octree.
     """
 
     arrivals: Arrivals
@@ -70,6 +71,7 @@ class Pilot:
     radiance: np.ndarray
     seen: np.ndarray
     difference: np.ndarray
+    alone: np.ndarray
     indirect: np.ndarray
     size: tuple[int, int]
     scene: mi.Scene
@@ -90,13 +92,26 @@ class Pilot:
         """The pilot of traced paths in the pixels ``pixel`` (n,) of a view."""
         radiance, seen, difference = single_sample_radiance(traced), finite(traced.seen), finite(traced.difference)
         both = finite(channel_mean(traced.radiance))
+        alone = both + finite(traced.alone)
         edges = download(traced.edges).astype(np.int64)
         arrivals, onward, indirect = _second_vertices(traced.gathered.second, both, edges)
         first, facing = _first_vertices(traced.gathered.first)
         vertices = np.concatenate([first, arrivals.position]), np.concatenate([facing, arrivals.normal])
         size, seed = (view.width, view.pixels), derived_seed(view.seed, Stream.OCTREE)
         return cls(
-            arrivals, onward, vertices, pixel, radiance, seen, difference, indirect, size, view.scene, seed, view.model
+            arrivals,
+            onward,
+            vertices,
+            pixel,
+            radiance,
+            seen,
+            difference,
+            alone,
+            indirect,
+            size,
+            view.scene,
+            seed,
+            view.model,
         )
 
     @cached_property

@@ -79,12 +79,12 @@ def make_start(view: View, virtual_lights: bool) -> Start:
     (pilot, learned), refusal = learning_pilot(view), _refusal(view, virtual_lights)
     # Single samples, and samples that never differ, tell nothing
     fraction = retained_fraction(view) if pilot.difference.any() else 1.0
-    effect = EmitterSamples.of(pilot, pilot.difference, fraction)
+    effect = EmitterSamples.of(pilot, pilot, fraction)
     options, effects = [], {False: effect, True: effect}
     if not refusal:
-        options, difference = _options(view, pilot)
-        if difference is not None:
-            effects[True] = EmitterSamples.of(pilot, difference, fraction)
+        options, carried = _options(view, pilot)
+        if carried is not None:
+            effects[True] = EmitterSamples.of(pilot, carried, fraction)
     return Start(pilot, view.emitters, learned, options, refusal, effects, view.learning_count, view.seed)
 
 
@@ -140,16 +140,16 @@ def _refusal(view: View, virtual_lights: bool) -> str:
     return ""
 
 
-def _options(view: View, pilot: Pilot) -> tuple[list[Option], np.ndarray | None]:
-    """(Kinds of virtual lights that are possible; difference of emitter samples where virtual lights represent
-    emitters, None if they may not)."""
+def _options(view: View, pilot: Pilot) -> tuple[list[Option], Pilot | None]:
+    """(Kinds of virtual lights that are possible; pilot where virtual lights represent emitters, None if they may
+    not)."""
     if not _may_carry_emitters(view):
         return _with_surfaces(view, pilot, ViewLights()), None
     emitters = ViewLights(emitters=view.light_set([]), emitters_c=view.emitters_c)
     traced = Pilot.trace(view, emitters)
     only_emitters = Option(False, True, traced.radiance, traced.indirect)
     options = [only_emitters, *_with_surfaces(view, pilot, ViewLights()), *_with_surfaces(view, traced, emitters)]
-    return options, traced.difference
+    return options, traced
 
 
 def _with_surfaces(view: View, traced: Pilot, lights: ViewLights) -> list[Option]:

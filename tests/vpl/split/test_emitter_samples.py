@@ -18,18 +18,26 @@ from tests.support.statistics import assert_same_mean
 from vpl.split import start
 from vpl.split.cost_model import CostModel
 from vpl.split.emitter_samples import EmitterSamples
+from vpl.split.pilot import Pilot, relative_variance
 
 MODEL = CostModel().without_denoiser()
 WIDTH = 16
 
 
-def effect(difference, fraction=1.0, count=4096, **constants):
-    """The effect of samples with a ``difference`` by pixel, in pairs of paths all over an image of even brightness."""
+def effect(difference, fraction=1.0, count=4096, noise=(0.0, 0.0), **constants):
+    """The effect of samples with a ``difference`` by pixel, in pairs of paths all over an image of even brightness.
+
+    ``noise``: standard deviation of paths with the weight of one of two samples, and with that of a single one.
+    """
     pixel = np.repeat(np.random.default_rng(0).permutation(count // 2) % WIDTH**2, 2)
     paths = SimpleNamespace(
         model=replace(MODEL, **constants), brightness=np.ones(count), pixel=pixel, size=(WIDTH, WIDTH**2)
     )
-    return EmitterSamples.of(paths, difference(pixel), fraction)
+    random = np.random.default_rng(1).standard_normal(count)
+    of_several, alone = (1 + one * random for one in noise)
+    return EmitterSamples.of(
+        paths, SimpleNamespace(difference=difference(pixel), radiance=of_several, alone=alone), fraction
+    )
 
 
 def left_half(pixel):
@@ -64,6 +72,15 @@ def test_one_sample_suffices(changed):
     found = effect(lambda pixel: size + 0 * pixel, 0.05 if changed == "stratified" else 1.0, **constants)
     chosen = found.best(0.6, 1.0, 64)
     assert (found.numbers(chosen.multiple) == 1).all() and (chosen.remains, chosen.cost) == (1.0, 1.0)
+
+
+@pytest.mark.parametrize(("noise", "more"), [((0.6, 0.6), True), ((0.6, 0.1), False), ((0.1, 0.6), True)])
+def test_one_sample_suffices_if_its_own_weight_leaves_less_variance(noise, more):
+    found = effect(lambda pixel: 0.5 + 0 * pixel, noise=noise)
+    chosen = found.best(0.6, 1.0, 64)
+    assert (found.numbers(chosen.multiple) > 1).all() == more
+    if not more:
+        assert chosen.remains == pytest.approx(1 - (0.36 - 0.01) / (1 + MODEL.black) / 0.6, rel=0.05)
 
 
 def test_few_samples_of_a_pixel_are_hardly_stratified():
@@ -163,6 +180,34 @@ def test_one_sample_is_the_least():
 
 
 # ---------------------- Predictions ----------------------
+
+
+def shining_box():
+    """A closed box with walls that shine evenly: BSDF samples are perfect, and emitter samples add noise."""
+    box = closed_box({}, 32)
+    for name in ("floor", "ceiling", "left", "right", "back", "front"):
+        box[name]["emitter"] = {"type": "area", "radiance": rgb(0.5)}
+    return mi.load_dict(box)
+
+
+def test_paths_of_a_single_sample_are_as_noisy_as_predicted():
+    """The pilot with two samples tells the noise of paths with one."""
+    pilots = {}
+    for most in (1, CostModel().most_emitter_samples):
+        found, of = [], Pilot.of.__func__
+        traced = classmethod(lambda cls, *arguments, kept=found, of=of: kept.append(of(cls, *arguments)) or kept[-1])
+        with mock.patch.object(Pilot, "of", traced), plugin_with_model(most_emitter_samples=most):
+            _, statistics = render_with_statistics("manylights", shining_box(), 256, max_depth=2)
+        pilots[most] = found[-1]
+        assert statistics["emitter_samples"] == "1"
+    single, double = pilots.values()
+    np.testing.assert_array_equal(single.alone, single.radiance)
+    assert np.mean(double.alone) == pytest.approx(np.mean(single.radiance), rel=0.005)
+    predicted, weighted_as_two = (
+        relative_variance(x, double.brightness, MODEL) for x in (double.alone, double.radiance)
+    )
+    measured = relative_variance(single.radiance, single.brightness, MODEL)
+    assert predicted == pytest.approx(measured, rel=0.05) and weighted_as_two > 1.5 * measured
 
 
 def test_noise_of_shadows_is_stratified_less_than_smooth_light():
