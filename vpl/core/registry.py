@@ -1,4 +1,4 @@
-"""Table of numbers for shapes or emitters, indexed by Mitsuba's registry."""
+"""Table of numbers for shapes, emitters or materials, indexed by Mitsuba's registry."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from ..core.arrays import channel_mean, upload
 from ..core.sampling import derived_seed
 from .camera_rays import CameraRays
 from .cost_model import CostModel
-from .pilot import Pilot, error_scale, finite, means_of_others, pixel_means, relative_variance
+from .pilot import Pilot, error_scale, finite, kept_of_both, means_of_others, pixel_means, relative_errors
 from .pixel_rays import RayNumbers
 from .view import Stream, View, ViewLights
 
@@ -56,9 +56,9 @@ class EmitterSamples:
     path; ``expected`` (pixels,): expected relative difference of two samples; ``fraction``: of the variance that
     stratified samples retain.
 
-    Samples are weighted against the BSDF by their number.  A single sample has the weight of one, and leaves another
-    variance than a sample with the weight of two, which ``whole`` is of: ``removed`` counts the difference of both in
-    the vertices with a single sample.
+    Samples are weighted against the BSDF by their number.  ``whole`` is the variance with the weight of two.  A single
+    sample has the weight of one, which leaves another variance.  ``removed`` counts this difference where a vertex
+    takes a single sample.
     """
 
     whole: float
@@ -79,12 +79,13 @@ class EmitterSamples:
         kept = np.argsort(relative)[: len(relative) - model.left_out(len(relative))]
         # Twice the mean square of half of the difference
         variance = 2 * relative[kept] ** 2
-        of_several, of_one = (relative_variance(x, pilot.brightness, model) for x in (traced.radiance, traced.alone))
+        weighted_as_two, alone = (relative_errors(x, pilot.brightness, model) for x in (traced.radiance, traced.alone))
+        pairs, gain = kept_of_both(weighted_as_two, alone, model), weighted_as_two - alone
         removed, added = np.zeros(len(_MULTIPLES)), np.zeros(len(_MULTIPLES))
         for k, multiple in enumerate(_MULTIPLES):
             number = _numbers(multiple * others, model)
             removed[k], added[k] = np.mean(variance * (1 - 1 / number[kept])), np.mean(number - 1)
-            removed[k] += (of_several - of_one) * np.mean(number[kept] == 1)
+            removed[k] += np.mean(gain[pairs] * (number[::2][pairs] == 1))
         expected = pixel_means(relative, pilot.pixel, *pilot.size, priors)
         return cls(float(np.mean(variance)), removed, added, expected, fraction, model)
 
@@ -95,8 +96,10 @@ class EmitterSamples:
     def best(self, variance: float, cost: float, samples: int) -> SampleChoice:
         """The choice with the least variance × cost, in images that are denoised with a power of the variance, for
         paths of a relative ``variance`` and a ``cost``, of which a pixel has so many ``samples``."""
-        # All of the noise may be that of emitter samples, but not more
-        of_samples = min(self.retained(samples), variance / self.whole) if self.whole > 0 else 0.0
+        # All of the noise may be that of emitter samples, but not more. The largest number of samples leaves a part
+        least_left = 1 / max(self.model.most_emitter_samples, 2)
+        most = max(self.whole, np.max(self.removed) / (1 - least_left))
+        of_samples = min(self.retained(samples), variance / most) if most > 0 else 0.0
         left, costs = variance - of_samples * self.removed, cost + self.model.emitter_sample_cost * self.added
         chosen = int(np.argmin(left**self.model.samples_power * costs))
         remains = left[chosen] / variance if variance > 0 else 1.0

@@ -82,9 +82,9 @@ class Traced:
     ``radiance``; ``drawn``: a contribution over its probability, from a path of ``length`` edges to an emitter of
     ``group``; ``seen``: emission at the end of the first edge, mean over channels; ``difference``: contributions of the
     emitter samples with even numbers at the first scattering vertex less those with odd numbers, mean over channels;
-    ``alone``: radiance with the first of these samples alone, weighted as a single sample, less ``radiance``, mean over
-    channels; ``valid``: whether a surface counts in the film's alpha; ``edges`` without the last; ``gathered``: gather
-    vertices.
+    ``alone_excess``: radiance with the first of these samples alone, weighted as a single sample, less ``radiance``,
+    mean over channels; ``valid``: whether a surface counts in the film's alpha; ``edges`` without the last;
+    ``gathered``: gather vertices.
     """
 
     radiance: mi.UnpolarizedSpectrum
@@ -93,7 +93,7 @@ class Traced:
     group: mi.UInt32
     seen: mi.Float
     difference: mi.Float
-    alone: mi.Float
+    alone_excess: mi.Float
     valid: mi.Bool
     edges: mi.UInt32
     gathered: Gathered

@@ -52,7 +52,7 @@ def trace_paths(
     """
     count = dr.width(first.throughput)
     path, found, gathered = Path.of(first), Contributions.none(count, sums), Gathered.none(count)
-    lane, seen, difference, alone = dr.arange(mi.UInt32, count), mi.Float(0), mi.Float(0), mi.Float(0)
+    lane, seen, difference, alone_excess = dr.arange(mi.UInt32, count), mi.Float(0), mi.Float(0), mi.Float(0)
 
     while dr.hint(path.active, exclude=[first, lattice, settings, emitters, lane]):
         # ---------------------- Hit ----------------------
@@ -64,7 +64,7 @@ def trace_paths(
         single = power_heuristic(path.density, met.density)
         arrived = _less_carried(path, met, settings) * met.radiance
         emission = arrived * mis
-        alone += channel_mean(arrived) * (single - mis)
+        alone_excess += channel_mean(arrived) * (single - mis)
         found.add(emission, path.depth + 1, met.group, sampler.next_1d(), lane)
         seen += dr.select(path.depth == 0, channel_mean(emission), 0)
 
@@ -87,7 +87,7 @@ def trace_paths(
         turned, bsdf_weight, of_vertex, more = _sample_emitters(
             scene, emitters, path, hit, weight, cell, samples, numbers, settings, sampler, found, lane
         )
-        difference, alone = difference + of_vertex, alone + more
+        difference, alone_excess = difference + of_vertex, alone_excess + more
 
         # ---------------------- Onward by the sample of the BSDF ----------------------
         survival = _turn(path, hit, turned, bsdf_weight, gathers, weight, cell, samples, emitters.traits)
@@ -99,7 +99,8 @@ def trace_paths(
 
     gathered.finish()
     traced = Traced(
-        found.radiance, found.one, found.length, found.group, seen, difference, alone, path.valid, path.depth, gathered
+        found.radiance, found.one, found.length, found.group, seen, difference, alone_excess, path.valid, path.depth,
+        gathered,
     )  # fmt: skip
     dr.eval(traced)
     return traced
@@ -113,14 +114,14 @@ def _sample_emitters(
     """Add the light of emitters by ``samples`` samples at each vertex to ``found``.
 
     ``numbers`` of the lattice; ``weight`` of the gather vertex.  Returns (sample of the BSDF; its weight; parts of the
-    vertex in ``difference`` and in ``alone`` of :class:`vpl.split.path_state.Traced`, 0 for a single sample).
+    vertex in ``difference`` and in ``alone_excess`` of :class:`vpl.split.path_state.Traced`, 0 for a single sample).
     """
     count = dr.width(lane)
     # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
     scatters, share = path.active & ~hit.hidden & (hit.goes_on | ~path.valid), dr.rcp(mi.Float(samples))
     turned, bsdf_weight = dr.zeros(mi.BSDFSample3f, count), dr.zeros(mi.Spectrum, count)
     number, edges = dr.zeros(mi.UInt32, count), path.depth + 2
-    difference, alone = dr.zeros(mi.Float, count), dr.zeros(mi.Float, count)
+    difference, alone_excess = dr.zeros(mi.Float, count), dr.zeros(mi.Float, count)
     while dr.hint(
         number < samples,
         exclude=[
@@ -142,9 +143,9 @@ def _sample_emitters(
         found.add(lit, edges + crossings, sample.group, sampler.next_1d(), lane)
         level = channel_mean(lit)
         difference += dr.select(samples > 1, dr.select((number & 1) == 0, level, -level), 0)
-        alone += dr.select(number == 0, level * single, 0) - level
+        alone_excess += dr.select(number == 0, level * single, 0) - level
         number += 1
-    return turned, bsdf_weight, difference, alone
+    return turned, bsdf_weight, difference, alone_excess
 
 
 def _evaluated_and_sampled(bsdf, si, toward, lobe, turn, active):
@@ -229,9 +230,9 @@ def _gather(path: Path, hit: Hit, settings: PathSettings, gathered: Gathered, sa
 def _lit(
     path: Path, hit: Hit, sample: EmitterSample, height, value, density, weight, share, settings: PathSettings, sampler
 ):  # fmt: skip
-    """Factors of the sampled emitters' light: β f, minus the parts carried by virtual lights; and the same for light
-    that passes null surfaces, which virtual lights that represent emitters do not carry; and the ratio of the weight as
-    a single sample to that of one of several.
+    """Three factors.  Of the light of the sampled emitters: β f, minus the parts carried by virtual lights.  Of light
+    that passes null surfaces, which virtual lights that represent emitters do not carry: the same without these parts.
+    Of the weight of a sample: from one of several to a single sample.
 
     ``height``: cosine of the direction; ``value``, ``density``: of the BSDF; ``weight`` of the gather vertex; ``share``
     of the sample in the light, one over the number of samples.
@@ -248,8 +249,8 @@ def _lit(
         value, beyond = (dr.select(survives, one / survival, 0) for one in (value, beyond))
     mis, single = (power_heuristic(sample.density, density * number) for number in (share, 1))
     mis, single = (dr.select(sample.is_point, 1, one) for one in (mis, single))
-    ratio = dr.select(mis > 0, single / (share * mis), 0)
     mis = dr.select(hit.smooth & (sample.density > 0), share * mis, 0)
+    ratio = dr.select(mis > 0, single / mis, 0)
     return value * mis, beyond * mis, ratio
 
 

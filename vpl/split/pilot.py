@@ -92,7 +92,7 @@ class Pilot:
         """The pilot of traced paths in the pixels ``pixel`` (n,) of a view."""
         radiance, seen, difference = single_sample_radiance(traced), finite(traced.seen), finite(traced.difference)
         both = finite(channel_mean(traced.radiance))
-        alone = both + finite(traced.alone)
+        alone = both + finite(traced.alone_excess)
         edges = download(traced.edges).astype(np.int64)
         arrivals, onward, indirect = _second_vertices(traced.gathered.second, both, edges)
         first, facing = _first_vertices(traced.gathered.first)
@@ -235,6 +235,11 @@ def relative_errors(values: np.ndarray, brightness: np.ndarray, model: CostModel
     count = len(values) // 2
     first, second = values[: 2 * count].astype(np.float64).reshape(-1, 2).T
     return 0.5 * (first - second) ** 2 / error_scale(brightness, model)[: 2 * count : 2] ** 2
+
+
+def kept_of_both(before: np.ndarray, after: np.ndarray, model: CostModel) -> np.ndarray:
+    """Indices of two arrays of errors (n,) of the same pairs, without the pairs that hold the largest errors."""
+    return np.argsort(np.maximum(before, after))[: len(before) - model.left_out(len(before))]
 
 
 def error_scale(brightness: np.ndarray, model: CostModel) -> np.ndarray:

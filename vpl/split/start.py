@@ -20,7 +20,7 @@ from .emitter_samples import EmitterSamples, retained_fraction
 from .emitters.base import EmitterSampler
 from .emitters.cell_choice import learning_rays
 from .local_c import LocalC
-from .pilot import PILOT_SAMPLES, Pilot, pilot_lanes, relative_errors, single_sample_radiance
+from .pilot import PILOT_SAMPLES, Pilot, kept_of_both, pilot_lanes, relative_errors, single_sample_radiance
 from .plan import Evidence, Option
 from .view import Gathering, Stream, View, ViewLights
 
@@ -113,7 +113,7 @@ def learning_pilot(view: View) -> tuple[Pilot, bool]:
 def is_certain_rise(before: np.ndarray, after: np.ndarray, model: CostModel) -> bool:
     """Whether the mean of ``after`` (n,) exceeds that of ``before`` (n,) by more than a standard error, without the
     pairs that hold the largest values."""
-    kept = np.argsort(np.maximum(before, after))[: len(before) - model.left_out(len(before))]
+    kept = kept_of_both(before, after, model)
     rise = after[kept] - before[kept]
     return len(rise) > 1 and bool(rise.mean() > rise.std(ddof=1) / len(rise) ** 0.5)
 

@@ -40,11 +40,11 @@ def is_diffuse(flags: mi.UInt32) -> mi.Bool:
 def with_minorant(materials: Materials) -> Materials:
     """Those of the ``materials`` that have a minorant.
 
-    Not those
+    Two kinds of materials have none:
 
-    - with a bump or normal map: no BSDF sample goes above the surface but below the perturbed normal, so a virtual
-      light there would carry light never subtracted by the traced part;
-    - without a diffuse lobe: BSDF samples rarely go to directions with a value as low as the minorant, and would
+    - those with a bump or normal map: no BSDF sample goes above the surface but below the perturbed normal, so a
+      virtual light there would carry light never subtracted by the traced part;
+    - those without a diffuse lobe: BSDF samples rarely go to directions with a value as low as the minorant, and would
       subtract the minorant as fireflies.
     """
     diffuse = materials.having(mi.BSDFFlags.DiffuseReflection)
@@ -56,8 +56,8 @@ def minorant_of(
 ) -> mi.UnpolarizedSpectrum:
     """Minorant F of a BSDF (1 / sr): the value for a fixed pair of directions on one side.
 
-    ``side``: see :func:`side_of`; ``materials``: see :func:`with_minorant`, F is 0 for all others, and where a lane is
-    not ``active``.
+    ``side``: see :func:`side_of`; ``materials``: those with a minorant, see :func:`with_minorant`.  F is 0 for all
+    others, and where a lane is not ``active``.
     """
     turned, to_side = mi.SurfaceInteraction3f(si), mi.Vector3f(1, 1, side)
     turned.wi, out = (mi.Vector3f(*direction.tolist()) * to_side for direction in (_INCIDENT, _OUTGOING))

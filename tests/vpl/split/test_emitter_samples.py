@@ -83,6 +83,20 @@ def test_one_sample_suffices_if_its_own_weight_leaves_less_variance(noise, more)
         assert chosen.remains == pytest.approx(1 - (0.36 - 0.01) / (1 + MODEL.black) / 0.6, rel=0.05)
 
 
+def test_the_weight_of_a_single_sample_counts_where_a_pixel_takes_one():
+    """Its gain lies in the half without differences, and so remains beside more samples in the other half."""
+    noisy = ~left_half(np.repeat(np.random.default_rng(0).permutation(2048) % WIDTH**2, 2))
+    plain, own = effect(left_half), effect(left_half, noise=(0.6 * noisy, 0.1 * noisy))
+    assert own.best(0.6, 1.0, 64).multiple == plain.best(0.6, 1.0, 64).multiple > 0
+    assert own.best(0.6, 1.0, 64).remains < plain.best(0.6, 1.0, 64).remains
+
+
+@pytest.mark.parametrize("variance", [0.6, 1e-3])
+def test_some_noise_remains_whatever_the_pilot_measured(variance):
+    chosen = effect(lambda pixel: 0.1 + 0 * pixel, noise=(5.0, 0.0), samples_power=0.7).best(variance, 1.0, 64)
+    assert 1 / MODEL.most_emitter_samples <= chosen.remains * (1 + 1e-9) and chosen.remains < 1
+
+
 def test_few_samples_of_a_pixel_are_hardly_stratified():
     found = effect(lambda pixel: 0.5 + 0 * pixel, 0.05)
     assert found.retained(1) == 1 and found.retained(4) == pytest.approx(0.05**0.5)
