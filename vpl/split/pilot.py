@@ -99,20 +99,9 @@ class Pilot:
         vertices = np.concatenate([first, arrivals.position]), np.concatenate([facing, arrivals.normal])
         size, seed = (view.width, view.pixels), derived_seed(view.seed, Stream.OCTREE)
         return cls(
-            arrivals,
-            onward,
-            vertices,
-            pixel,
-            radiance,
-            seen,
-            difference,
-            alone,
-            indirect,
-            size,
-            view.scene,
-            seed,
+            arrivals, onward, vertices, pixel, radiance, seen, difference, alone, indirect, size, view.scene, seed,
             view.model,
-        )
+        )  # fmt: skip
 
     @cached_property
     def line_sampler(self) -> LineSampler:
