@@ -31,7 +31,7 @@ class Materials:
     def of(cls, shapes: SceneShapes) -> Materials:
         """The materials of all surfaces of a scene."""
         found = [shape.bsdf() for _, shape in shapes.of_hits]
-        return cls(list({id(bsdf): bsdf for bsdf in found if bsdf is not None}.values()))
+        return cls(list({id(bsdf): bsdf for bsdf in found}.values()))
 
     def where(self, test: Callable[[mi.BSDF], bool]) -> Materials:
         """The materials that pass a test."""
