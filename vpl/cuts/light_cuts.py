@@ -20,7 +20,7 @@ import numpy as np
 from ..core.arrays import NO_LIMIT, add_at, chunks, download, upload, upload_limit
 from ..lights.light_set import LightGroup, LightSet
 from ..points.surfaces import Batch
-from ..transport.bounds import contribution_bound
+from ..transport.bounds import contribution_bound, expected_error
 from ..transport.evaluation import Transport, evaluate_representatives
 
 # Pairs shaded and traced at a time: bounds the memory for any size of image and cuts
@@ -47,8 +47,9 @@ def _step(group: LightGroup, batch: Batch, threshold, smallest_distance, i):
     """Visit node ``i``: (whether the cut contains it, next node).  A bound of zero skips the node's subtree."""
     node = group.tree.gather(i)
     bound = contribution_bound(group.kind, batch.receiver, node, smallest_distance)
+    error = expected_error(group.kind, batch.receiver, node, bound) if batch.receiver.by_expected_error else bound
     reached = bound > 0
-    taken = reached & ((node.escape == i + 1) | (bound <= threshold))
+    taken = reached & ((node.escape == i + 1) | (error <= threshold))
     return taken, dr.select(taken | ~reached, node.escape, i + 1)
 
 

@@ -174,7 +174,9 @@ class Receiver:
 
     ``position``: of a point, or the centre of a node's box; ``normal``: shading normal on the viewer's side, or the
     axis of a node's cone of normals; ``extent``: half extents of the box (None for points); ``normal_cosine``,
-    ``mirror_cosine``: cosines of the half-angles of the cones of normals and of proxy axes (None for points).
+    ``mirror_cosine``: cosines of the half-angles of the cones of normals and of proxy axes (None for points);
+    ``by_expected_error``: whether light cuts compare thresholds with :func:`vpl.transport.bounds.expected_error`,
+    instead of the bound.
     """
 
     position: mi.Point3f
@@ -183,3 +185,4 @@ class Receiver:
     extent: mi.Point3f | None = None
     normal_cosine: mi.Float | None = None
     mirror_cosine: mi.Float | None = None
+    by_expected_error: bool = False

@@ -257,6 +257,7 @@ class Gatherer:
         allowed = self._errors(rays) * rays.numbers * np.maximum(brightness, self.darkest)
         precise = dr.float64_array_t(mi.Float)
         allowed = dr.gather(precise, upload(precise, allowed), clusters.pixel)
+        allowed *= dr.select(clusters.size > 1, 1, dr.opaque(precise, view.model.single_error))
         shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, part.first)
         for number, transport in enumerate(self.transports):
             stream = derived_seed(seed, 1, number)

@@ -42,7 +42,7 @@ class Receivers:
         count = dr.width(cosine)
         white, no = mi.Color3f(*(dr.opaque(mi.Float, 1.0, count) for _ in range(3))), mi.Bool(False)
         proxy = MaterialProxy(white, None, None, None, no, no, False, False)
-        return cls(Receiver(center, axis, proxy, extent, cosine))
+        return cls(Receiver(center, axis, proxy, extent, cosine, by_expected_error=True))
 
     @property
     def count(self) -> int:
@@ -57,9 +57,8 @@ class Receivers:
         )
         dr.eval(position, normal, extent, cosine, base)
         no = mi.Bool(False)
-        return Receivers(
-            Receiver(position, normal, MaterialProxy(base, None, None, None, no, no, False, False), extent, cosine)
-        )
+        proxy = MaterialProxy(base, None, None, None, no, no, False, False)
+        return Receivers(Receiver(position, normal, proxy, extent, cosine, by_expected_error=True))
 
 
 class PixelClusters:
