@@ -1,9 +1,10 @@
 """Light from virtual lights at gather vertices: a light cut for the vertices of a pixel with similar normals.
 
-These vertices form a cluster.  Bounds on the box and the cone of normals choose a light cut for the whole cluster, as
-in Multidimensional Lightcuts [MDLC].  For each pair of the cluster and a node of the cut, a vertex is drawn by weight
-and a light of the node by intensity.  Neighbouring pixels therefore share no representative lights.  Their errors are
-uncorrelated noise: samples average the noise out, and a denoiser recognises noise.
+These vertices form a cluster.  The box and the cone of normals choose a light cut for the whole cluster, as in
+Multidimensional Lightcuts [MDLC], but by expected errors (:func:`vpl.transport.bounds.expected_error`) instead of upper
+bounds.  For each pair of the cluster and a node of the cut, a vertex is drawn by weight and a light of the node by
+intensity.  Neighbouring pixels therefore share no representative lights.  Their errors are uncorrelated noise: samples
+average the noise out, and a denoiser recognises noise.
 
 Vertices are drawn by systematic sampling along the cut, from a random start for each cluster.  Successive nodes of a
 cut are near each other.  They light successive vertices, which mostly belong to different cells of a finer film.
@@ -183,9 +184,9 @@ def light_clusters(
 ) -> int:  # fmt: skip
     """Add the light of virtual lights at the clusters to ``result``, per camera ray; returns the number of shadow rays.
 
-    ``allowed``, for each cluster in double precision: largest bound of a pair, as a contribution to the sum over the
-    samples of the pixel; ``sums`` by layer.  A light of a node is drawn in proportion to intensity, so the drawn lights
-    of a group have the expectation of the lights of the group.
+    ``allowed``, for each cluster in double precision: largest expected error of a pair, as a contribution to the sum
+    over the samples of the pixel; ``sums`` by layer.  A light of a node is drawn in proportion to intensity, so the
+    drawn lights of a group have the expectation of the lights of the group.
     """
     # A cluster without weight may have any error
     threshold = mi.Float(allowed / dr.maximum(clusters.weight, np.finfo(np.float64).tiny))

@@ -21,7 +21,7 @@ from .pilot import Pilot, relative_variance
 from .view import ViewLights
 
 _TINY = np.finfo(np.float64).tiny
-_FEWEST_RAYS = 1e-9  # for a sample; the largest error bound limits the rays
+_FEWEST_RAYS = 1e-9  # for a sample; the largest error of cuts limits the rays
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,10 @@ class Plan:
     """Decision for an image.
 
     ``light_paths``: number of lines for drawing virtual lights on surfaces, 0 for none; ``emitters``: whether virtual
-    lights represent emitters; ``error``: bound of the cuts, as a fraction of the pixel; ``vertices``: lit vertices per
-    pixel; ``variance``: remaining relative variance of a camera path; ``of_lights``: variance of the lights on surfaces
-    and of the choice of lit vertices, in the same unit; ``cost`` of a path with its share of lights and cuts, over that
-    of a path alone; ``rays``: shadow rays of a pixel's cuts; ``reason`` in words.
+    lights represent emitters; ``error``: largest one of a pair in cuts, as a fraction of the pixel; ``vertices``: lit
+    vertices per pixel; ``variance``: remaining relative variance of a camera path; ``of_lights``: variance of the
+    lights on surfaces and of the choice of lit vertices, in the same unit; ``cost`` of a path with its share of lights
+    and cuts, over that of a path alone; ``rays``: shadow rays of a pixel's cuts; ``reason`` in words.
     """
 
     light_paths: int
@@ -301,7 +301,7 @@ def _planned(evidence: Evidence, option: Option, rest: float) -> tuple[float, Pl
 
 
 def _cut_rays(rest: float, cuts: float, samples: int, model: CostModel) -> tuple[float, float]:
-    """(Shadow rays of a pixel's cuts, error bound), where paths leave the relative variance ``rest``.
+    """(Shadow rays of a pixel's cuts, error of pairs), where paths leave the relative variance ``rest``.
 
     ``cuts``: variance and rays over those of cuts through surface lights.  For r rays of a sample, the least of
     (rest + cuts × cut variance / r)^power × (1 + cuts × r × cost of a ray), without fixed costs.  It is the positive
