@@ -65,7 +65,7 @@ class ManyLightsIntegrator(PassRenderer):
     F is the *minorant* of a BSDF, its Lambertian part.  Virtual lights carry the first part.  They lie on the surfaces
     where camera paths arrive, each with the irradiance that one path finds there, and a light tree clusters them.  The
     gather vertices of a pixel that face the same way share one light cut, as in Multidimensional Lightcuts, but refined
-    by expected errors instead of bounds, with a light drawn for every pair.  Paths trace the second part as ``path``
+    by expected errors instead of bounds, with a light drawn for each pair.  Paths trace the second part as ``path``
     does; most of them end at x2, where little is left.  w prevents bright spots in corners; c is a multiple of the
     distance between lights, at x2.  See :mod:`vpl.split`.
 

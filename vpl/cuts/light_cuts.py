@@ -1,4 +1,4 @@
-"""Light cuts by threshold: the coarsest clusters of a light tree with error bounds below a gather point's threshold.
+"""Light cuts by threshold: the coarsest clusters of a light tree with errors below a gather point's threshold.
 
 Lightcuts [LC section 4] refines the cluster with the largest bound until every bound is at most ``error`` times the
 radiance of the point.  For a given radiance the cut is independent of the order of refinement: from the root down, a
@@ -7,6 +7,9 @@ traversal continues at ``i + 1`` to refine and at ``escape[i]`` to accept or ski
 
 Departure from the paper, which compares bounds with the running total of the cut: thresholds follow from a radiance
 estimate, computed in advance with coarse cuts at few points (:func:`estimate_radiance`).
+
+The error of a cluster is the bound of its contribution, or for receivers with ``by_expected_error``, the expected error
+(:mod:`vpl.transport.bounds`).
 """
 
 from __future__ import annotations
@@ -109,7 +112,7 @@ def _sum_segments(values, offset, count):
 
 
 def cut_sizes(lights: LightSet, batch: Batch, threshold, most: int = 0) -> CutSizes:
-    """Sizes of the cuts at a threshold, the largest accepted bound per point.
+    """Sizes of the cuts at a threshold, the largest accepted error per point.
 
     Counting stops at the first node beyond ``most`` per group of lights (0: never).
     """

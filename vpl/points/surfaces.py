@@ -176,7 +176,7 @@ class Receiver:
     axis of a node's cone of normals; ``extent``: half extents of the box (None for points); ``normal_cosine``,
     ``mirror_cosine``: cosines of the half-angles of the cones of normals and of proxy axes (None for points);
     ``by_expected_error``: whether light cuts compare thresholds with :func:`vpl.transport.bounds.expected_error`,
-    instead of the bound.
+    which needs a white proxy, boxes and cones, instead of the bound.
     """
 
     position: mi.Point3f

@@ -148,9 +148,11 @@ class CostModel:
         "0.17 cornell to 4.6 classroom: the optimum is flat",
     )
     vertex_variance: float = _constant(
-        0.06, "relative variance", "Variance of a gather vertex that stands for its pixel; none where all are lit.",
+        0.06,
+        "relative variance",
+        "Relative variance of a single gather vertex that stands for its pixel; none where all vertices are lit.",
         "0.018 kitchen to 0.23 veach_ajar",
-    )  # fmt: skip
+    )
 
     # ---------------------- Costs ----------------------
     fixed_cost: float = _constant(
@@ -173,7 +175,8 @@ class CostModel:
         0.5,
         "paths",
         "The same in raw images: the whole cost of a ray.",
-        "raw variance × time over that with 0.2: kitchen 0.87, veach_ajar 0.84, hall 1.02; with 1.2: kitchen 0.89",
+        "raw variance × time over that with 0.2, 96 samples: kitchen 0.87, veach_ajar 0.84, classroom 0.83, hall 1.02; "
+        "with 1.2: 0.89, 0.93, 0.86",
     )
     emitter_cuts: float = _constant(
         0.4,
@@ -243,16 +246,13 @@ class CostModel:
         8.0, "shadow rays", "Most shadow rays of cuts for a sample, however little the paths leave.", _SENSITIVITY
     )
     coarse_rays: float = _constant(
-        14, "shadow rays", "Shadow rays of the cuts of a pixel at an expected error of 1.", "13 and 17 (decisions.md)"
+        14, "shadow rays", "Shadow rays of the cuts of a pixel at an expected error of 1.", "13, 17, 28 (decisions.md)"
     )
     error_slope: float = _constant(1.6, "exponent", "The error falls with this power of the rays.", _SENSITIVITY)
     finest_error: float = _constant(0.001, "fraction of the pixel", "Smallest error of a pair.", _SENSITIVITY)
     coarsest_error: float = _constant(2.0, "fraction of the pixel", "Largest error of a pair.", _SENSITIVITY)
     single_error: float = _constant(
-        4.0,
-        "ratio",
-        "Error of pairs of a single gather vertex over that of other pairs: they are many, and add little variance.",
-        "raw variance × time over that with 2: kitchen 0.99, classroom 0.97, veach_ajar 0.95, cornell 1.01",
+        4.0, "ratio", "Error of pairs of single gather vertices over that of others, up to the largest.", "decisions.md"
     )
     dark_pixel: float = _constant(
         0.1, "image means", "Pixels darker than this are lit as precisely as if they were as bright.", _SENSITIVITY

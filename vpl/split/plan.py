@@ -29,7 +29,7 @@ class Plan:
     """Decision for an image.
 
     ``light_paths``: number of lines for drawing virtual lights on surfaces, 0 for none; ``emitters``: whether virtual
-    lights represent emitters; ``error``: largest one of a pair in cuts, as a fraction of the pixel; ``vertices``: lit
+    lights represent emitters; ``error``: largest expected one of a pair, as a fraction of the pixel; ``vertices``: lit
     vertices per pixel; ``variance``: remaining relative variance of a camera path; ``of_lights``: variance of the
     lights on surfaces and of the choice of lit vertices, in the same unit; ``cost`` of a path with its share of lights
     and cuts, over that of a path alone; ``rays``: shadow rays of a pixel's cuts; ``reason`` in words.

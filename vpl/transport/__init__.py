@@ -1,4 +1,4 @@
-"""Light from virtual lights to gather points: contributions, visibility, and bounds of clusters.
+"""Light from virtual lights to gather points: contributions, visibility, bounds and expected errors of clusters.
 
 In the order to read in:
 
@@ -7,7 +7,7 @@ In the order to read in:
 - ``contribution``: the formula for the contribution of a light to a point, BSDF × cosine × geometry × intensity, and
   the shadow ray between them
 - ``bounds``: upper bounds of the contribution of a cluster of lights to a point or a cluster of points
-  [LC section 4.1; IC section 4]
+  [LC section 4.1; IC section 4], and the expected error of a light that represents the cluster
 - ``evaluation``: shades and traces pairs of a point and a light (``evaluate_pairs``), lists of lights in step
   (``sum_lights``), and every light (``sum_all_lights``, the oracle of every method); ``Transport``: the scene, the
   traits of surfaces, the lights

@@ -241,7 +241,7 @@ def decision(samples, pixels=10**6):
 
 
 def test_samples_of_larger_passes_share_cuts():
-    """The largest error bound limits how coarse the cuts of few samples are."""
+    """The largest error limits how coarse the cuts of few samples are."""
     one = decision(1)
     assert one.plan.gathers and one.growth(1) == 1
     sizes = np.array([1, 2, 4, 8, 16])
