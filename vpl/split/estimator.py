@@ -254,7 +254,9 @@ class Gatherer:
         traced = np.add.reduceat(radiance, rays.first[:-1]) / rays.numbers
         brightness = np.maximum(traced, 0) + self.expected[slice(*part.pixels)]
         # Of the sum over the samples of a pixel
-        allowed = self._errors(rays, clusters) * clusters.of_pixels(rays.numbers * np.maximum(brightness, self.darkest))
+        allowed = self._errors(rays) * rays.numbers * np.maximum(brightness, self.darkest)
+        precise = dr.float64_array_t(mi.Float)
+        allowed = dr.gather(precise, upload(precise, allowed), clusters.pixel)
         shadow_rays, seed = 0, derived_seed(view.seed, Stream.GATHER, part.first)
         for number, transport in enumerate(self.transports):
             stream = derived_seed(seed, 1, number)
@@ -265,10 +267,8 @@ class Gatherer:
         counts = {"shadow_rays": shadow_rays, "gather_points": points.count, "clusters": clusters.count}
         return lit, counts | {"later": points.alone}
 
-    def _errors(self, rays: PixelRays, clusters: PixelClusters):
-        """Largest expected error of the pairs of each cluster, as a fraction of its pixel: with as many shadow rays for
-        each camera ray, and fewer for single vertices, which are many and add little variance."""
+    def _errors(self, rays: PixelRays) -> np.ndarray:
+        """Largest error of a pair over the radiance of its pixel, (pixels,): with as many shadow rays for each ray."""
         model = self.view.model
         finer = (rays.numbers / rays.mean) ** -model.error_slope
-        errors = clusters.of_pixels(np.clip(self.plan.error * finer, model.finest_error, model.coarsest_error))
-        return dr.select(clusters.size > 1, errors, dr.minimum(errors * model.single_error, model.coarsest_error))
+        return np.clip(self.plan.error * finer, model.finest_error, model.coarsest_error)

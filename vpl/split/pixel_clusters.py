@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import add_at, channel_mean, upload
+from ..core.arrays import add_at, channel_mean
 from ..core.loops import recorded_once
 from ..core.sampling import derived_seed, find_interval, pair_samples, running_sums, systematic_samples
 from ..cuts.light_cuts import collect_cuts, limited_cuts
@@ -99,11 +99,6 @@ class PixelClusters:
     @property
     def count(self) -> int:
         return self.receivers.count
-
-    def of_pixels(self, values: np.ndarray):
-        """For each cluster the value of its pixel, from ``values`` (pixels,), in double precision."""
-        precise = type(self.cumulative)
-        return dr.gather(precise, upload(precise, values), self.pixel)
 
     def draw(self, cluster, sample):
         """Draw a vertex of each cluster by weight: (camera ray, white Lambertian surface, weight over probability)."""

@@ -70,7 +70,7 @@ def contribution_bound(kind: str, receiver: Receiver, node: Node, smallest_dista
     else:
         center, extent = node.center - receiver.position, node.extent
         if receiver.extent is not None:
-            extent += receiver.extent
+            extent = extent + receiver.extent
         radius = dr.norm(extent)
         distance2 = dr.squared_norm(dr.maximum(dr.abs(center) - extent, 0))
 
