@@ -25,7 +25,7 @@ from ..core.arrays import add_at, download, upload
 from ..lights.light_set import LightGroup, LightSet
 from ..lights.virtual_lights import AT_INFINITY
 from ..points.point_clusters import PointClusters
-from ..transport.bounds import contribution_bound
+from ..transport.bounds import chord, contribution_bound
 from .light_cuts import limited_cuts, upload_thresholds
 
 # Pairs classified at a time
@@ -77,18 +77,13 @@ class Pairs:
         return joined
 
 
-def _chord(cosine):
-    """Distance between two unit vectors with the given cosine."""
-    return dr.sqrt(dr.maximum(2 - 2 * cosine, 0))
-
-
 def _lights_spread_more(kind: str, points, lights):
     """Whether to split the light node of a pair rather than the point node."""
-    spread = _chord(points.receiver.normal_cosine)
+    spread = chord(points.receiver.normal_cosine)
     if points.receiver.mirror_cosine is not None:
-        spread += _chord(points.receiver.mirror_cosine)
+        spread += chord(points.receiver.mirror_cosine)
     if kind in AT_INFINITY:
-        return _chord(lights.cosine) > _CONE_WEIGHT * spread
+        return chord(lights.cosine) > _CONE_WEIGHT * spread
     distance = dr.norm(lights.center - points.receiver.position)
     return lights.radius > points.radius + _CONE_WEIGHT * distance * spread
 

@@ -52,14 +52,9 @@ class Receivers:
     def select(self, index) -> Receivers:
         """The clusters at ``index``, evaluated."""
         one = self.receiver
-        position, normal, extent, cosine, base = (
-            dr.gather(type(x), x, index)
-            for x in (one.position, one.normal, one.extent, one.normal_cosine, one.proxy.base)
-        )
-        dr.eval(position, normal, extent, cosine, base)
-        no = mi.Bool(False)
-        proxy = MaterialProxy(base, None, None, None, no, no, False, False)
-        return Receivers(Receiver(position, normal, proxy, extent, cosine, by_expected_error=True))
+        parts = [dr.gather(type(x), x, index) for x in (one.position, one.extent, one.normal, one.normal_cosine)]
+        dr.eval(parts)
+        return Receivers.of(*parts)
 
 
 class PixelClusters:

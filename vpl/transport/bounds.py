@@ -50,6 +50,11 @@ def cosine_less_angle(cosine, cone_cosine):
     return dr.select(cosine >= cone_cosine, 1, cosine * cone_cosine + sines)
 
 
+def chord(cosine):
+    """Distance between two unit vectors with the given cosine."""
+    return dr.sqrt(dr.maximum(2 - 2 * cosine, 0))
+
+
 def _nearest_cosine(cosine, cone_cosine):
     """The larger cosine where an axis is only known to lie in a cone (None: the axis is exact)."""
     return cosine if cone_cosine is None else cosine_less_angle(cosine, cone_cosine)
@@ -112,11 +117,8 @@ def expected_error(kind: str, receiver: Receiver, node: Node, bound):
     cosines = [dr.dot(receiver.normal, toward) * inverse, -dr.dot(node.axis, toward) * inverse]
     first_sine, second_sine = (dr.sqrt(dr.maximum(1 - dr.square(cosine), 0)) for cosine in cosines)
     first, second = (dr.maximum(cosine, 0) for cosine in cosines)
-    first_cone, second_cone = (
-        dr.sqrt(dr.maximum(2 - 2 * cosine, 0)) for cosine in (receiver.normal_cosine, node.cosine)
-    )
     change = extent * (2 * first * second + first_sine * second + first * second_sine)
-    change += first_cone * second + first * second_cone
+    change += chord(receiver.normal_cosine) * second + first * chord(node.cosine)
     share = carried_share(dr.square(node.least_c), first * second / distance2)
     change *= dr.square(share) / distance2
     # Roots one by one: squares of very bright and very dark lights are out of range

@@ -35,6 +35,12 @@ def pairs(rng, receivers: dict, lights: dict):
     return receiver, node
 
 
+def errors(receiver, node) -> tuple[np.ndarray, np.ndarray]:
+    """(Expected errors, bounds) of pairs, (n,) float64."""
+    bound = contribution_bound("surface", receiver, node, mi.Float(0))
+    return tuple(download(x).astype(np.float64) for x in (expected_error("surface", receiver, node, bound), bound))
+
+
 def random_boxes(rng, spread: float) -> dict:
     """Boxes with cones, in a room with a size of some units."""
     return {
@@ -86,8 +92,7 @@ def test_an_expected_error_is_that_of_its_definition(seed):
     rng = np.random.default_rng(seed)
     receivers, lights = (random_boxes(rng, 10.0 ** rng.uniform(-3, 1)) for _ in range(2))
     receiver, node = pairs(rng, receivers, lights)
-    bound = contribution_bound("surface", receiver, node, mi.Float(0))
-    error, bound = (download(x).astype(np.float64) for x in (expected_error("surface", receiver, node, bound), bound))
+    error, bound = errors(receiver, node)
     np.testing.assert_allclose(error, definition(receivers, lights, node, bound), rtol=1e-2, atol=1e-30)
 
 
@@ -96,8 +101,7 @@ def test_the_change_of_a_small_cluster_holds_the_deviation_of_its_members():
     rng = np.random.default_rng(3)
     receivers, lights = (random_boxes(rng, 1e-3) | {"cosine": np.ones(PAIRS)} for _ in range(2))
     receiver, node = pairs(rng, receivers, lights)
-    bound = contribution_bound("surface", receiver, node, mi.Float(0))
-    error, bound = (download(x).astype(np.float64) for x in (expected_error("surface", receiver, node, bound), bound))
+    error, bound = errors(receiver, node)
     centers = [x | {"extent": 0 * x["extent"]} for x in (receivers, lights)]
     at_center = drawn(rng, *centers, node)[:, :1]
     change, found = error**2 / np.maximum(bound, 1e-30), drawn(rng, receivers, lights, node)
@@ -110,12 +114,9 @@ def test_the_change_of_a_small_cluster_holds_the_deviation_of_its_members():
 def test_errors_grow_with_the_light(scale):
     rng = np.random.default_rng(4)
     receiver, node = pairs(rng, random_boxes(rng, 0.5), random_boxes(rng, 0.5))
-    errors = []
-    for factor in (1, scale):
-        scaled = SimpleNamespace(**vars(node) | {"intensity": node.intensity * factor})
-        bound = contribution_bound("surface", receiver, scaled, mi.Float(0))
-        errors.append(download(expected_error("surface", receiver, scaled, bound)).astype(np.float64))
-    np.testing.assert_allclose(errors[1] / scale, errors[0], rtol=1e-4)
+    scaled = SimpleNamespace(**vars(node) | {"intensity": node.intensity * scale})
+    (error, _), (of_scaled, _) = (errors(receiver, one) for one in (node, scaled))
+    np.testing.assert_allclose(of_scaled / scale, error, rtol=1e-4)
 
 
 def test_cuts_of_pixels_compare_expected_errors():
@@ -131,10 +132,9 @@ def test_cuts_of_pixels_compare_expected_errors():
     sizes = cut_sizes(lights, receivers, threshold)
     (chunk,) = collect_cuts(lights, receivers, threshold, sizes)
     node, receiver = group.tree.gather(chunk.nodes), receivers.select(chunk.rows).receiver
-    bound = contribution_bound("surface", receiver, node, mi.Float(0))
-    error, leaf = download(expected_error("surface", receiver, node, bound)), download(node.escape == chunk.nodes + 1)
+    (error, bound), leaf = errors(receiver, node), download(node.escape == chunk.nodes + 1)
     assert ((error <= 0.01 * (1 + 1e-5)) | leaf).all() and (error[~leaf] > 0).any()
-    assert (download(bound)[~leaf] > 0.01).mean() > 0.05
+    assert (bound[~leaf] > 0.01).mean() > 0.05
     rows = np.arange(0, PAIRS, 7)
     some = cut_sizes(lights, receivers.select(upload(mi.UInt32, rows)), dr.opaque(mi.Float, 0.01, len(rows)))
     np.testing.assert_array_equal(some.total(), sizes.total()[rows])
@@ -145,8 +145,7 @@ def test_errors_follow_the_deviation_of_representatives_more_closely_than_bounds
     rng = np.random.default_rng(1)
     receivers, lights = random_boxes(rng, 0.1), random_boxes(rng, 1.0)
     receiver, node = pairs(rng, receivers, lights)
-    bound = contribution_bound("surface", receiver, node, mi.Float(0))
-    error, bound = (download(x).astype(np.float64) for x in (expected_error("surface", receiver, node, bound), bound))
+    error, bound = errors(receiver, node)
     deviation = drawn(rng, receivers, lights, node).std(1)
     seen = (bound > 0) & (deviation > 0)
     assert seen.sum() > PAIRS // 4
@@ -160,9 +159,8 @@ def test_clusters_around_the_same_point_have_the_error_of_their_bound_or_less():
     boxes = random_boxes(rng, 1.0) | {"cosine": np.ones(PAIRS)}
     boxes["extent"][: PAIRS // 2] = 0
     receiver, node = pairs(rng, boxes, boxes)
-    bound = contribution_bound("surface", receiver, node, mi.Float(0))
-    error = download(expected_error("surface", receiver, node, bound))
-    assert np.isfinite(error).all() and (error <= download(bound) * (1 + 1e-5)).all()
+    error, bound = errors(receiver, node)
+    assert np.isfinite(error).all() and (error <= bound * (1 + 1e-5)).all()
 
 
 def test_other_kinds_of_lights_have_the_error_of_their_bound():
