@@ -41,10 +41,13 @@ class GatherVertices:
         weight = dr.zeros(mi.UnpolarizedSpectrum, count)
         return cls(mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0), weight, mi.UInt32(0))
 
-    def select(self, index: mi.UInt32, *factors: mi.Float) -> GatherVertices:
-        """The vertices at ``index``, with weights multiplied by ``factors``, evaluated."""
+    def select(self, index: mi.UInt32, factor: mi.Float | None = None) -> GatherVertices:
+        """The vertices at ``index``, with weights multiplied by the ``factor`` of each (default: 1), evaluated."""
+        factor = dr.opaque(mi.Float, 1.0, len(index)) if factor is None else factor
+        # Every selection uses the same kernel
+        dr.eval(index, factor)
         picked = GatherVertices(*(dr.gather(type(x), x, index) for x in vars(self).values()))
-        for factor in factors if len(index) else ():
+        if len(index):
             picked.weight *= factor
         dr.eval(picked)
         return picked

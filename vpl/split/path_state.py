@@ -76,6 +76,22 @@ class Hit:
 
 
 @dataclass
+class Vertex:
+    """Vertices where paths scatter.
+
+    ``hit``; ``gathers``, ``weight``: mask and weights of gather vertices; ``cell`` of the emitter sampler; ``samples``:
+    number of emitter samples; ``numbers`` of the lattice.
+    """
+
+    hit: Hit
+    gathers: mi.Bool
+    weight: mi.UnpolarizedSpectrum
+    cell: mi.UInt32
+    samples: mi.UInt32
+    numbers: tuple
+
+
+@dataclass
 class Traced:
     """Result of :func:`trace_paths`, one record per lane, evaluated.
 

@@ -34,7 +34,7 @@ from .contributions import Contributions, LayerSums
 from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
 from .gather_vertices import Gathered, GatherVertices, SecondVertices
 from .lattice import Lattice
-from .path_state import Hit, Path, Traced
+from .path_state import Hit, Path, Traced, Vertex
 from .roulette import residual_survival, throughput_survival
 from .view import FirstEdge, Gathering, PathSettings, State
 
@@ -83,14 +83,14 @@ def trace_paths(
         path.scattered += dr.select(hit.smooth, 1, 0)
         samples = dr.select(hit.smooth & (path.scattered == 1), first.direct_samples, 1)
         cell = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side)
-        numbers = lattice.at(path.depth)
+        vertex = Vertex(hit, gathers, weight, cell, samples, lattice.at(path.depth))
         turned, bsdf_weight, of_vertex, more = _sample_emitters(
-            scene, emitters, path, hit, weight, cell, samples, numbers, settings, sampler, found, lane
+            scene, emitters, path, vertex, settings, sampler, found, lane
         )
         difference, alone_excess = difference + of_vertex, alone_excess + more
 
         # ---------------------- Onward by the sample of the BSDF ----------------------
-        survival = _turn(path, hit, turned, bsdf_weight, gathers, weight, cell, samples, emitters.traits)
+        survival = _turn(path, vertex, turned, bsdf_weight, emitters.traits)
 
         # ---------------------- Russian roulette: residual of the direction, and throughput ----------------------
         _end_at_direction(path, hit, survival, settings, sampler.next_1d())
@@ -108,15 +108,15 @@ def trace_paths(
 
 @dr.syntax
 def _sample_emitters(
-    scene, emitters: EmitterSampler, path: Path, hit: Hit, weight, cell, samples: mi.UInt32, numbers: tuple,
-    settings: PathSettings, sampler, found: Contributions, lane,
+    scene, emitters: EmitterSampler, path: Path, vertex: Vertex, settings: PathSettings, sampler, found: Contributions,
+    lane,
 ):  # fmt: skip
-    """Add the light of emitters by ``samples`` samples at each vertex to ``found``.
+    """Add the light of emitters by the samples at each vertex to ``found``.
 
-    ``numbers`` of the lattice; ``weight`` of the gather vertex.  Returns (sample of the BSDF; its weight; parts of the
-    vertex in ``difference`` and in ``alone_excess`` of :class:`vpl.split.path_state.Traced`, 0 for a single sample).
+    Returns (sample of the BSDF; its weight; parts of the vertex in ``difference`` and in ``alone_excess`` of
+    :class:`vpl.split.path_state.Traced`, 0 for a single sample).
     """
-    count = dr.width(lane)
+    count, hit, samples = dr.width(lane), vertex.hit, vertex.samples
     # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
     scatters, share = path.active & ~hit.hidden & (hit.goes_on | ~path.valid), dr.rcp(mi.Float(samples))
     turned, bsdf_weight = dr.zeros(mi.BSDFSample3f, count), dr.zeros(mi.Spectrum, count)
@@ -124,18 +124,16 @@ def _sample_emitters(
     difference, alone_excess = dr.zeros(mi.Float, count), dr.zeros(mi.Float, count)
     while dr.hint(
         number < samples,
-        exclude=[
-            scene, emitters, path, hit, weight, cell, samples, numbers, settings, lane, scatters, share, edges
-        ],
-    ):  # fmt: skip
-        chosen, place, lobe, turn = _numbers_of_sample(numbers, number)
-        sample = emitters.sample(hit.si, cell, chosen, sampler.next_1d(), place, hit.smooth)
+        exclude=[scene, emitters, path, vertex, hit, samples, settings, lane, scatters, share, edges],
+    ):
+        chosen, place, lobe, turn = _numbers_of_sample(vertex.numbers, number)
+        sample = emitters.sample(hit.si, vertex.cell, chosen, sampler.next_1d(), place, hit.smooth)
         # A single call for both: each call adds the code of every material to the kernel
         toward = hit.si.to_local(sample.direction)
         value, density, turned, bsdf_weight = emitters.traits.materials.call(
             hit.bsdf, _evaluated_and_sampled, hit.si, toward, lobe, turn, active=scatters
         )
-        lit, beyond, single = _lit(path, hit, sample, toward.z, value, density, weight, share, settings, sampler)
+        lit, beyond, single = _lit(path, vertex, sample, toward.z, value, density, share, settings, sampler)
         arriving, crossings = sample.arriving(
             scene, emitters.traits, settings.max_depth - edges, dr.max(dr.abs(beyond)) > 0
         )
@@ -228,15 +226,16 @@ def _gather(path: Path, hit: Hit, settings: PathSettings, gathered: Gathered, sa
 
 
 def _lit(
-    path: Path, hit: Hit, sample: EmitterSample, height, value, density, weight, share, settings: PathSettings, sampler
+    path: Path, vertex: Vertex, sample: EmitterSample, height, value, density, share, settings: PathSettings, sampler
 ):  # fmt: skip
     """Three factors.  Of the light of the sampled emitters: β f, minus the parts carried by virtual lights.  Of light
     that passes null surfaces, which virtual lights that represent emitters do not carry: the same without these parts.
     Of the weight of a sample: from one of several to a single sample.
 
-    ``height``: cosine of the direction; ``value``, ``density``: of the BSDF; ``weight`` of the gather vertex; ``share``
-    of the sample in the light, one over the number of samples.
+    ``height``: cosine of the direction; ``value``, ``density``: of the BSDF; ``share`` of the sample in the light, one
+    over the number of samples.
     """
+    hit, weight = vertex.hit, vertex.weight
     full = path.throughput * mi.unpolarized_spectrum(value)
     cosine = dr.select(height * hit.side > 0, dr.abs(height), 0)
     value = beyond = full - path.carried * cosine
@@ -254,15 +253,14 @@ def _lit(
     return value * mis, beyond * mis, ratio
 
 
-def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight, cell, samples, traits: SceneTraits):
-    """Continue along a BSDF sample ``bs`` with its weight; returns the survival probability by the residual.
-
-    ``gathers``, ``weight``: mask and weights of gather vertices, carried on by the path; ``cell`` of the vertex, and
-    its number of emitter ``samples``.
+def _turn(path: Path, vertex: Vertex, bs, bsdf_weight, traits: SceneTraits):
+    """Continue along a BSDF sample ``bs`` with its weight, and carry the weight of gather vertices on; returns the
+    survival probability by the residual.
 
     A path that passes a null surface keeps the vertex and the density of its direction: next-event estimation passes
     null surfaces as well.
     """
+    hit, gathers = vertex.hit, vertex.gathers
     full = path.throughput * mi.unpolarized_spectrum(bsdf_weight)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     # Like `path`, by the sampled direction, even if the path ends
@@ -276,7 +274,7 @@ def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight, cell, samples,
     # At diffuse surfaces the residual is the same in all directions, and has ended paths before
     judged = (dr.max(dr.abs(path.carried)) > 0) & ~hit.is_diffuse
     survival = residual_survival(path.throughput, full, judged)
-    path.carried = weight * lambertian
+    path.carried = vertex.weight * lambertian
     onward = dr.select(gathers & ~delta, mi.UInt32(State.CONNECTING), mi.UInt32(State.PAST))
     path.state = dr.select((path.state == State.SEEKING) & ~gathers, mi.UInt32(State.SEEKING), onward)
     path.ray = hit.si.spawn_ray(dr.select(hit.hidden, path.ray.d, hit.si.to_world(bs.wo)))
@@ -284,8 +282,8 @@ def _turn(path: Path, hit: Hit, bs, bsdf_weight, gathers, weight, cell, samples,
     if traits.null:
         # Some materials do not tell what they transmit, and block shadow rays
         turns = ~(null & (dr.max(traits.transmission(hit.si, null & path.active)) > 0))
-    path.vertex, path.cell = dr.select(turns, hit.si.p, path.vertex), dr.select(turns, cell, path.cell)
-    path.emitter_samples = dr.select(turns, samples, path.emitter_samples)
+    path.vertex, path.cell = dr.select(turns, hit.si.p, path.vertex), dr.select(turns, vertex.cell, path.cell)
+    path.emitter_samples = dr.select(turns, vertex.samples, path.emitter_samples)
     path.density, path.delta = dr.select(turns, bs.pdf, path.density), dr.select(turns, delta, path.delta)
     path.depth += dr.select(hit.goes_on, 1, 0)
     return survival

@@ -88,6 +88,7 @@ class LearnedEmitters(CellEmitters):
         self._environment = scene.environment()
         of_environment = np.array([emitter.is_environment() for emitter in emitters])
         self._environment_number = int(of_environment.argmax()) if self._environment is not None else -1
+        self._on_surfaces = not of_environment.all()
         self._regions = None
         if weight[of_environment].any():
             self._regions = regions_of(self._environment, _REGIONS, _COLUMNS)
@@ -187,9 +188,11 @@ class LearnedEmitters(CellEmitters):
         wanted = active & has_density & (emitter != None)  # noqa: E711
         found = self._number_of.at(emitter, wanted)
         wanted, number = wanted & (found > 0), found - 1
-        near = wanted & si.is_valid()
-        probability = self.choice.probability(cell, number, near)
-        density = emitter.pdf_direction(origin, ds, near) * probability
+        density = mi.Float(0)
+        if self._on_surfaces:
+            # The call of a single emitter, a sky with a sun, would be 7% of the kernel
+            near = wanted & si.is_valid()
+            density = emitter.pdf_direction(origin, ds, near) * self.choice.probability(cell, number, near)
         if self._regions:
             # A branch, because few packets hold a path that leaves the scene
             density = dr.if_stmt(
