@@ -21,7 +21,8 @@ in ``product`` also ``manylights``.
   ``--scenes``, also in scenes where virtual lights gain little.
 - ``classes``: shares of classes of light in the variance, see :mod:`benchmarks.noise_classes`.
 - ``lights``: variance × time of ``manylights`` with fewer and more light paths than it chooses.
-- ``cold``: seconds and peak memory of the first render of a process, 16 samples per pixel, with an empty kernel cache.
+- ``cold``: seconds and peak memory of the first render of a process, 16 samples per pixel, with an empty kernel cache,
+  and with the kernels of another scene.
 """
 
 from __future__ import annotations
@@ -54,6 +55,8 @@ PARTS = ("product", "timed", "denoised", "cost", "classes", "lights", "cold")
 # Light paths, as multiples of the chosen number
 SWEEP = (1 / 4, 1 / 2, 1, 2, 4)
 COLD_SPP = 16
+# The scene that was rendered before another one, and before itself
+BEFORE = ("cornell", "glossy")
 _COLD = """
 import resource, sys, time
 start = time.perf_counter()
@@ -196,27 +199,38 @@ def lights(names, width: int, seconds: float, passes: int) -> dict:
 
 
 def cold(names, width: int) -> dict:
-    """Print seconds and peak memory of first renders with an empty kernel cache, each in a new process."""
+    """Print seconds and peak memory of first renders of a process, with an empty kernel cache, and seconds with that of
+    another scene."""
     rows = {}
-    print(f"cold, {width} wide, {COLD_SPP} samples: seconds of the first render, peak GiB")
+    print(f"cold, {width} wide, {COLD_SPP} samples: seconds of the first render, peak GiB; seconds after another scene")
     for name in names:
-        found = []
+        before = BEFORE[name == BEFORE[0]]
+        rows[name] = {}
         for kind in KINDS:
-            with tempfile.TemporaryDirectory() as cache:
-                environment = os.environ | {"DRJIT_CACHE_DIR": cache, "PYTHONPATH": str(scenes.PROJECT)}
-                command = [sys.executable, "-c", _COLD, kind, name, str(width), str(COLD_SPP)]
-                output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-            found.append([float(value) for value in output.split()[-2:]])
-        (theirs, their_memory), (ours, our_memory) = found
-        within = "" if ours <= 2 * theirs + 1 else "  above 2 × path + 1 s"
-        print(
-            f"{name:16s} path {theirs:5.1f} s, {their_memory:.2f}; manylights {ours:5.1f} s, {our_memory:.2f}{within}",
-            flush=True,
-        )
-        rows[name] = {
-            kind: {"seconds": spent, "memory": memory} for kind, (spent, memory) in zip(KINDS, found, strict=True)
-        }
+            seconds, memory = first_render(kind, name, width)
+            later, _ = first_render(kind, name, width, before)
+            rows[name][kind] = {"seconds": seconds, "memory": memory, "new_scene_seconds": later}
+        theirs, ours = (rows[name][kind] for kind in KINDS)
+        columns = [
+            f"{kind} {row['seconds']:5.1f} s, {row['memory']:.2f}; {row['new_scene_seconds']:5.1f} s"
+            for kind, row in rows[name].items()
+        ]
+        above = [key for key in ("seconds", "new_scene_seconds") if ours[key] > 2 * theirs[key] + 1]
+        within = f"  above 2 × path + 1 s: {', '.join(above)}" if above else ""
+        print(f"{name:16s} {'; '.join(columns)}{within}", flush=True)
     return rows
+
+
+def first_render(kind: str, name: str, width: int, before: str | None = None) -> tuple[float, float]:
+    """(Seconds, peak GiB) of the first render of a scene in a new process.  The kernel cache is empty, or holds the
+    kernels of the scene ``before``."""
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"DRJIT_CACHE_DIR": cache, "PYTHONPATH": str(scenes.PROJECT)}
+        for scene in filter(None, (before, name)):
+            command = [sys.executable, "-c", _COLD, kind, scene, str(width), str(COLD_SPP)]
+            output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    seconds, memory = output.split()[-2:]
+    return float(seconds), float(memory)
 
 
 def main() -> None:

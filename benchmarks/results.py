@@ -41,6 +41,7 @@ UNITS = {
     "load_seconds": "s",
     "loss": "mean squared error of an image, over its squared target plus a hundredth of the squared mean",
     "memory": "GiB at the peak, above the loaded scene where `path` has none",
+    "new_scene_seconds": "s of the first render with the compiled kernels of another scene",
     "plain_speedup": "as speedup, by the variances of all pixels",
     "product": "relative variance times s",
     "product_ratio": "product over that with the chosen value",

@@ -158,6 +158,8 @@ TABLES = {
         (
             Column("`path` s", "{path[seconds]:.1f}"),
             Column("`manylights` s", "{manylights[seconds]:.1f}"),
+            Column("new scene: `path` s", "{path[new_scene_seconds]:.1f}"),
+            Column("new scene: `manylights` s", "{manylights[new_scene_seconds]:.1f}"),
             Column("`path` GiB, 1024 wide", "{large[path][memory]:.1f}"),
             Column("`manylights` GiB, 1024 wide", "{large[manylights][memory]:.1f}"),
         ),

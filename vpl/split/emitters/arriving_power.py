@@ -82,7 +82,7 @@ def arriving_power(looks: Looks, sources: int, neighbours: np.ndarray) -> mi.Flo
     visible = dr.gather(precise, of_cell, cell) * dr.gather(precise, of_source, source)
     visible = dr.minimum(visible / dr.maximum(of_all, 1e-9), 1)
     # The mean of roots, because a neighbour may be next to an emitter that is far from this cell
-    power, prior = dr.sqrt(looks.found), _PRIOR * dr.sqrt(visible * looks.possible)
+    power, prior = mi.Float(dr.sqrt(looks.found)), _PRIOR * dr.sqrt(visible * looks.possible)
     dr.eval(power, prior, cell, source)
     around, most = upload(mi.UInt32, neighbours), dr.opaque(mi.UInt32, neighbours.shape[1])
     total = prior + RAYS * _around(power, around, most, cell, source, stride)
