@@ -21,14 +21,16 @@ in ``product`` also ``manylights``.
   ``--scenes``, also in scenes where virtual lights gain little.
 - ``classes``: shares of classes of light in the variance, see :mod:`benchmarks.noise_classes`.
 - ``lights``: variance × time of ``manylights`` with fewer and more light paths than it chooses.
-- ``cold``: seconds and peak memory of the first render of a process, 16 samples per pixel, with an empty kernel cache,
-  and with the kernels of another scene.
+- ``cold``: seconds and peak memory of the first render of a process, 16 samples per pixel, with an empty kernel cache;
+  seconds with the kernels of another scene.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -55,8 +57,8 @@ PARTS = ("product", "timed", "denoised", "cost", "classes", "lights", "cold")
 # Light paths, as multiples of the chosen number
 SWEEP = (1 / 4, 1 / 2, 1, 2, 4)
 COLD_SPP = 16
-# The scene that was rendered before another one, and before itself
-BEFORE = ("cornell", "glossy")
+# Scene whose kernels are in the cache when another scene is new, and the one for cornell itself
+BEFORE, BEFORE_ITSELF = "cornell", "glossy"
 _COLD = """
 import resource, sys, time
 start = time.perf_counter()
@@ -199,36 +201,45 @@ def lights(names, width: int, seconds: float, passes: int) -> dict:
 
 
 def cold(names, width: int) -> dict:
-    """Print seconds and peak memory of first renders of a process, with an empty kernel cache, and seconds with that of
-    another scene."""
+    """Print seconds and peak memory of first renders of a process with an empty kernel cache, and seconds with the
+    kernels of another scene."""
     rows = {}
     print(f"cold, {width} wide, {COLD_SPP} samples: seconds of the first render, peak GiB; seconds after another scene")
     for name in names:
-        before = BEFORE[name == BEFORE[0]]
+        before = BEFORE_ITSELF if name == BEFORE else BEFORE
         rows[name] = {}
         for kind in KINDS:
-            seconds, memory = first_render(kind, name, width)
-            later, _ = first_render(kind, name, width, before)
+            with tempfile.TemporaryDirectory() as cache:
+                seconds, memory = first_render(kind, name, width, cache)
+            with tempfile.TemporaryDirectory() as cache:
+                shutil.copytree(cache_after(kind, before, width).name, cache, dirs_exist_ok=True)
+                later, _ = first_render(kind, name, width, cache)
             rows[name][kind] = {"seconds": seconds, "memory": memory, "new_scene_seconds": later}
         theirs, ours = (rows[name][kind] for kind in KINDS)
         columns = [
             f"{kind} {row['seconds']:5.1f} s, {row['memory']:.2f}; {row['new_scene_seconds']:5.1f} s"
             for kind, row in rows[name].items()
         ]
-        above = [key for key in ("seconds", "new_scene_seconds") if ours[key] > 2 * theirs[key] + 1]
+        states = {"seconds": "empty cache", "new_scene_seconds": "new scene"}
+        above = [state for key, state in states.items() if ours[key] > 2 * theirs[key] + 1]
         within = f"  above 2 × path + 1 s: {', '.join(above)}" if above else ""
         print(f"{name:16s} {'; '.join(columns)}{within}", flush=True)
     return rows
 
 
-def first_render(kind: str, name: str, width: int, before: str | None = None) -> tuple[float, float]:
-    """(Seconds, peak GiB) of the first render of a scene in a new process.  The kernel cache is empty, or holds the
-    kernels of the scene ``before``."""
-    with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | {"DRJIT_CACHE_DIR": cache, "PYTHONPATH": str(scenes.PROJECT)}
-        for scene in filter(None, (before, name)):
-            command = [sys.executable, "-c", _COLD, kind, scene, str(width), str(COLD_SPP)]
-            output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+@functools.cache
+def cache_after(kind: str, name: str, width: int) -> tempfile.TemporaryDirectory:
+    """Kernel cache after the first render of a scene."""
+    folder = tempfile.TemporaryDirectory()
+    first_render(kind, name, width, folder.name)
+    return folder
+
+
+def first_render(kind: str, name: str, width: int, cache: str) -> tuple[float, float]:
+    """(Seconds, peak GiB) of the first render of a scene in a new process, with the kernels in the folder ``cache``."""
+    environment = os.environ | {"DRJIT_CACHE_DIR": cache, "PYTHONPATH": str(scenes.PROJECT)}
+    command = [sys.executable, "-c", _COLD, kind, name, str(width), str(COLD_SPP)]
+    output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
     seconds, memory = output.split()[-2:]
     return float(seconds), float(memory)
 

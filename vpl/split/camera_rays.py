@@ -21,8 +21,8 @@ class CameraRays:
     """Some camera rays of a view.
 
     ``ray``; ``active``; ``importance`` of radiance, for Russian roulette; ``direct_samples``: number of emitter samples
-    at the first scattering vertex; ``places`` in pixels, all evaluated; ``sizes``: the different numbers of rays of
-    pixels; ``cells`` of the film in a pixel.
+    at the first scattering vertex; ``places`` in pixels; ``sizes``: the different numbers of rays of pixels; ``cells``
+    of the film in a pixel.
     """
 
     ray: mi.Ray3f
@@ -38,12 +38,11 @@ class CameraRays:
         """The rays with the indices ``lane``."""
         ray, places = view.ray, view.rays.places(lane)
         part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
-        # All numbers of rays, and counted and chosen lanes, use the same kernels
+        # All numbers of rays, and counted and chosen lanes, use the same kernel
         dr.eval(lane, places)
         importance = dr.gather(mi.Float, view.importance, places.pixel)
         samples = dr.gather(mi.UInt32, view.direct_samples, places.pixel)
         active = dr.gather(mi.Bool, view.active, lane)
-        dr.eval(part, importance, samples, active)
         return cls(part, active, importance, samples, places, view.rays.sizes, view.rays.cells)
 
     def trace(

@@ -165,6 +165,8 @@ def _with_surfaces(view: View, traced: Pilot, lights: ViewLights) -> list[Option
     with_surfaces = replace(lights, surfaces=view.light_set([]), c=LocalC.constant(0.0))
     settings = view.settings(with_surfaces, Gathering.AT_FIRST)
     rays = CameraRays.of(view, upload(mi.UInt32, pilot_lanes(view)))
+    # Otherwise the rays would keep those of the view
+    dr.eval(rays.ray, rays.active, rays.importance, rays.direct_samples, rays.places)
     measured = partial(rays.trace, view.scene, view.emitters, derived_seed(view.seed, Stream.PILOT), settings)
 
     def residual():

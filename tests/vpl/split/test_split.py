@@ -273,6 +273,30 @@ def test_so_many_vertices_of_a_pixel_are_lit_evenly_among_its_samples(samples, m
     assert set(apart) <= {samples // kept, -(-samples // kept)}
 
 
+@pytest.mark.parametrize("chosen", [[], [4, 0, 4, 2]])
+def test_selected_vertices_have_their_weights_times_the_factors(chosen):
+    """With factors and without, by the same kernel."""
+    rng, count = np.random.default_rng(2), 5
+    columns = rng.normal(size=(4, count, 3))
+    place = [kind(points(x)) for kind, x in zip((mi.Point3f, mi.Normal3f, mi.Normal3f), columns[:3], strict=True)]
+    weight, depth = mi.UnpolarizedSpectrum(points(columns[3])), dr.arange(mi.UInt32, count) + 1
+    vertices, factor = GatherVertices(*place, weight, depth), rng.uniform(1, 2, len(chosen))
+    kernels = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for factors in (None, factor):
+            dr.eval(vertices)
+            index = upload(mi.UInt32, chosen)
+            dr.kernel_history_clear()
+            found = vertices.select(index, None if factors is None else upload(mi.Float, factors))
+            kernels.append({kernel["hash"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT})
+            expected = columns[3][chosen] * (1 if factors is None else factors[:, None])
+            assert dr.width(found.depth) == len(chosen) and np.all(np.array(found.depth) == np.array(chosen) + 1)
+            if chosen:
+                np.testing.assert_allclose(download(found.weight), expected, rtol=1e-6)
+                np.testing.assert_allclose(download(found.position), columns[0][chosen], rtol=1e-6)
+    assert kernels[0] == kernels[1]
+
+
 def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
     rng, count, samples = np.random.default_rng(1), 400, 8
     weight = rng.uniform(0.01, 1, (count, 3))

@@ -83,7 +83,7 @@ def arriving_power(looks: Looks, sources: int, neighbours: np.ndarray) -> mi.Flo
     visible = dr.minimum(visible / dr.maximum(of_all, 1e-9), 1)
     # The mean of roots, because a neighbour may be next to an emitter that is far from this cell
     power, prior = mi.Float(dr.sqrt(looks.found)), _PRIOR * dr.sqrt(visible * looks.possible)
-    dr.eval(power, prior, cell, source)
+    dr.eval(power, prior)
     around, most = upload(mi.UInt32, neighbours), dr.opaque(mi.UInt32, neighbours.shape[1])
     total = prior + RAYS * _around(power, around, most, cell, source, stride)
     rays = upload(precise, RAYS * np.count_nonzero(neighbours, 1) + _PRIOR)
@@ -99,7 +99,7 @@ def arriving_power(looks: Looks, sources: int, neighbours: np.ndarray) -> mi.Flo
 def _around(power, around, most, cell, source, stride):
     """Sum of the ``power`` of the ``most`` neighbours ``around`` each pair's ``cell``, for the same ``source``.
 
-    A loop: a sum of 26 terms takes four times as long to compile.
+    A loop, because an unrolled sum takes ten times as long to compile.
     """
     total, number = dr.zeros(type(power), dr.width(cell)), dr.zeros(mi.UInt32, dr.width(cell))
     while dr.hint(number < most, exclude=[power, around, most, cell, source, stride]):
