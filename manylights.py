@@ -79,8 +79,8 @@ def layer_names(text):
     return names
 
 
-def parse(arguments):
-    """Parse the command line and return the options. Exits with status 2 and a message if it is invalid."""
+def _parser():
+    """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog="manylights", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -135,6 +135,12 @@ def parse(arguments):
     add("--exposure", type=float, metavar="STOPS",
         help="scale PNG images by 2^STOPS (default: bring the 95th percentile of the brightness to 0.8)")  # fmt: skip
     command_line.add_common_options(parser)
+    return parser
+
+
+def parse(arguments):
+    """Parse the command line and return the options. Exits with status 2 and a message if it is invalid."""
+    parser = _parser()
     options = parser.parse_args(arguments)
     if options.denoise_quality and not options.denoise:
         parser.error("--denoise-quality needs --denoise")
