@@ -19,7 +19,6 @@ falls as 1 / time, so a method's time for another error is its own time, scaled;
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 import tempfile
@@ -229,8 +228,6 @@ def number_of_lights(options) -> dict:
 
 
 _COLD = """
-import sys
-sys.path.insert(0, {project!r})
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 import integrators
@@ -260,12 +257,8 @@ def cold_starts(options) -> dict:
             shown = []
             for kind in ("adaptivedirect", "path"):
                 with tempfile.TemporaryDirectory() as cache:
-                    code = _COLD.format(project=str(scenes.PROJECT), file=file, plugin={"type": kind, "max_depth": 2})
-                    environment = {**os.environ, "DRJIT_CACHE_DIR": cache}
-                    done = subprocess.run(
-                        [sys.executable, "-c", code], env=environment, check=True, capture_output=True, text=True
-                    )
-                first, second = map(float, done.stdout.split()[-2:])
+                    code = _COLD.format(file=file, plugin={"type": kind, "max_depth": 2})
+                    first, second = scenes.numbers_of(code, cache, 2)
                 shown.append(f"{first:.1f}, {second:.1f}")
                 rows.setdefault(name, {})[kind] = {"seconds": first, "second_seconds": second}
             print(f"{name} | {shown[0]} | {shown[1]}", flush=True)

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -145,8 +143,6 @@ def _seconds_alone(plugin, job) -> float:
 
 
 _COLD = """
-import sys, time
-sys.path.insert(0, {project!r})
 import mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 import integrators
@@ -168,14 +164,8 @@ def cold_starts(names) -> dict:
             runs = []
             for _ in range(3):
                 with tempfile.TemporaryDirectory() as cache:
-                    code = _COLD.format(
-                        project=str(scenes.PROJECT), name=name, plugin={"type": plugin, "max_depth": DEPTH}
-                    )
-                    environment = {**os.environ, "DRJIT_CACHE_DIR": cache}
-                    done = subprocess.run(
-                        [sys.executable, "-c", code], env=environment, check=True, capture_output=True, text=True
-                    )
-                    runs.append(float(done.stdout.split()[-1]))
+                    code = _COLD.format(name=name, plugin={"type": plugin, "max_depth": DEPTH})
+                    runs += scenes.numbers_of(code, cache, 1)
             seconds[plugin] = float(np.median(runs))
         rows[name] = {plugin: {"seconds": spent} for plugin, spent in seconds.items()}
         ratio = seconds["lightcuts"] / seconds["path"]

@@ -29,9 +29,7 @@ from __future__ import annotations
 
 import argparse
 import functools
-import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from fractions import Fraction
@@ -237,11 +235,8 @@ def cache_after(kind: str, name: str, width: int) -> tempfile.TemporaryDirectory
 
 def first_render(kind: str, name: str, width: int, cache: str) -> tuple[float, float]:
     """(Seconds, peak GiB) of the first render of a scene in a new process, with the kernels in the folder ``cache``."""
-    environment = os.environ | {"DRJIT_CACHE_DIR": cache, "PYTHONPATH": str(scenes.PROJECT)}
-    command = [sys.executable, "-c", _COLD, kind, name, str(width), str(COLD_SPP)]
-    output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-    seconds, memory = output.split()[-2:]
-    return float(seconds), float(memory)
+    seconds, memory = scenes.numbers_of(_COLD, cache, 2, kind, name, width, COLD_SPP)
+    return seconds, memory
 
 
 def main() -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -101,6 +104,15 @@ def timed(function, clock=time.perf_counter):
     dr.eval(result)
     dr.sync_thread()
     return result, clock() - start
+
+
+def numbers_of(code: str, cache: str, count: int, *arguments) -> list[float]:
+    """The last ``count`` numbers that Python ``code`` prints in a new process, with the compiled kernels in the folder
+    ``cache``; ``arguments`` of the process."""
+    environment = os.environ | {"DRJIT_CACHE_DIR": cache, "PYTHONPATH": str(PROJECT)}
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    return [float(number) for number in output.split()[-count:]]
 
 
 def geometric_mean(values) -> float:

@@ -81,7 +81,8 @@ def arriving_power(looks: Looks, sources: int, neighbours: np.ndarray) -> mi.Flo
     dr.make_opaque(of_cell, of_source, of_all)
     visible = dr.gather(precise, of_cell, cell) * dr.gather(precise, of_source, source)
     visible = dr.minimum(visible / dr.maximum(of_all, 1e-9), 1)
-    # The mean of roots, because a neighbour may be next to an emitter that is far from this cell
+    # The mean of roots, because a neighbour may be next to an emitter that is far from this cell. Single precision
+    # holds an irradiance, but not its square
     power, prior = mi.Float(dr.sqrt(looks.found)), _PRIOR * dr.sqrt(visible * looks.possible)
     dr.eval(power, prior)
     around, most = upload(mi.UInt32, neighbours), dr.opaque(mi.UInt32, neighbours.shape[1])
@@ -101,10 +102,10 @@ def _around(power, around, most, cell, source, stride):
 
     A loop, because an unrolled sum takes ten times as long to compile.
     """
-    total, number = dr.zeros(type(power), dr.width(cell)), dr.zeros(mi.UInt32, dr.width(cell))
+    total, number = dr.zeros(mi.Float, dr.width(cell)), dr.zeros(mi.UInt32, dr.width(cell))
     while dr.hint(number < most, exclude=[power, around, most, cell, source, stride]):
         near = dr.gather(mi.UInt32, around, cell * most + number)
-        total += dr.gather(type(power), power, (near - 1) * stride + source, near > 0)
+        total += dr.gather(mi.Float, power, (near - 1) * stride + source, near > 0)
         number += 1
     return total
 
