@@ -3,7 +3,7 @@
 - ``arrays``: safe copies between NumPy and Dr.Jit (``upload``, ``download``), validity of values (``usable``,
   ``finite_or_zero``), chunks of rows that fit in memory (``chunks``)
 - ``sampling``: derived seeds, samplers of any width, discrete distributions (``Choice``, ``RowChoice``,
-  ``find_interval``), low-discrepancy samples (``SpreadSamples``)
+  ``GuidedSums``, ``find_interval``), low-discrepancy samples (``SpreadSamples``)
 - ``loops``: kernel loops recorded once
 - ``shared_code``: kernels shared by shapes that differ only in numbers
 - ``garbage``: code blocks without Python's cyclic garbage collector

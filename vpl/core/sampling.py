@@ -39,29 +39,43 @@ def precise_sample(sampler):
     return precise(sampler.next_1d()) + precise(sampler.next_1d()) * 2.0**-_SAMPLE_BITS
 
 
-def pair_samples(seed: int, first, second) -> mi.Float64:
-    """A uniform double-precision number of 32 bits for each pair of indices (UInt32), by Mitsuba's hash.
+class PairNumbers:
+    """Uniform numbers for the pairs of ``size`` (UInt32, (n,)) sequences and an index or a place, by Mitsuba's hash.
 
-    The number of a pair depends on its indices and not on its lane.  A ray that passes exactly between two shapes meets
-    either of them, because Mitsuba loads shapes in an order that changes with the process.  If this adds a pair, the
-    numbers of other pairs remain.
+    Packed records hold the hashes of the sequences, which many pairs share.
     """
-    own, key = mi.sample_tea_32(first, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)
-    number, _ = mi.sample_tea_32(own, second ^ key, HASH_ROUNDS)
-    return dr.float64_array_t(mi.Float)(number) * 2.0**-32
 
+    def __init__(self, seed: int, size: mi.UInt32):
+        count = dr.width(size)
+        sequence = dr.arange(mi.UInt32, count)
+        own, key = mi.sample_tea_32(sequence, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)
+        start, _ = mi.sample_tea_32(sequence, dr.opaque(mi.UInt32, derived_seed(seed, 1)), HASH_ROUNDS)
+        # The lanes that fill a packet hold zeros, by which processors do not divide
+        step = dr.opaque(mi.UInt32, 2**32 - 1) // dr.maximum(size, 1)
+        self._records = dr.zeros(mi.UInt32, 4 * count)
+        dr.scatter(self._records, mi.Vector4u(own, key, start, step), sequence)
+        dr.eval(self._records)
 
-def systematic_samples(seed: int, sequence, place, size) -> mi.Float64:
-    """The numbers at ``place`` of the systematic samples of a ``sequence``, double precision; all UInt32.
+    def random(self, sequence, second) -> mi.Float64:
+        """A number of 32 bits for each pair of a ``sequence`` and an index ``second`` (UInt32).
 
-    A sequence begins at a random number in [0, 1), has the step 1 / ``size``, and wraps around at 1.  Successive
-    samples select successive ones of ``size`` equal intervals.  A number depends on the place, so another place changes
-    it, unlike those of :func:`pair_samples`.
-    """
-    start, _ = mi.sample_tea_32(sequence, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)
-    # The lanes that fill a packet hold zeros, by which processors do not divide
-    step = dr.opaque(mi.UInt32, 2**32 - 1) // dr.maximum(size, 1)
-    return dr.float64_array_t(mi.Float)(start + place * step) * 2.0**-32
+        The number depends on both indices and not on the lane.  A ray that passes exactly between two shapes meets
+        either of them, because Mitsuba loads shapes in an order that changes with the process.  If this adds a pair,
+        the numbers of other pairs remain.
+        """
+        record = dr.gather(mi.Vector4u, self._records, sequence)
+        number, _ = mi.sample_tea_32(record.x, second ^ record.y, HASH_ROUNDS)
+        return dr.float64_array_t(mi.Float)(number) * 2.0**-32
+
+    def systematic(self, sequence, place) -> mi.Float64:
+        """The numbers at ``place`` (UInt32) of the systematic samples of each ``sequence``.
+
+        The samples begin at a random number in [0, 1), have the step 1 / ``size``, and wrap around at 1.  Successive
+        samples select successive ones of ``size`` equal intervals.  A number depends on the place, so another place
+        changes it, unlike those of :meth:`random`.
+        """
+        record = dr.gather(mi.Vector4u, self._records, sequence)
+        return dr.float64_array_t(mi.Float)(record.z + place * record.w) * 2.0**-32
 
 
 def stratified(sampler, count: int, first: int, total: int):
@@ -141,6 +155,38 @@ def find_interval(cumulative, first, last, sample):
     return last_at_most(cumulative, first, last, target)
 
 
+class GuidedSums:
+    """Running sums of weights, searched like :func:`find_interval` in constant expected time by guided search [Chen and
+    Asau 1974, "On generating random variates from an empirical distribution"].
+
+    ``weight`` (n,) float64, non-negative: n intervals.
+    """
+
+    def __init__(self, weight: np.ndarray):
+        sums = np.concatenate([[0.0], np.cumsum(weight)])
+        # A power of two, and at least two, because arrays of one entry change the kernels
+        guides = 1 << max(int(len(weight) - 1).bit_length(), 1)
+        scale = guides / sums[-1] if sums[-1] > 0 else 0.0
+        # The product is rounded alike on the device, and grows with the sum: a sum with a smaller guide than a number
+        # lies below the number, a sum with a larger guide above it
+        guide = np.minimum((sums * scale).astype(np.int64), guides - 1)
+        last = np.cumsum(np.bincount(guide, minlength=guides)) - 1
+        first = np.maximum(np.concatenate([[0], last[:-1]]), 0)
+        self._bounds = upload(mi.UInt32, np.stack([first, last + 1], 1).ravel())
+        precise = dr.float64_array_t(mi.Float)
+        self._sums, self._scale = upload(precise, sums), dr.opaque(precise, scale)
+        self._most = dr.opaque(mi.UInt32, guides - 1)
+
+    def find(self, first, last, sample):
+        """The interval of ``first`` .. ``last`` - 1 for a uniform number, as by :func:`find_interval`."""
+        precise = type(self._sums)
+        start = dr.gather(precise, self._sums, first)
+        target = start + precise(sample) * (dr.gather(precise, self._sums, last) - start)
+        guide = dr.minimum(mi.UInt32(target * self._scale), self._most)
+        low, high = dr.gather(mi.Vector2u, self._bounds, guide)
+        return last_at_most(self._sums, dr.maximum(first, low), dr.minimum(last, high), target)
+
+
 def rounded_shares(share: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Inclusive prefix sums (n,) float64 of the shares in each row, rounded to multiples of 2^-23.
 
@@ -170,8 +216,8 @@ def rounded_shares(share: np.ndarray, length: np.ndarray) -> np.ndarray:
 
 
 class RowChoice:
-    """Discrete distributions, one per row, sampled in constant expected time by guided search [Chen and Asau 1974, "On
-    generating random variates from an empirical distribution"].
+    """Discrete distributions, one per row, sampled in constant expected time by guided search, see
+    :class:`GuidedSums`.
 
     ``share`` (n,) float64: shares of the members, row after row, with sum one in each row; ``length`` (rows,): members
     of each row, at least one. ``pmf`` (n,) float64: exact sampling probabilities (see :func:`rounded_shares`).

@@ -15,12 +15,12 @@ import numpy as np
 from ..core.arrays import NO_LIMIT, channel_mean, download, finite_or_zero, spectrum_to_rgb, upload
 from ..core.clock import Clock
 from ..core.cones import COSINE_ROUNDING
-from ..core.sampling import Choice, derived_seed, find_interval, independent_sampler, running_sums, stratified
+from ..core.sampling import Choice, GuidedSums, derived_seed, independent_sampler, stratified
 from ..core.stages import Stage
 from .emission import bounding_sphere
 from .emitters import Emitters
 from .focus import Focus, spacing
-from .light_tree import CONE_COS, LEAST_C, WINDOW, DeviceTree, LightTree, build_light_tree
+from .light_tree import CONE_COS, INTENSITY, LEAST_C, WINDOW, DeviceTree, LightTree, build_light_tree
 from .tracing import LightPathSettings, TracedLights, trace_lights
 from .virtual_lights import KINDS, DeviceLights, VirtualLights
 
@@ -191,14 +191,13 @@ def _tree_of(lights: VirtualLights, generator, window: int = WINDOW) -> LightTre
 class ScatteredGroup(LightGroup):
     """Lights whose clusters have no fixed representative: :meth:`draw` draws a new one at every call.
 
-    ``first``, ``last``: per node, the range of its lights in ``order``; ``order``: lights in preorder; ``cumulative``:
-    running sums of their intensities, in double precision.
+    ``order``: lights in preorder; ``sums`` of their intensities; ``nodes``: packed records of the nodes, see
+    :meth:`_record`.
     """
 
-    first: mi.UInt32
-    last: mi.UInt32
     order: mi.UInt32
-    cumulative: mi.Float64
+    sums: GuidedSums
+    nodes: mi.UInt32
 
     @classmethod
     def of(cls, lights: VirtualLights, seed: int, sign: float = 1.0) -> ScatteredGroup:
@@ -210,22 +209,28 @@ class ScatteredGroup(LightGroup):
         representative = tree.representative.copy()
         if lights.kind == "surface":
             tree.records[:, LEAST_C] = -largest_below(tree, -lights.c)
-        first, last = (upload(mi.UInt32, column) for column in _leaf_ranges(tree).T)
-        intensity = lights.intensity.mean(1, dtype=np.float64)
+        ranges = _leaf_ranges(tree).astype(np.uint32)
+        bits = tree.records[:, INTENSITY].copy().view(np.uint32)
+        nodes = np.column_stack([ranges, tree.leaf_order[ranges[:, 0]], bits])
+        sums = GuidedSums(lights.intensity.mean(1, dtype=np.float64)[tree.leaf_order])
         return cls(
-            lights.kind, DeviceLights(lights), DeviceTree(lights.kind, tree, representative), first, last,
-            upload(mi.UInt32, tree.leaf_order), running_sums(upload(mi.Float, intensity[tree.leaf_order])), sign=sign,
+            lights.kind, DeviceLights(lights), DeviceTree(lights.kind, tree, representative),
+            upload(mi.UInt32, tree.leaf_order), sums, upload(mi.UInt32, nodes), sign=sign,
         )  # fmt: skip
 
     def first_light(self, nodes):
         """Index of the first light of each node: nodes of a cut differ in it, and similar trees have equal ones."""
-        return dr.gather(mi.UInt32, self.order, dr.gather(mi.UInt32, self.first, nodes))
+        return self._record(nodes).z
 
     def draw(self, nodes, sample):
         """Draw a light of each node by intensity with a uniform number: (lights, scale factors)."""
-        first, last = dr.gather(mi.UInt32, self.first, nodes), dr.gather(mi.UInt32, self.last, nodes)
-        index = dr.gather(mi.UInt32, self.order, find_interval(self.cumulative, first, last, sample))
-        return self.standing_for(index, self.tree.summed_intensity(nodes))
+        record = self._record(nodes)
+        index = dr.gather(mi.UInt32, self.order, self.sums.find(record.x, record.y, sample))
+        return self.standing_for(index, dr.reinterpret_array(mi.Float, record.w))
+
+    def _record(self, nodes) -> mi.Vector4u:
+        """First place and end of the lights of each node in ``order``, first light, bits of the intensity."""
+        return dr.gather(mi.Vector4u, self.nodes, nodes)
 
 
 def prepare_lights(scene, emitters: Emitters, options: LightOptions, places: np.ndarray, seed: int) -> LightSet:

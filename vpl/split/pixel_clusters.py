@@ -20,13 +20,13 @@ import numpy as np
 
 from ..core.arrays import add_at, channel_mean
 from ..core.loops import recorded_once
-from ..core.sampling import derived_seed, find_interval, pair_samples, running_sums, systematic_samples
+from ..core.sampling import PairNumbers, derived_seed, find_interval, running_sums
 from ..cuts.light_cuts import collect_cuts, limited_cuts
 from ..points.bsdf_proxies import MaterialProxy
 from ..points.surfaces import LambertianSurface, Receiver
 from ..transport.evaluation import Transport, evaluate_pairs
 from .contributions import LayerSums
-from .gather_vertices import LitVertices, joined
+from .gather_vertices import LitVertices, PackedVertices, joined
 from .pixel_rays import PixelRays
 from .spatial_cells import FACINGS, device_facing
 
@@ -60,8 +60,8 @@ class Receivers:
 class PixelClusters:
     """Clusters of lit vertices (at least one) by pixel and facing; each later vertex is a separate cluster.
 
-    ``first``, ``size``: range of the vertices of each cluster; ``pixel`` of each cluster; ``ray`` of each vertex, in
-    the order of the clusters; ``camera_rays`` of the pixels.
+    ``first``, ``size``: range of the vertices of each cluster; ``pixel`` of each cluster; ``vertices`` in the order of
+    the clusters; ``camera_rays`` of the pixels.
     """
 
     def __init__(self, lit: LitVertices, camera_rays: PixelRays):
@@ -73,17 +73,11 @@ class PixelClusters:
             first, size = joined(first, last), joined(size, dr.opaque(mi.UInt32, 1, lit.alone))
             order = joined(order, last)
         self.first, self.size = first, size
-        at = [dr.gather(type(x), x, order) for x in (vertices.position, vertices.flat, vertices.normal, vertices.depth)]
-        self.ray, self._weight = (
-            dr.gather(mi.UInt32, lit.rays, order),
-            dr.gather(mi.UnpolarizedSpectrum, vertices.weight, order),
-        )
-        self._level = channel_mean(dr.abs(self._weight))
+        self.vertices = PackedVertices(vertices, lit.rays, order)
         self.pixel = dr.gather(mi.UInt32, pixel, dr.gather(mi.UInt32, order, self.first))
-        dr.eval(at, self.ray, self._weight, self._level, self.first, self.size, self.pixel)
-        self._vertices = at
-        self.receivers = Receivers.of(*_bounds(at[0], at[2], self.first, self.size))
-        self.cumulative = running_sums(self._level)
+        dr.eval(self.first, self.size, self.pixel)
+        self.receivers = Receivers.of(*_bounds(self.vertices, self.first, self.size))
+        self.cumulative = running_sums(self.vertices.level)
 
     @property
     def weight(self):
@@ -103,16 +97,11 @@ class PixelClusters:
         whole = dr.gather(type(self.cumulative), self.cumulative, last) - dr.gather(
             type(self.cumulative), self.cumulative, first
         )
+        one, ray = self.vertices.at(row)
         interaction = dr.zeros(mi.Interaction3f, dr.width(row))
-        position, flat, normal, depth = (dr.gather(type(x), x, row) for x in self._vertices)
-        interaction.p, interaction.n = position, flat
-        surface = LambertianSurface(interaction, depth, normal, mi.Color3f(1))
-        factor = mi.Float(whole) / dr.gather(mi.Float, self._level, row)
-        return (
-            dr.gather(mi.UInt32, self.ray, row),
-            surface,
-            dr.gather(mi.UnpolarizedSpectrum, self._weight, row) * factor,
-        )
+        interaction.p, interaction.n = one.position, one.flat
+        surface = LambertianSurface(interaction, one.depth, one.normal, mi.Color3f(1))
+        return ray, surface, one.weight * (mi.Float(whole) / channel_mean(dr.abs(one.weight)))
 
 
 def _by_pixel_and_facing(normal: mi.Normal3f, pixel: mi.UInt32, count: int, pixels: int):
@@ -154,19 +143,19 @@ def _vertices_by_key(facing, begin, number, first, order):
 
 @recorded_once
 @dr.syntax
-def _bounds(position, normal, first, size):
+def _bounds(vertices: PackedVertices, first, size):
     """Box and cone of normals of each range of vertices: (centre, half of the extent, axis, cosine), evaluated."""
     low, high = mi.Point3f(dr.inf), mi.Point3f(-dr.inf)
     axis, k = mi.Vector3f(0), dr.zeros(mi.UInt32, dr.width(first))
-    while dr.hint(k < size, exclude=[position, normal, first, size]):
-        point = dr.gather(mi.Point3f, position, first + k)
+    while dr.hint(k < size, exclude=[vertices, first, size]):
+        point, normal = vertices.place(first + k)
         low, high = dr.minimum(low, point), dr.maximum(high, point)
-        axis += mi.Vector3f(dr.gather(mi.Normal3f, normal, first + k))
+        axis += mi.Vector3f(normal)
         k += 1
     axis /= dr.maximum(dr.norm(axis), 1e-20)
     cosine, k = mi.Float(1), dr.zeros(mi.UInt32, dr.width(first))
-    while dr.hint(k < size, exclude=[normal, first, size, axis]):
-        cosine = dr.minimum(cosine, dr.dot(axis, dr.gather(mi.Normal3f, normal, first + k)))
+    while dr.hint(k < size, exclude=[vertices, first, size, axis]):
+        cosine = dr.minimum(cosine, dr.dot(axis, vertices.place(first + k)[1]))
         k += 1
     # Rounded down by 16 units in the last place, so the cone holds every normal
     box = 0.5 * (low + high), 0.5 * (high - low), axis, dr.maximum(cosine - 2e-6, -1)
@@ -190,10 +179,9 @@ def light_clusters(
     rays = 0
     for chunk in collect_cuts(transport.lights, clusters.receivers, threshold, sizes):
         cluster = dr.gather(mi.UInt32, chunk.points, chunk.rows)
-        stream = derived_seed(seed, chunk.number)
-        of_light = pair_samples(stream, cluster, chunk.group.first_light(chunk.nodes))
-        size = dr.gather(mi.UInt32, clusters.size, cluster)
-        of_vertex = systematic_samples(derived_seed(stream, 1), cluster, chunk.place, size)
+        numbers = PairNumbers(derived_seed(seed, chunk.number), clusters.size)
+        of_light = numbers.random(cluster, chunk.group.first_light(chunk.nodes))
+        of_vertex = numbers.systematic(cluster, chunk.place)
         ray, surface, weight = clusters.draw(cluster, of_vertex)
         light, scale = chunk.group.draw(chunk.nodes, of_light)
         value, traced = evaluate_pairs(transport, chunk.group, surface, light, scale)

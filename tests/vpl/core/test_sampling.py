@@ -11,12 +11,11 @@ from tests.support.scenes import area_light, sensor, wall
 from vpl.core.arrays import download, upload
 from vpl.core.sampling import (
     Choice,
+    PairNumbers,
     RowChoice,
     SpreadSamples,
     independent_sampler,
-    pair_samples,
     precise_sample,
-    systematic_samples,
 )
 
 SEQUENCES, MEMBERS = 2000, 64
@@ -113,12 +112,14 @@ def test_members_of_rows_are_drawn_with_exactly_the_claimed_probability(lengths)
 
 
 def test_numbers_of_pairs_are_uniform_uncorrelated_and_independent_of_the_lane(variant):
-    first, second = (x.ravel().astype(np.uint32) for x in np.mgrid[1000:1300, 0:300])
+    first, second = (x.ravel().astype(np.uint32) for x in np.mgrid[0:300, 0:300])
     later = slice(len(first) // 2, None)
-    number, again, other = (
-        download(pair_samples(seed, *(upload(mi.UInt32, x[rows]) for x in (first, second))))
-        for seed, rows in ((5, slice(None)), (5, later), (6, slice(None)))
-    )
+
+    def numbers(seed, rows=slice(None)):
+        pairs = PairNumbers(seed, dr.full(mi.UInt32, 8, 300))
+        return download(pairs.random(*(upload(mi.UInt32, x[rows]) for x in (first, second))))
+
+    number, again, other = numbers(5), numbers(5, later), numbers(6)
     assert number.min() >= 0 and number.max() < 1 and stats.kstest(number, "uniform").pvalue > 1e-4
     assert np.array_equal(number[later], again)
     # Neighbours along either index, and two seeds
@@ -130,18 +131,17 @@ def test_numbers_of_pairs_are_uniform_uncorrelated_and_independent_of_the_lane(v
 def test_systematic_samples_are_uniform_and_select_successive_intervals(variant):
     sequences, places, sizes = 3000, 40, np.array([1, 3, 7, 64, 1000], np.uint32)
     sequence, place = (x.ravel().astype(np.uint32) for x in np.mgrid[0:sequences, 0:places])
-    size = sizes[sequence % len(sizes)]
-    samples = [
-        download(systematic_samples(seed, *(upload(mi.UInt32, x) for x in (sequence, place, size)))) for seed in (5, 6)
-    ]
+    size = sizes[np.arange(sequences) % len(sizes)]
+    pairs = [upload(mi.UInt32, x) for x in (sequence, place)]
+    samples = [download(PairNumbers(seed, upload(mi.UInt32, size)).systematic(*pairs)) for seed in (5, 6)]
     for at in (0, 1, places - 1):
         assert stats.kstest(samples[0][place == at], "uniform").pvalue > 1e-4
     assert 0 <= samples[0].min() and samples[0].max() < 1
     starts = [one[place == 0] for one in samples]
     assert abs(np.corrcoef(*starts)[0, 1]) < 5 / np.sqrt(sequences)
-    interval = np.floor(samples[0] * size).reshape(sequences, places)
+    interval = np.floor(samples[0] * size[sequence]).reshape(sequences, places)
     # A step is rounded down to a multiple of 2^-32
-    moved = (np.diff(interval, axis=1) - 1) % size.reshape(sequences, places)[:, 1:]
+    moved = (np.diff(interval, axis=1) - 1) % size[:, None]
     assert np.mean(moved == 0) > 0.999
 
 

@@ -220,7 +220,7 @@ def test_a_pair_contributes_what_the_split_leaves_to_it():
 def test_nodes_know_the_least_c_of_their_lights():
     lights = surface_lights(np.random.default_rng(5), 200)
     group = ScatteredGroup.of(lights, 1)
-    first, last, order = (np.array(x) for x in (group.first, group.last, group.order))
+    order, (first, last, *_) = np.array(group.order), np.array(group.nodes).reshape(-1, 4).T
     least = download(group.tree.gather(dr.arange(mi.UInt32, group.tree.count)).least_c)
     np.testing.assert_array_equal(least, [lights.c[order[a:b]].min() for a, b in zip(first, last, strict=True)])
 
@@ -229,7 +229,7 @@ def test_lights_of_a_node_are_drawn_by_their_share_of_its_intensity():
     rng = np.random.default_rng(0)
     lights = surface_lights(rng, 60)
     group = ScatteredGroup.of(lights, 1)
-    first, last, order = (np.array(x) for x in (group.first, group.last, group.order))
+    order, (first, last, *_) = np.array(group.order), np.array(group.nodes).reshape(-1, 4).T
     level = lights.intensity.mean(1)
     draws = 200_000
     for node in range(0, len(first), 13):
@@ -309,10 +309,11 @@ def test_vertices_of_a_cluster_are_drawn_by_weight_and_stand_for_all_of_it():
     rays = PixelRays.uniform(count // samples, samples)
     clusters = PixelClusters(LitVertices(vertices, dr.arange(mi.UInt32, count), 0), rays)
     first, size = np.array(clusters.first), np.array(clusters.size)
-    assert size.sum() == count and (np.repeat(clusters.pixel, size) == np.array(clusters.ray) // samples).all()
+    ray_of = np.array(clusters.vertices.at(dr.arange(mi.UInt32, count))[1])
+    assert size.sum() == count and (np.repeat(clusters.pixel, size) == ray_of // samples).all()
     draws = 20_000
     for cluster in range(0, clusters.count, 31):
-        members = np.array(clusters.ray)[first[cluster] : first[cluster] + size[cluster]]
+        members = ray_of[first[cluster] : first[cluster] + size[cluster]]
         ray, _, value = clusters.draw(
             dr.full(mi.UInt32, cluster, draws), upload(mi.Float, (np.arange(draws) + 0.5) / draws)
         )  # fmt: skip
@@ -334,10 +335,11 @@ def test_clusters_hold_their_vertices(alone):
     first, size, pixel = (np.array(x) for x in (clusters.first, clusters.size, clusters.pixel))
     assert list(pixel[: len(keys)]) == list(keys // FACINGS) and clusters.count == len(keys) + alone
     assert size.sum() == count and (size[len(size) - alone :] == 1).all() and (np.diff(first) == size[:-1]).all()
-    ray, receiver = np.array(clusters.ray), clusters.receivers.receiver
+    (held, ray), receiver = clusters.vertices.at(dr.arange(mi.UInt32, count)), clusters.receivers.receiver
+    ray = np.array(ray)
     assert sorted(ray) == sorted(rays)
     low, high = (np.array(receiver.position + sign * receiver.extent).T for sign in (-1, 1))
-    inside, around = np.array(clusters._vertices[0]).T, np.array(clusters._vertices[2]).T
+    inside, around = np.array(held.position).T, np.array(held.normal).T
     of = np.repeat(np.arange(clusters.count), size)
     assert (ray // samples == pixel[of]).all()
     assert (inside >= low[of] - 1e-6).all() and (inside <= high[of] + 1e-6).all()
