@@ -88,7 +88,9 @@ class LightcutsIntegrator(ManyLightIntegrator):
         radiance, rays, collected = evaluate_cuts(job.transport, job.batch, threshold, sizes, stopped=job.stopped)
         clock.stop()
         bounds = searched + collected + spent.upper_bounds
-        return ShadeResult(radiance, rays + spent.shadow_rays, bounds, sum(sizes.count), clock.seconds)
+        return ShadeResult(
+            radiance, rays + spent.shadow_rays, bounds, sum(one.count for one in sizes.cuts), clock.seconds
+        )
 
 
 mi.register_integrator("lightcuts", LightcutsIntegrator)

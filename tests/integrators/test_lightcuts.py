@@ -13,6 +13,7 @@ from tests.support.rendering import render
 from tests.support.rooms import COATED, GLOSSY, many_kinds
 from tests.support.scenes import area_light, closed_box, sensor, wall
 from vpl.core.arrays import download, upload
+from vpl.cuts import traversal
 from vpl.cuts.light_cuts import CutChunk, collect_cuts, cut_sizes, evaluate_cuts, limited_cuts
 from vpl.lights.light_set import LightGroup, LightSet, light_tree
 from vpl.lights.virtual_lights import VirtualLights
@@ -215,3 +216,28 @@ def test_alpha_is_that_of_path_with_and_without_an_environment():
         scene = mi.load_dict({"type": "scene", "sensor": camera, "ball": {"type": "sphere"}, **sky})
         alphas = [render(scene, name, 16)[..., 3] for name in ("lightcuts", "path")]
         assert np.allclose(*alphas, atol=0.3) and np.allclose(alphas[0].mean(), alphas[1].mean(), atol=0.02)
+
+
+@pytest.mark.parametrize(("first", "store"), [(1, 1 << 24), (2, 300), (16, 0)])
+@pytest.mark.parametrize("most", [0, 5])
+def test_cuts_do_not_depend_on_rounds_and_memory(monkeypatch, first, store, most):
+    """Against cuts of a single round, which are stored as a whole."""
+    _plugin, jobs = prepared(mi.load_dict(many_kinds()))
+
+    def cuts_of(job):
+        threshold = dr.full(mi.Float, 1e-3 * job.mean, job.batch.count)
+        threshold, sizes, visits = limited_cuts(job.lights, job.batch, threshold, most)
+        chunks = list(collect_cuts(job.lights, job.batch, threshold, sizes))
+        assert all(download(chunk.written).all() for chunk in chunks)
+        return download(visits), [(download(chunk.rows), download(chunk.nodes)) for chunk in chunks]
+
+    monkeypatch.setattr(traversal, "_FIRST", 1 << 12)
+    expected = [cuts_of(job) for job in jobs]
+    monkeypatch.setattr(traversal, "_FIRST", first)
+    monkeypatch.setattr(traversal, "_LARGEST_STORE", store)
+    for job, (visits, chunks) in zip(jobs, expected, strict=True):
+        assert max(np.bincount(rows).max() for rows, _ in chunks) > first or most
+        found_visits, found = cuts_of(job)
+        np.testing.assert_array_equal(found_visits, visits)
+        for one, other in zip(found, chunks, strict=True):
+            np.testing.assert_array_equal(one, other)

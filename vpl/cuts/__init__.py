@@ -15,6 +15,7 @@ cut through the light trees (``limited_cuts``), and its radiance (``evaluate_cut
 
     phase_one -> product_cuts (raise_thresholds, find_pairs) -> [adaptive_visibility ->] pair_lists
 
+- ``traversal``: traversal of a light tree for many points, which stores the nodes of their cuts
 - ``product_cuts``: simultaneous descent of both trees [IC Algorithm 1]; ``Pairs``, ``find_pairs``
 - ``pixel_cuts``: thresholds of pixels and of blocks of pixels; a representative point and light for each pair
 - ``phase_one``: Phase I, the approximate image [IC section 3]

@@ -20,11 +20,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NO_LIMIT, add_at, chunks, download, upload, upload_limit
+from ..core.arrays import add_at, chunks, download, upload
 from ..lights.light_set import LightGroup, LightSet
 from ..points.surfaces import Batch
-from ..transport.bounds import contribution_bound, expected_error
 from ..transport.evaluation import Transport, evaluate_representatives
+from .traversal import Cuts, collect, several, traverse
 
 # Pairs shaded and traced at a time: bounds the memory for any size of image and cuts
 _PAIRS_PER_CHUNK = 1 << 22
@@ -32,71 +32,6 @@ _PAIRS_PER_CHUNK = 1 << 22
 _BRACKET, _BISECTIONS = 4.0, 3
 # Error bound of the coarse cuts as a fraction of the image's mean
 _ESTIMATE_ERROR = 0.05
-
-
-@dataclass
-class CutSizes:
-    """Per group of lights, an array over points: ``count``: nodes in the cut; ``visits``: computed bounds."""
-
-    count: list[mi.UInt32]
-    visits: list[mi.UInt32]
-
-    def total(self) -> np.ndarray:
-        """Nodes in the cut of every point over the groups, (n,) int64."""
-        return sum(download(count).astype(np.int64) for count in self.count)
-
-
-def _step(group: LightGroup, batch: Batch, threshold, smallest_distance, i):
-    """Visit node ``i``: (whether the cut contains it, next node).  A bound of zero skips the node's subtree."""
-    node = group.tree.gather(i)
-    bound = contribution_bound(group.kind, batch.receiver, node, smallest_distance)
-    error = expected_error(group.kind, batch.receiver, node, bound) if batch.receiver.by_expected_error else bound
-    reached = bound > 0
-    taken = reached & ((node.escape == i + 1) | (error <= threshold))
-    return taken, dr.select(taken | ~reached, node.escape, i + 1)
-
-
-@dr.syntax
-def _count_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: float, most: int):
-    """Traverse a group's tree for every point: (nodes in the cut, nodes visited).
-
-    Stops when a cut exceeds ``most`` nodes (0: never).
-    """
-    end, limit = dr.opaque(mi.UInt32, group.tree.count), upload_limit(most or NO_LIMIT)
-    clamp = dr.opaque(mi.Float, smallest_distance)
-    i, count, visits = mi.UInt32(0), dr.zeros(mi.UInt32, batch.count), dr.zeros(mi.UInt32, batch.count)
-    while dr.hint((i < end) & (count <= limit), exclude=[group, batch]):
-        taken, i = _step(group, batch, threshold, clamp, i)
-        count += dr.select(taken, 1, 0)
-        visits += 1
-    dr.eval(count, visits)
-    return count, visits
-
-
-@dr.syntax
-def _collect_nodes(group: LightGroup, batch: Batch, threshold, smallest_distance: float, offset, length, total: int):
-    """Repeat the traversal of :func:`_count_nodes` and store (row of the batch, node) of every node in a cut.
-
-    A point has ``length`` entries from ``offset`` on.  Rounding may change the cut between the traversals; entries
-    beyond ``length`` are dropped.  Returns (rows, nodes, entries written per point, nodes visited per point).
-    """
-    end = dr.opaque(mi.UInt32, group.tree.count)
-    clamp = dr.opaque(mi.Float, smallest_distance)
-    rows, nodes = dr.zeros(mi.UInt32, total), dr.zeros(mi.UInt32, total)
-    dr.eval(rows, nodes)
-    row = dr.arange(mi.UInt32, batch.count)
-    i, at, visits = mi.UInt32(0), mi.UInt32(offset), mi.UInt32(0)
-    while dr.hint(i < end, exclude=[group, batch, rows, nodes]):
-        taken, following = _step(group, batch, threshold, clamp, i)
-        taken &= at < offset + length
-        dr.scatter(rows, row, at, taken)
-        dr.scatter(nodes, i, at, taken)
-        at += dr.select(taken, 1, 0)
-        visits += 1
-        i = following
-    written = at - offset
-    dr.eval(rows, nodes, written, visits)
-    return rows, nodes, written, visits
 
 
 @dr.syntax
@@ -111,13 +46,28 @@ def _sum_segments(values, offset, count):
     return total
 
 
-def cut_sizes(lights: LightSet, batch: Batch, threshold, most: int = 0) -> CutSizes:
-    """Sizes of the cuts at a threshold, the largest accepted error per point.
+@dataclass
+class CutSizes:
+    """Cuts of points in each group of lights."""
 
-    Counting stops at the first node beyond ``most`` per group of lights (0: never).
+    cuts: list[Cuts]
+
+    def total(self) -> np.ndarray:
+        """Nodes in the cut of every point over the groups, (n,) int64."""
+        return sum(download(one.count).astype(np.int64) for one in self.cuts)
+
+    @property
+    def visits(self) -> mi.UInt32:
+        """Nodes visited per point over the groups."""
+        return sum(one.visits for one in self.cuts)
+
+
+def cut_sizes(lights: LightSet, batch: Batch, threshold, most: int = 0) -> CutSizes:
+    """Cuts at a threshold, the largest accepted error per point.
+
+    Cuts end at the first node beyond ``most`` per group of lights (0: never).
     """
-    found = [_count_nodes(group, batch, threshold, lights.smallest_distance, most) for group in lights.groups]
-    return CutSizes([count for count, _ in found], [visits for _, visits in found])
+    return CutSizes([traverse(group, batch, threshold, lights.smallest_distance, most) for group in lights.groups])
 
 
 def upload_thresholds(values: np.ndarray):
@@ -135,22 +85,21 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
     """
     max_cut = max(max_cut, len(lights.groups)) if max_cut else 0  # the roots of the groups form the coarsest cut
     sizes = cut_sizes(lights, batch, threshold, max_cut)
-    visits = sum(sizes.visits)
-    rows = np.flatnonzero(sizes.total() > max_cut)
+    rows = several(np.flatnonzero(sizes.total() > max_cut))
     if max_cut == 0 or len(rows) == 0:
-        return threshold, sizes, visits
+        return threshold, sizes, sizes.visits
     index = upload(mi.UInt32, rows)
     part = batch.select(index)
     # NumPy, because the points are mostly few: kernels would take longer to compile than to run
-    spent, fitting = np.zeros(len(rows), np.uint32), [np.zeros(len(rows), np.uint32) for _ in sizes.count]
+    spent, fitting = ([np.zeros(len(rows), np.uint32) for _ in lights.groups] for _ in range(2))
 
     def too_large(values):
         """Mask of cuts above ``max_cut`` at the given thresholds; stores the sizes of the remaining cuts."""
-        nonlocal spent, fitting
         found = cut_sizes(lights, part, upload_thresholds(values), max_cut)
         over = found.total() > max_cut
-        fitting = [np.where(over, old, download(new)) for new, old in zip(found.count, fitting, strict=True)]
-        spent = spent + sum(map(download, found.visits))
+        for number, one in enumerate(found.cuts):
+            fitting[number] = np.where(over, fitting[number], download(one.count))
+            spent[number] += download(one.visits)
         return over
 
     low = np.maximum(download(dr.gather(mi.Float, threshold, index)).astype(np.float64), np.finfo(np.float32).tiny)
@@ -165,11 +114,10 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
         low, high = np.where(over, middle, low), np.where(over, high, middle)
     threshold = mi.Float(threshold)
     dr.scatter(threshold, upload_thresholds(high), index)
-    for target, count in zip(sizes.count, fitting, strict=True):
-        dr.scatter(target, upload(mi.UInt32, count), index)
-    add_at(visits, upload(mi.UInt32, spent), index)
-    dr.eval(threshold, sizes.count, visits)
-    return threshold, sizes, visits
+    dr.eval(threshold)
+    for one, count, visits in zip(sizes.cuts, fitting, spent, strict=True):
+        one.replace(index, upload(mi.UInt32, count), upload(mi.UInt32, visits))
+    return threshold, sizes, sizes.visits
 
 
 @dataclass
@@ -204,19 +152,16 @@ class CutChunk:
 
 def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
     """Yield the cuts of a batch as evaluated :class:`CutChunk` of bounded size."""
-    for number, (group, group_count) in enumerate(zip(lights.groups, sizes.count, strict=True)):
-        count = download(group_count).astype(np.int64)
+    for number, (group, cuts) in enumerate(zip(lights.groups, sizes.cuts, strict=True)):
+        count = download(cuts.count).astype(np.int64)
         for first, last in chunks(count, _PAIRS_PER_CHUNK):
-            total = int(count[first:last].sum())
-            if total == 0:
+            length = count[first:last]
+            if not length.any():
                 continue
             points = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
             part = batch if last - first == batch.count else batch.select(points)
-            offset = upload(mi.UInt32, np.cumsum(count[first:last]) - count[first:last])
-            chosen = dr.gather(mi.Float, threshold, points)
-            length = dr.gather(mi.UInt32, group_count, points)
-            rows, nodes, written, visits = _collect_nodes(
-                group, part, chosen, lights.smallest_distance, offset, length, total
+            rows, nodes, offset, written, visits = collect(
+                group, part, threshold, lights.smallest_distance, cuts, first, length
             )
             yield CutChunk(group, number, part, points, offset, written, rows, nodes, visits)
 

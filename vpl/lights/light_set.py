@@ -191,11 +191,10 @@ def _tree_of(lights: VirtualLights, generator, window: int = WINDOW) -> LightTre
 class ScatteredGroup(LightGroup):
     """Lights whose clusters have no fixed representative: :meth:`draw` draws a new one at every call.
 
-    ``order``: lights in preorder; ``sums`` of their intensities; ``nodes``: packed records of the nodes, see
-    :meth:`_record`.
+    The lights are in the order of the tree: those of a node are neighbours in memory.  ``sums`` of their intensities;
+    ``nodes``: packed records of the nodes, see :meth:`_record`.
     """
 
-    order: mi.UInt32
     sums: GuidedSums
     nodes: mi.UInt32
 
@@ -206,30 +205,31 @@ class ScatteredGroup(LightGroup):
         Surface lights need a c.  Their clusters have the least c in place of a representative.
         """
         tree = _tree_of(lights, np.random.default_rng(seed), _SMALL_WINDOW)
+        ranges, order = _leaf_ranges(tree).astype(np.uint32), tree.leaf_order
+        lights, tree = lights.select(order), tree.in_leaf_order()
         representative = tree.representative.copy()
         if lights.kind == "surface":
             tree.records[:, LEAST_C] = -largest_below(tree, -lights.c)
-        ranges = _leaf_ranges(tree).astype(np.uint32)
         bits = tree.records[:, INTENSITY].copy().view(np.uint32)
-        nodes = np.column_stack([ranges, tree.leaf_order[ranges[:, 0]], bits])
-        sums = GuidedSums(lights.intensity.mean(1, dtype=np.float64)[tree.leaf_order])
-        return cls(
-            lights.kind, DeviceLights(lights), DeviceTree(lights.kind, tree, representative),
-            upload(mi.UInt32, tree.leaf_order), sums, upload(mi.UInt32, nodes), sign=sign,
-        )  # fmt: skip
+        nodes = upload(mi.UInt32, np.column_stack([ranges, order[ranges[:, 0]], bits]))
+        sums = GuidedSums(lights.intensity.mean(1, dtype=np.float64))
+        device_tree = DeviceTree(lights.kind, tree, representative)
+        return cls(lights.kind, DeviceLights(lights), device_tree, sums, nodes, sign=sign)
 
     def first_light(self, nodes):
-        """Index of the first light of each node: nodes of a cut differ in it, and similar trees have equal ones."""
+        """The caller's index of the first light of each node: nodes of a cut differ in it, and similar trees have equal
+        ones."""
         return self._record(nodes).z
 
     def draw(self, nodes, sample):
         """Draw a light of each node by intensity with a uniform number: (lights, scale factors)."""
         record = self._record(nodes)
-        index = dr.gather(mi.UInt32, self.order, self.sums.find(record.x, record.y, sample))
+        index = self.sums.find(record.x, record.y, sample)
         return self.standing_for(index, dr.reinterpret_array(mi.Float, record.w))
 
     def _record(self, nodes) -> mi.Vector4u:
-        """First place and end of the lights of each node in ``order``, first light, bits of the intensity."""
+        """For each node: its first light, the end of its lights, the caller's index of the first light, bits of the
+        intensity."""
         return dr.gather(mi.Vector4u, self.nodes, nodes)
 
 

@@ -84,6 +84,14 @@ class LightTree:
         """(2n - 1,) uint32 view: representative light of each node, an index into the caller's arrays."""
         return self.records.view(np.uint32)[:, REPRESENTATIVE]
 
+    def in_leaf_order(self) -> LightTree:
+        """The same tree for lights in the order of ``leaf_order``."""
+        rank = np.empty_like(self.leaf_order)
+        rank[self.leaf_order] = np.arange(len(rank), dtype=rank.dtype)
+        tree = LightTree(self.records.copy(), np.arange(len(rank), dtype=rank.dtype), self.depth)
+        tree.representative[:] = rank[self.representative]
+        return tree
+
     @property
     def is_leaf(self) -> np.ndarray:
         """(2n - 1,) bool: whether a node is a leaf. The leaves hold the lights in the order of ``leaf_order``."""

@@ -217,10 +217,19 @@ def test_a_pair_contributes_what_the_split_leaves_to_it():
     np.testing.assert_allclose(found, shared[:, None] * lights.intensity, rtol=1e-3, atol=1e-5)
 
 
+def ranges_of(group):
+    """(First light of each node, end of its lights, the caller's indices of the lights), for a group."""
+    first, last, light, _ = np.array(group.nodes).reshape(-1, 4).T
+    order = np.zeros(group.count, np.uint32)
+    leaf = last == first + 1
+    order[first[leaf]] = light[leaf]
+    return first, last, order
+
+
 def test_nodes_know_the_least_c_of_their_lights():
     lights = surface_lights(np.random.default_rng(5), 200)
     group = ScatteredGroup.of(lights, 1)
-    order, (first, last, *_) = np.array(group.order), np.array(group.nodes).reshape(-1, 4).T
+    first, last, order = ranges_of(group)
     least = download(group.tree.gather(dr.arange(mi.UInt32, group.tree.count)).least_c)
     np.testing.assert_array_equal(least, [lights.c[order[a:b]].min() for a, b in zip(first, last, strict=True)])
 
@@ -229,7 +238,7 @@ def test_lights_of_a_node_are_drawn_by_their_share_of_its_intensity():
     rng = np.random.default_rng(0)
     lights = surface_lights(rng, 60)
     group = ScatteredGroup.of(lights, 1)
-    order, (first, last, *_) = np.array(group.order), np.array(group.nodes).reshape(-1, 4).T
+    first, last, order = ranges_of(group)
     level = lights.intensity.mean(1)
     draws = 200_000
     for node in range(0, len(first), 13):
