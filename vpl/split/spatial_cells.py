@@ -69,20 +69,33 @@ class SpatialCells:
 
     @classmethod
     def around(cls, position: np.ndarray, normal: np.ndarray, most: int) -> tuple[SpatialCells, np.ndarray]:
-        """(Cells of vertices (n, 3), the number of the cell of each): the finest grid with at most ``most`` cells."""
+        """(Cells of vertices (n, 3), the number of the cell of each) in a fine grid with at most ``most`` cells.
+
+        A bisection, so the finest grid if finer ones have more cells.
+        """
         low, high = np.quantile(position, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
         # The cubes must have a size in single precision
         longest = max(float((high - low).max()), 1e-6 * float(np.abs([low, high]).max()), 1e-30)
         direction = facing(normal)
-        for cubes in range(_FINEST_GRID, 0, -1):
+
+        def grid(cubes: int):
             size = longest / cubes
             resolution = np.maximum(np.ceil((high - low) / size), 1).astype(np.int64)
             cube = np.clip(np.floor((position - low) / size), 0, resolution - 1).astype(np.int64)
             key = ((cube[:, 2] * resolution[1] + cube[:, 1]) * resolution[0] + cube[:, 0]) * FACINGS + direction
             occupied = np.zeros(FACINGS * resolution.prod(), bool)
             occupied[key] = True
-            if np.count_nonzero(occupied) <= most:
-                break
+            return size, resolution, key, occupied
+
+        cubes, above, found = 1, _FINEST_GRID + 1, grid(1)
+        while above - cubes > 1:
+            tried = above - 1 if above > _FINEST_GRID else (cubes + above) // 2
+            finer = grid(tried)
+            if np.count_nonzero(finer[-1]) <= most:
+                cubes, found = tried, finer
+            else:
+                above = tried
+        size, resolution, key, occupied = found
         table = np.where(occupied, np.cumsum(occupied), 0)
         return cls._of(low, size, resolution, table), table[key]
 
