@@ -123,7 +123,7 @@ def ray_rates(names) -> dict:
 def _seconds_alone(plugin, job) -> float:
     """Seconds per shadow ray of a job's cuts, traced alone in a batch."""
     threshold = dr.full(mi.Float, plugin.error * job.mean, job.batch.count)
-    threshold, sizes, _ = limited_cuts(job.lights, job.batch, threshold, plugin.max_cut)
+    threshold, sizes = limited_cuts(job.lights, job.batch, threshold, plugin.max_cut)
     seconds = count = 0.0
     for chunk in collect_cuts(job.lights, job.batch, threshold, sizes):
         light, _ = chunk.group.representatives(chunk.nodes)

@@ -161,7 +161,7 @@ def cut_at(view, row):
     job = view.job
     level = estimate_radiance(job.transport, job.batch, job.direct, job.mean, 1000, 8).radiance[row]
     one = job.batch.select(mi.UInt32(row))
-    threshold, sizes, _ = limited_cuts(job.lights, one, dr.opaque(mi.Float, ERROR * level), 1000)
+    threshold, sizes = limited_cuts(job.lights, one, dr.opaque(mi.Float, ERROR * level), 1000)
     chunks = [chunk for chunk in collect_cuts(job.lights, one, threshold, sizes) if chunk.group is view.group]
     return view.group.tree.records()[np.concatenate([download(chunk.nodes) for chunk in chunks])]
 

@@ -83,11 +83,11 @@ class LightcutsIntegrator(ManyLightIntegrator):
         spent = estimate_radiance(job.transport, job.batch, job.direct, job.mean, self.max_cut, _ESTIMATE_STRIDE)
         clock.begin(Stage.CUT)
         wanted = upload(mi.Float, self.error * np.maximum(spent.radiance, self.dark_floor * job.mean))
-        threshold, sizes, searched = limited_cuts(job.lights, job.batch, wanted, self.max_cut)
+        threshold, sizes = limited_cuts(job.lights, job.batch, wanted, self.max_cut)
         clock.begin(Stage.EVALUATE)
         radiance, rays, collected = evaluate_cuts(job.transport, job.batch, threshold, sizes, stopped=job.stopped)
         clock.stop()
-        bounds = searched + collected + spent.upper_bounds
+        bounds = sizes.visits + collected + spent.upper_bounds
         return ShadeResult(
             radiance, rays + spent.shadow_rays, bounds, sum(one.count for one in sizes.cuts), clock.seconds
         )

@@ -13,8 +13,8 @@ from tests.support.rendering import render
 from tests.support.rooms import COATED, GLOSSY, many_kinds
 from tests.support.scenes import area_light, closed_box, sensor, wall
 from vpl.core.arrays import download, upload
-from vpl.cuts import traversal
-from vpl.cuts.light_cuts import CutChunk, collect_cuts, cut_sizes, evaluate_cuts, limited_cuts
+from vpl.cuts import light_cuts, traversal
+from vpl.cuts.light_cuts import CutChunk, collect_cuts, cuts_at, evaluate_cuts, limited_cuts
 from vpl.lights.light_set import LightGroup, LightSet, light_tree
 from vpl.lights.virtual_lights import VirtualLights
 from vpl.points.surfaces import LambertianSurface, ScatteringSurface
@@ -47,7 +47,7 @@ def test_cuts_hold_every_light_that_can_arrive_once_and_keep_their_bounds(batch)
     plugin, jobs = prepared(mi.load_dict(many_kinds()))
     job = jobs[batch]
     threshold = dr.full(mi.Float, plugin.error * job.mean, job.batch.count)
-    sizes = cut_sizes(job.lights, job.batch, threshold)
+    sizes = cuts_at(job.lights, job.batch, threshold)
     for chunk in collect_cuts(job.lights, job.batch, threshold, sizes):
         tree, first = chunk.group.tree, int(chunk.offset[7])
         nodes = download(chunk.nodes)[first : first + int(chunk.length[7])]
@@ -77,11 +77,11 @@ def test_largest_cut_is_respected():
     _plugin, jobs = prepared(mi.load_dict(many_kinds()))
     for job in jobs:
         threshold = dr.full(mi.Float, 1e-4 * job.mean, job.batch.count)
-        free = cut_sizes(job.lights, job.batch, threshold).total()
+        free = cuts_at(job.lights, job.batch, threshold).total()
         assert free.max() > 60
-        raised, sizes, _ = limited_cuts(job.lights, job.batch, threshold, 60)
+        raised, sizes = limited_cuts(job.lights, job.batch, threshold, 60)
         assert sizes.total().max() <= 60
-        assert np.array_equal(sizes.total(), cut_sizes(job.lights, job.batch, raised).total())
+        assert np.array_equal(sizes.total(), cuts_at(job.lights, job.batch, raised).total())
         untouched = free <= 60
         assert np.array_equal(sizes.total()[untouched], free[untouched])
 
@@ -101,7 +101,7 @@ def test_cuts_are_unbiased_for_coloured_lights():
             [LightGroup("oriented", group.lights, light_tree(lights, seed))], job.lights.smallest_distance, 5, 0, 0, {}
         )
         threshold = dr.full(mi.Float, 0.1 * job.mean, job.batch.count)
-        sizes = cut_sizes(trees, job.batch, threshold)
+        sizes = cuts_at(trees, job.batch, threshold)
         radiance, _, _ = evaluate_cuts(replace(job.transport, lights=trees), job.batch, threshold, sizes)
         means.append(download(radiance).mean(0))
     means = np.array(means)
@@ -226,15 +226,15 @@ def test_cuts_do_not_depend_on_rounds_and_memory(monkeypatch, first, store, most
 
     def cuts_of(job):
         threshold = dr.full(mi.Float, 1e-3 * job.mean, job.batch.count)
-        threshold, sizes, visits = limited_cuts(job.lights, job.batch, threshold, most)
+        threshold, sizes = limited_cuts(job.lights, job.batch, threshold, most)
         chunks = list(collect_cuts(job.lights, job.batch, threshold, sizes))
         assert all(download(chunk.written).all() for chunk in chunks)
-        return download(visits), [(download(chunk.rows), download(chunk.nodes)) for chunk in chunks]
+        return download(sizes.visits), [(download(chunk.rows), download(chunk.nodes)) for chunk in chunks]
 
     monkeypatch.setattr(traversal, "_FIRST", 1 << 12)
     expected = [cuts_of(job) for job in jobs]
     monkeypatch.setattr(traversal, "_FIRST", first)
-    monkeypatch.setattr(traversal, "_LARGEST_STORE", store)
+    monkeypatch.setattr(light_cuts, "LARGEST_STORE", store)
     for job, (visits, chunks) in zip(jobs, expected, strict=True):
         assert max(np.bincount(rows).max() for rows, _ in chunks) > first or most
         found_visits, found = cuts_of(job)

@@ -40,9 +40,10 @@ def precise_sample(sampler):
 
 
 class PairNumbers:
-    """Uniform numbers for the pairs of ``size`` (UInt32, (n,)) sequences and an index or a place, by Mitsuba's hash.
+    """Uniform numbers for the pairs of n sequences and an index or a place, by Mitsuba's hash.
 
-    Packed records hold the hashes of the sequences, which many pairs share.
+    ``size`` (n,) UInt32: number of equal intervals of each sequence, see :meth:`systematic`.  Packed records hold the
+    hashes of the sequences, which many pairs share.
     """
 
     def __init__(self, seed: int, size: mi.UInt32):
@@ -156,10 +157,11 @@ def find_interval(cumulative, first, last, sample):
 
 
 class GuidedSums:
-    """Running sums of weights, searched like :func:`find_interval` in constant expected time by guided search [Chen and
-    Asau 1974, "On generating random variates from an empirical distribution"].
+    """Running sums of weights, searched like :func:`find_interval`, but by guided search [Chen and Asau 1974, "On
+    generating random variates from an empirical distribution"].
 
-    ``weight`` (n,) float64, non-negative: n intervals.
+    A search among all intervals takes constant expected time; in a part of them, it never takes longer than a bisection
+    of the part.  ``weight`` (n,) float64, non-negative: n intervals.
     """
 
     def __init__(self, weight: np.ndarray):

@@ -24,7 +24,7 @@ from ..core.arrays import add_at, chunks, download, upload
 from ..lights.light_set import LightGroup, LightSet
 from ..points.surfaces import Batch
 from ..transport.evaluation import Transport, evaluate_representatives
-from .traversal import Cuts, collect, several, traverse
+from .traversal import LARGEST_STORE, Cuts, collect, several, traverse
 
 # Pairs shaded and traced at a time: bounds the memory for any size of image and cuts
 _PAIRS_PER_CHUNK = 1 << 22
@@ -47,8 +47,8 @@ def _sum_segments(values, offset, count):
 
 
 @dataclass
-class CutSizes:
-    """Cuts of points in each group of lights."""
+class CutsOfGroups:
+    """Cuts of points, one of :class:`vpl.cuts.traversal.Cuts` for each group of lights."""
 
     cuts: list[Cuts]
 
@@ -62,12 +62,17 @@ class CutSizes:
         return sum(one.visits for one in self.cuts)
 
 
-def cut_sizes(lights: LightSet, batch: Batch, threshold, most: int = 0) -> CutSizes:
+def cuts_at(lights: LightSet, batch: Batch, threshold, most: int = 0, stores: bool = True) -> CutsOfGroups:
     """Cuts at a threshold, the largest accepted error per point.
 
-    Cuts end at the first node beyond ``most`` per group of lights (0: never).
+    Cuts end at the first node beyond ``most`` per group of lights (0: never).  ``stores``: whether to store the nodes,
+    for :func:`collect_cuts`.
     """
-    return CutSizes([traverse(group, batch, threshold, lights.smallest_distance, most) for group in lights.groups])
+    found, room = [], LARGEST_STORE if stores else 0
+    for group in lights.groups:
+        found.append(traverse(group, batch.receiver, threshold, lights.smallest_distance, most, room))
+        room -= found[-1].entries
+    return CutsOfGroups(found)
 
 
 def upload_thresholds(values: np.ndarray):
@@ -76,18 +81,18 @@ def upload_thresholds(values: np.ndarray):
         return upload(mi.Float, values.astype(np.float32))
 
 
-def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
-    """Sizes of the cuts, with thresholds raised for cuts of more than ``max_cut`` nodes (0: no limit).
+def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int, stores: bool = True):
+    """(Thresholds, cuts), with thresholds raised for cuts of more than ``max_cut`` nodes (0: no limit).
 
     Refinement of the worst cluster up to ``max_cut`` nodes ([LC] section 4.2) is equivalent to a larger threshold.
     Growing steps bracket the threshold; they end because the roots form the cut at an infinite threshold.  Bisection of
     the logarithm narrows the bracket.  Returns (threshold, sizes, nodes visited per point).
     """
     max_cut = max(max_cut, len(lights.groups)) if max_cut else 0  # the roots of the groups form the coarsest cut
-    sizes = cut_sizes(lights, batch, threshold, max_cut)
+    sizes = cuts_at(lights, batch, threshold, max_cut, stores)
     rows = several(np.flatnonzero(sizes.total() > max_cut))
     if max_cut == 0 or len(rows) == 0:
-        return threshold, sizes, sizes.visits
+        return threshold, sizes
     index = upload(mi.UInt32, rows)
     part = batch.select(index)
     # NumPy, because the points are mostly few: kernels would take longer to compile than to run
@@ -95,7 +100,7 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
 
     def too_large(values):
         """Mask of cuts above ``max_cut`` at the given thresholds; stores the sizes of the remaining cuts."""
-        found = cut_sizes(lights, part, upload_thresholds(values), max_cut)
+        found = cuts_at(lights, part, upload_thresholds(values), max_cut, stores=False)
         over = found.total() > max_cut
         for number, one in enumerate(found.cuts):
             fitting[number] = np.where(over, fitting[number], download(one.count))
@@ -117,7 +122,7 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int):
     dr.eval(threshold)
     for one, count, visits in zip(sizes.cuts, fitting, spent, strict=True):
         one.replace(index, upload(mi.UInt32, count), upload(mi.UInt32, visits))
-    return threshold, sizes, sizes.visits
+    return threshold, sizes
 
 
 @dataclass
@@ -146,11 +151,11 @@ class CutChunk:
 
     @property
     def written(self) -> mi.Bool:
-        """Mask of valid entries: rounding may shorten a cut after the counting traversal and leave entries unused."""
+        """Mask of valid entries: rounding may shorten a cut that is not stored as a whole, and leave entries unused."""
         return self.place < dr.gather(mi.UInt32, self.length, self.rows)
 
 
-def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
+def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutsOfGroups):
     """Yield the cuts of a batch as evaluated :class:`CutChunk` of bounded size."""
     for number, (group, cuts) in enumerate(zip(lights.groups, sizes.cuts, strict=True)):
         count = download(cuts.count).astype(np.int64)
@@ -161,13 +166,13 @@ def collect_cuts(lights: LightSet, batch: Batch, threshold, sizes: CutSizes):
             points = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
             part = batch if last - first == batch.count else batch.select(points)
             rows, nodes, offset, written, visits = collect(
-                group, part, threshold, lights.smallest_distance, cuts, first, length
+                group, part.receiver, threshold, lights.smallest_distance, cuts, first, length
             )
             yield CutChunk(group, number, part, points, offset, written, rows, nodes, visits)
 
 
 def evaluate_cuts(
-    transport: Transport, batch: Batch, threshold, sizes: CutSizes, second=False, stopped=lambda: False
+    transport: Transport, batch: Batch, threshold, sizes: CutsOfGroups, second=False, stopped=lambda: False
 ):  # fmt: skip
     """Radiance of every point from its cut: representative lights, scaled to their clusters' intensity [LC, section 3].
 
@@ -210,14 +215,14 @@ def estimate_radiance(transport: Transport, batch: Batch, direct, mean: float, m
     index = upload(mi.UInt32, rows)
     part = batch.select(index)
     threshold = dr.opaque(mi.Float, _ESTIMATE_ERROR * mean, len(rows))
-    threshold, sizes, searched = limited_cuts(transport.lights, part, threshold, max_cut)
+    threshold, sizes = limited_cuts(transport.lights, part, threshold, max_cut)
     # Second representatives, because thresholds must be independent of the final cuts' representatives
     radiance, rays, collected = evaluate_cuts(transport, part, threshold, sizes, second=True)
     reflected = np.repeat(download(radiance).mean(1, dtype=np.float64), stride)[:count]
     level = block_mean(reflected + download(direct).mean(1, dtype=np.float64), 2 * stride)
     estimate = Estimate(level, *(dr.zeros(mi.UInt32, count) for _ in range(2)))
     dr.scatter(estimate.shadow_rays, rays, index)
-    dr.scatter(estimate.upper_bounds, collected + searched, index)
+    dr.scatter(estimate.upper_bounds, collected + sizes.visits, index)
     return estimate
 
 

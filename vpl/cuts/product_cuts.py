@@ -211,7 +211,7 @@ def raise_thresholds(
     # The search multiplies thresholds, so they must be positive
     tried = np.maximum(allowed[rows], np.finfo(np.float32).tiny)
     index = upload(mi.UInt32, rows)
-    raised, sizes, visits = limited_cuts(lights, clusters.batch.select(index), upload_thresholds(tried), max_cut)
-    counter.add_at_points(index, visits)
+    raised, sizes = limited_cuts(lights, clusters.batch.select(index), upload_thresholds(tried), max_cut, stores=False)
+    counter.add_at_points(index, sizes.visits)
     least = download(raised).astype(np.float64) * np.minimum(sizes.total() / max_cut, 1)
     return np.maximum(allowed, np.repeat(least, stride)[: clusters.count])

@@ -62,8 +62,8 @@ def initial_columns(entries: MatrixEntries, mean: float, most: int) -> tuple[Col
     clusters = entries.rows.clusters
     slices = _SliceBatch(clusters, upload(mi.UInt32, clusters.tree.leaves))
     threshold = upload_thresholds(np.full(slices.count, max(_START * mean, np.finfo(np.float32).tiny)))
-    threshold, sizes, visits = limited_cuts(entries.lights, slices, threshold, most)
-    bounds, parts = int(dr.sum(mi.UInt64(visits))[0]), []
+    threshold, sizes = limited_cuts(entries.lights, slices, threshold, most)
+    bounds, parts = int(dr.sum(mi.UInt64(sizes.visits))[0]), []
     numbers = {id(group): number for number, group in enumerate(entries.lights.groups)}
     for chunk in collect_cuts(entries.lights, slices, threshold, sizes):
         piece, node, written = (

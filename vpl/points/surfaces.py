@@ -186,3 +186,18 @@ class Receiver:
     normal_cosine: mi.Float | None = None
     mirror_cosine: mi.Float | None = None
     by_expected_error: bool = False
+
+    @property
+    def count(self) -> int:
+        return dr.width(self.position)
+
+    def select(self, index: mi.UInt32) -> Receiver:
+        """The receivers at ``index``, evaluated."""
+        picked = {
+            name: None if value is None else dr.gather(type(value), value, index)
+            for name, value in vars(self).items()
+            if name not in ("proxy", "by_expected_error")
+        }
+        picked = Receiver(**picked, proxy=self.proxy.select(index), by_expected_error=self.by_expected_error)
+        dr.eval(vars(picked.proxy), {name: value for name, value in vars(picked).items() if name != "proxy"})
+        return picked

@@ -130,8 +130,8 @@ class Gathered:
 
 
 class PackedVertices:
-    """Gather vertices with the camera ``ray`` of each, in an ``order``, as packed records: one access to memory instead
-    of one for each value.
+    """Gather vertices with the camera ``ray`` of each, in an ``order``, as packed records: the values of a vertex lie
+    in one line of the cache.
 
     ``level``: weight of each vertex, the mean of the absolute values over channels.
     """
@@ -142,7 +142,7 @@ class PackedVertices:
         self.level = channel_mean(dr.abs(one.weight))
         depth, ray = (dr.reinterpret_array(mi.Float, x) for x in (one.depth, dr.gather(mi.UInt32, ray, order)))
         weight = spectrum_to_rgb(one.weight)
-        parts = [(one.position, ray), (one.flat, depth), (one.normal, self.level), (weight, mi.Float(0))]
+        parts = [(one.position, ray), (one.flat, depth), (one.normal, mi.Float(0)), (weight, mi.Float(0))]
         self._records = dr.zeros(mi.Float, count * _RECORD)
         for number, (vector, value) in enumerate(parts):
             dr.scatter(self._records, mi.Vector4f(*vector, value), row * len(parts) + number)

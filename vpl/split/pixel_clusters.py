@@ -47,14 +47,11 @@ class Receivers:
 
     @property
     def count(self) -> int:
-        return dr.width(self.receiver.position)
+        return self.receiver.count
 
     def select(self, index) -> Receivers:
         """The clusters at ``index``, evaluated."""
-        one = self.receiver
-        parts = [dr.gather(type(x), x, index) for x in (one.position, one.extent, one.normal, one.normal_cosine)]
-        dr.eval(parts)
-        return Receivers.of(*parts)
+        return Receivers(self.receiver.select(index))
 
 
 class PixelClusters:
@@ -175,13 +172,12 @@ def light_clusters(
     # A cluster without weight may have any error
     threshold = mi.Float(allowed / dr.maximum(clusters.weight, np.finfo(np.float64).tiny))
     dr.eval(threshold)
-    threshold, sizes, _ = limited_cuts(transport.lights, clusters.receivers, threshold, max_cut)
-    rays = 0
+    threshold, sizes = limited_cuts(transport.lights, clusters.receivers, threshold, max_cut)
+    rays, numbers = 0, [PairNumbers(derived_seed(seed, k), clusters.size) for k in range(len(transport.lights.groups))]
     for chunk in collect_cuts(transport.lights, clusters.receivers, threshold, sizes):
-        cluster = dr.gather(mi.UInt32, chunk.points, chunk.rows)
-        numbers = PairNumbers(derived_seed(seed, chunk.number), clusters.size)
-        of_light = numbers.random(cluster, chunk.group.first_light(chunk.nodes))
-        of_vertex = numbers.systematic(cluster, chunk.place)
+        cluster, own = dr.gather(mi.UInt32, chunk.points, chunk.rows), numbers[chunk.number]
+        of_light = own.random(cluster, chunk.group.first_light(chunk.nodes))
+        of_vertex = own.systematic(cluster, chunk.place)
         ray, surface, weight = clusters.draw(cluster, of_vertex)
         light, scale = chunk.group.draw(chunk.nodes, of_light)
         value, traced = evaluate_pairs(transport, chunk.group, surface, light, scale)

@@ -301,7 +301,9 @@ def test_no_kernel_is_compiled_anew_for_another_seed(lights_cost_nothing, monkey
         dr.kernel_history_clear()
         render(scene, "manylights", 16, 3, max_depth=4)
         kernels = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
-    assert [(kernel["size"], kernel["operation_count"]) for kernel in kernels if not kernel["cache_hit"]] == []
+    # A kernel found on the disk was not in memory
+    compiled = [kernel for kernel in kernels if not kernel["cache_hit"] or kernel["cache_disk"]]
+    assert [(kernel["size"], kernel["operation_count"]) for kernel in compiled] == []
 
 
 @pytest.mark.parametrize("many", [False, True])

@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.properties import seeds, unit_vectors
 from vpl.core.arrays import download, upload, upload_vectors
-from vpl.cuts.light_cuts import collect_cuts, cut_sizes
+from vpl.cuts.light_cuts import collect_cuts, cuts_at
 from vpl.lights.light_set import LightSet, ScatteredGroup
 from vpl.lights.virtual_lights import VirtualLights
 from vpl.split.pixel_clusters import Receivers
@@ -129,14 +129,14 @@ def test_cuts_of_pixels_compare_expected_errors():
     group = ScatteredGroup.of(lights, 1)
     lights, receivers = LightSet([group], 0, np.inf, 0, 0, {}), Receivers.of(*uploaded(random_boxes(rng, 0.1)))
     threshold = dr.opaque(mi.Float, 0.01, PAIRS)
-    sizes = cut_sizes(lights, receivers, threshold)
+    sizes = cuts_at(lights, receivers, threshold)
     (chunk,) = collect_cuts(lights, receivers, threshold, sizes)
     node, receiver = group.tree.gather(chunk.nodes), receivers.select(chunk.rows).receiver
     (error, bound), leaf = errors(receiver, node), download(node.escape == chunk.nodes + 1)
     assert ((error <= 0.01 * (1 + 1e-5)) | leaf).all() and (error[~leaf] > 0).any()
     assert (bound[~leaf] > 0.01).mean() > 0.05
     rows = np.arange(0, PAIRS, 7)
-    some = cut_sizes(lights, receivers.select(upload(mi.UInt32, rows)), dr.opaque(mi.Float, 0.01, len(rows)))
+    some = cuts_at(lights, receivers.select(upload(mi.UInt32, rows)), dr.opaque(mi.Float, 0.01, len(rows)))
     np.testing.assert_array_equal(some.total(), sizes.total()[rows])
 
 
