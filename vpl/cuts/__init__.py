@@ -2,8 +2,8 @@
 
 Each method chooses how coarse clusters may be, from error bounds (:mod:`vpl.transport.bounds`) and a radiance estimate.
 
-[LC], plugin ``lightcuts``, uses ``light_cuts`` and ``traversal``: the radiance estimate of each point (``estimate_radiance``), the
-cut through the light trees (``limited_cuts``), and its radiance (``evaluate_cuts``).
+[LC], plugin ``lightcuts``, uses ``light_cuts`` and ``traversal``: the radiance estimate of each point
+(``estimate_radiance``), the cut through the light trees (``limited_cuts``), and its radiance (``evaluate_cuts``).
 
 [MDLC], plugin ``mdlightcuts``, uses pairs of a gather node and a light node; gather trees are in
 :mod:`vpl.points.gather_tree`::

@@ -171,8 +171,9 @@ def traverse(
 def collect(group: LightGroup, receiver: Receiver, threshold, smallest_distance: float, cuts: Cuts, first: int, length):
     """(Rows of the points, nodes, offset and number of entries per point, nodes visited per point) of cuts.
 
-    The points ``receiver`` are those of ``cuts`` from ``first`` on, and have ``length`` (n,) nodes, NumPy.  Rounding may change the
-    rest of a cut between the traversals; nodes beyond ``length`` are dropped, and a point may have fewer entries.
+    The points ``receiver`` are those of ``cuts`` from ``first`` on, and have ``length`` (n,) nodes, NumPy.  Rounding
+    may change the rest of a cut between the traversals; nodes beyond ``length`` are dropped, and a point may have fewer
+    entries.
     """
     count = len(length)
     rows = upload(mi.UInt32, np.repeat(np.arange(count, dtype=np.uint32), length))
