@@ -407,6 +407,16 @@ def test_a_wider_window_and_the_angular_weight_do_what_they_say():
 
 
 @pytest.mark.stress
+def test_a_tree_in_the_order_of_its_leaves_is_the_same_tree():
+    rng = np.random.default_rng(2)
+    position, direction, flux = random_lights(rng, 70)
+    tree = build(position, direction, flux)
+    order, ordered = tree.leaf_order, tree.in_leaf_order()
+    check_tree(ordered, position[order], direction[order], flux[order])
+    np.testing.assert_array_equal(order[ordered.representative], tree.representative)
+    np.testing.assert_array_equal(ordered.leaf_order, np.arange(70))
+
+
 def test_representatives_are_drawn_in_proportion_to_intensity():
     rng = np.random.default_rng(10)
     position, direction, flux = random_lights(rng, 12)

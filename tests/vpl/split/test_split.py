@@ -226,6 +226,14 @@ def ranges_of(group):
     return first, last, order
 
 
+def test_the_first_light_of_a_node_has_the_index_of_the_caller():
+    lights = surface_lights(np.random.default_rng(6), 100)
+    group = ScatteredGroup.of(lights, 1)
+    node = dr.arange(mi.UInt32, group.tree.count)
+    found = np.array(group.lights.gather(group._record(node).x).position).T
+    np.testing.assert_array_equal(found, lights.position[np.array(group.first_light(node))])
+
+
 def test_nodes_know_the_least_c_of_their_lights():
     lights = surface_lights(np.random.default_rng(5), 200)
     group = ScatteredGroup.of(lights, 1)
