@@ -406,7 +406,6 @@ def test_a_wider_window_and_the_angular_weight_do_what_they_say():
 # --- Representatives ---
 
 
-@pytest.mark.stress
 def test_a_tree_in_the_order_of_its_leaves_is_the_same_tree():
     rng = np.random.default_rng(2)
     position, direction, flux = random_lights(rng, 70)
@@ -417,6 +416,7 @@ def test_a_tree_in_the_order_of_its_leaves_is_the_same_tree():
     np.testing.assert_array_equal(ordered.leaf_order, np.arange(70))
 
 
+@pytest.mark.stress
 def test_representatives_are_drawn_in_proportion_to_intensity():
     rng = np.random.default_rng(10)
     position, direction, flux = random_lights(rng, 12)
