@@ -119,10 +119,9 @@ class Cuts:
     def replace(self, rows: mi.UInt32, count: mi.UInt32, visits: mi.UInt32) -> None:
         """Replace the cuts of the points ``rows`` by those of ``count`` nodes with other thresholds, which are not
         stored; add to ``visits``."""
-        for target, value in ((self.count, count), (self.known, mi.UInt32(0)), (self.onward, mi.UInt32(0))):
-            dr.scatter(target, value, rows)
-        dr.scatter(self.visits, dr.gather(mi.UInt32, self.visits, rows) + visits, rows)
-        dr.eval(self.count, self.visits, self.known, self.onward)
+        for target in (self.known, self.onward):
+            dr.scatter(target, mi.UInt32(0), rows)
+        self.add(rows, 0, count, visits, None)
 
 
 def several(index: np.ndarray) -> np.ndarray:

@@ -199,5 +199,5 @@ class Receiver:
             if name not in ("proxy", "by_expected_error")
         }
         picked = Receiver(**picked, proxy=self.proxy.select(index), by_expected_error=self.by_expected_error)
-        dr.eval(vars(picked.proxy), {name: value for name, value in vars(picked).items() if name != "proxy"})
+        dr.eval(picked)
         return picked
