@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from functools import partial
 
 from vpl.core.backend import check_backend, import_drjit
 
@@ -23,17 +24,20 @@ import_drjit()
 
 import mitsuba as mi  # noqa: E402  (import_drjit explains import errors)
 
-PLUGINS = (
-    "manylights",
-    "vpl",
-    "lightcuts",
-    "mdlightcuts",
-    "lightslice",
-    "matrixrecovery",
-    "illuminationcut",
-    "adaptivedirect",
-    "unoccludeddirect",
-)
+# The class of each plugin, in the module with the plugin's name
+PLUGINS = {
+    "manylights": "ManyLightsIntegrator",
+    "vpl": "VPLIntegrator",
+    "lightcuts": "LightcutsIntegrator",
+    "mdlightcuts": "MultidimensionalLightcutsIntegrator",
+    "lightslice": "LightSliceIntegrator",
+    "matrixrecovery": "MatrixRecoveryIntegrator",
+    "illuminationcut": "IlluminationCutIntegrator",
+    "adaptivedirect": "AdaptiveDirectIntegrator",
+    "unoccludeddirect": "UnoccludedDirectIntegrator",
+}
+# Modules of their base classes, in the order in which they import each other
+_BASES = ("gathering", "camera_samples", "longer_renders", "bands", "common", "direct")
 VARIANTS = (
     "llvm_ad_rgb",
     "llvm_ad_mono",
@@ -47,15 +51,24 @@ VARIANTS = (
 
 
 def _register(_old: str | None, variant: str) -> None:
-    """Register the plugins for ``variant``: reload their modules, because the base class belongs to the variant."""
+    """Register the plugins for ``variant``.
+
+    Loaded modules are loaded again, because their base class belongs to the variant.  Other plugins are loaded when a
+    scene first uses them.
+    """
     if variant in VARIANTS:
         check_backend(variant)
-    for name in ("gathering", "camera_samples", "longer_renders", "bands", "common", "direct", *PLUGINS):
+    for name in (*_BASES, *PLUGINS):
         full_name = f"{__name__}.{name}"
         if full_name in sys.modules:
             importlib.reload(sys.modules[full_name])
-        else:
-            importlib.import_module(full_name)
+        elif name in PLUGINS:
+            mi.register_integrator(name, partial(_load, name))
+
+
+def _load(name: str, props: mi.Properties) -> mi.Integrator:
+    """Import the module of a plugin, which registers its class in place of this function, and make an integrator."""
+    return getattr(importlib.import_module(f"{__name__}.{name}"), PLUGINS[name])(props)
 
 
 if mi.variant() is not None:

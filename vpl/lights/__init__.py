@@ -15,7 +15,8 @@ Data flow and reading order::
 - ``virtual_lights``: ``VirtualLights`` in NumPy arrays, ``DeviceLights`` for kernels, and ``geometry``, the geometric
   factor between a light and a point
 - ``clustering``: bottom-up clustering with any merge cost, for [LC] and [IAS]
-- ``light_tree``: the light tree of [LC] with representative lights, boxes and cones; ``DeviceTree`` for kernels
+- ``light_tree``: the light tree of [LC] with representative lights, boxes and cones
+- ``device_tree``: light trees in kernels
 - ``light_set``: ``LightSet``, the lights of a render with one ``LightGroup`` per kind; emitters with an extent turned
   into virtual lights (``direct="vpl"``); scale factors of representative lights
 

@@ -20,7 +20,8 @@ from ..core.stages import Stage
 from .emission import bounding_sphere
 from .emitters import Emitters
 from .focus import Focus, spacing
-from .light_tree import CONE_COS, INTENSITY, LEAST_C, WINDOW, DeviceTree, LightTree, build_light_tree
+from .device_tree import DeviceTree
+from .light_tree import CONE_COS, INTENSITY, LEAST_C, WINDOW, LightTree, build_light_tree
 from .tracing import LightPathSettings, TracedLights, trace_lights
 from .virtual_lights import KINDS, DeviceLights, VirtualLights
 

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import channel_mean
-from ..lights.light_tree import Node
+from ..lights.device_tree import Node
 from ..lights.virtual_lights import AT_INFINITY
 from ..points.bsdf_proxies import MaterialProxy
 from ..points.surfaces import Receiver
