@@ -17,10 +17,10 @@ from ..core.clock import Clock
 from ..core.cones import COSINE_ROUNDING
 from ..core.sampling import Choice, GuidedSums, derived_seed, independent_sampler, stratified
 from ..core.stages import Stage
+from .device_tree import DeviceTree
 from .emission import bounding_sphere
 from .emitters import Emitters
 from .focus import Focus, spacing
-from .device_tree import DeviceTree
 from .light_tree import CONE_COS, INTENSITY, LEAST_C, WINDOW, LightTree, build_light_tree
 from .tracing import LightPathSettings, TracedLights, trace_lights
 from .virtual_lights import KINDS, DeviceLights, VirtualLights

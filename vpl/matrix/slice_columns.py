@@ -23,8 +23,8 @@ import numpy as np
 
 from ..core.arrays import channel_mean, download, even_chunks, upload
 from ..core.sampling import derived_seed, find_interval, independent_sampler, precise_sample
-from ..lights.light_set import LightGroup, LightSet
 from ..lights.device_tree import DeviceTree
+from ..lights.light_set import LightGroup, LightSet
 from ..lights.light_tree import ESCAPE, cluster_sizes
 from ..points.point_clusters import PointClusters
 from ..points.slices import six_dimensional

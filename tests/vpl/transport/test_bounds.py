@@ -7,8 +7,8 @@ import pytest
 
 from tests.support.pairs import exact, scene_of, unit
 from vpl.core.arrays import download, upload
-from vpl.lights.light_set import light_tree
 from vpl.lights.device_tree import DeviceTree
+from vpl.lights.light_set import light_tree
 from vpl.lights.light_tree import CONE_COS, build_light_tree
 from vpl.points.bsdf_proxies import MaterialProxy
 from vpl.points.surfaces import Receiver
