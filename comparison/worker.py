@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from . import images, machine
-from .command_line import failure, set_variant, versions
+from .command_line import check_integrator, failure, set_variant, versions
 from .counters import total_statistics
 from .denoising import Denoiser
 from .fine_film import usual_parts
@@ -132,6 +132,8 @@ def _ask(process, job, tick):
 def render(job):
     """Execute a job in this process; return the measurements (see `run`)."""
     set_variant(job.variant)
+    # Imports the module of a plugin, which is no part of loading a scene
+    check_integrator(job.integrator)
     begin = time.perf_counter()
     file = _parse(job)
     parameters, scene = file.integrator[1], file.load(job.threads)

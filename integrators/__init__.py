@@ -4,8 +4,9 @@
 methods of papers.
 
 ``import manylights`` checks for another module named ``manylights``, then imports this package.  This package registers
-the plugins for the current variant, and again after every ``mi.set_variant``.  Supported are the vectorised ``*_rgb``
-and ``*_mono`` variants; any other variant raises an error when a plugin is loaded.
+the plugins for the current variant, and again after every ``mi.set_variant``.  The module of a plugin is imported when
+its first integrator is created.  Supported are the vectorised ``*_rgb`` and ``*_mono`` variants; in any other variant,
+creating an integrator raises an error.
 
 Mitsuba 3.10 will not need the import: for every variant it imports or reloads the modules of the entry points in the
 group ``mitsuba``, in the order of their names.  Each plugin's module is an entry point and registers its plugin.  The
@@ -36,8 +37,8 @@ PLUGINS = {
     "adaptivedirect": "AdaptiveDirectIntegrator",
     "unoccludeddirect": "UnoccludedDirectIntegrator",
 }
-# Modules of their base classes, in the order in which they import each other
-_BASES = ("gathering", "camera_samples", "longer_renders", "bands", "common", "direct")
+# Shared modules: each follows the modules that it imports
+_BASES = ("camera_samples", "gathering", "longer_renders", "bands", "common", "direct")
 VARIANTS = (
     "llvm_ad_rgb",
     "llvm_ad_mono",
@@ -51,11 +52,8 @@ VARIANTS = (
 
 
 def _register(_old: str | None, variant: str) -> None:
-    """Register the plugins for ``variant``.
-
-    Loaded modules are loaded again, because their base class belongs to the variant.  Other plugins are loaded when a
-    scene first uses them.
-    """
+    """Register the plugins for ``variant``: reload modules, because the base class belongs to the variant, and register
+    functions that import the modules of the remaining plugins."""
     if variant in VARIANTS:
         check_backend(variant)
     for name in (*_BASES, *PLUGINS):
@@ -63,12 +61,16 @@ def _register(_old: str | None, variant: str) -> None:
         if full_name in sys.modules:
             importlib.reload(sys.modules[full_name])
         elif name in PLUGINS:
-            mi.register_integrator(name, partial(_load, name))
+            mi.register_integrator(name, _LOADERS[name])
 
 
 def _load(name: str, props: mi.Properties) -> mi.Integrator:
     """Import the module of a plugin, which registers its class in place of this function, and make an integrator."""
     return getattr(importlib.import_module(f"{__name__}.{name}"), PLUGINS[name])(props)
+
+
+# Kept: another thread may still call a function after the plugin's class has replaced it
+_LOADERS = {name: partial(_load, name) for name in PLUGINS}
 
 
 if mi.variant() is not None:

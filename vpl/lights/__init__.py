@@ -2,7 +2,7 @@
 
 Data flow and reading order::
 
-    scene -> emitters -> emission -> tracing -> virtual_lights -> light_tree -> light_set
+    scene -> emitters -> emission -> tracing -> virtual_lights -> light_tree -> device_tree -> light_set
                                                                   (clustering)
 
 - ``emitters``: a scene's emitters in flat arrays (``Emitters``), because kernels must not call emitter objects
@@ -16,7 +16,7 @@ Data flow and reading order::
   factor between a light and a point
 - ``clustering``: bottom-up clustering with any merge cost, for [LC] and [IAS]
 - ``light_tree``: the light tree of [LC] with representative lights, boxes and cones
-- ``device_tree``: light trees in kernels
+- ``device_tree``: ``DeviceTree``, a light tree in kernels, and its ``Node``
 - ``light_set``: ``LightSet``, the lights of a render with one ``LightGroup`` per kind; emitters with an extent turned
   into virtual lights (``direct="vpl"``); scale factors of representative lights
 
