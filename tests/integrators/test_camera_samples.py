@@ -102,7 +102,9 @@ def test_the_sensor_keeps_its_sampler_and_film():
 
 
 def test_kept_lights_serve_any_number_of_samples():
-    scene = mi.load_dict(mi.cornell_box() | {"integrator": {"type": "manylights", "keep_lights": True}})
+    room = mi.cornell_box() | {"integrator": {"type": "manylights", "keep_lights": True}}
+    room["sensor"]["film"] |= {"width": 64, "height": 64}
+    scene = mi.load_dict(room)
     for spp in (32, 64):
         mi.render(scene, spp=spp, seed=2)
     found = scene.integrator().statistics

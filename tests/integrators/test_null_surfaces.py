@@ -40,12 +40,12 @@ def sheets(*names):
     }
 
 
-def assert_image_of_prb(scene, max_depth, finds=0.06, **more):
+def assert_image_of_prb(scene, max_depth, finds=0.06, seeds=10, **more):
     def pair(seed):
         found = render(scene, "manylights", 128, seed, max_depth=max_depth, **more)
         return found, render(scene, "prb", 1024, seed, max_depth=max_depth)
 
-    assert_same_mean(pair, 10, finds)
+    assert_same_mean(pair, seeds, finds)
 
 
 @pytest.mark.parametrize("names", ["torn glass", "bumps torn", *stress("blend", "glass glass", "torn blend bumps")])
@@ -80,7 +80,8 @@ def test_many_emitters_above_a_torn_sheet(max_depth, lights_cost_nothing):
     """Virtual lights carry only light that passes no surface."""
     rng = np.random.default_rng(2)
     scene = mi.load_dict(closed_box(panels(90, rng) | bulbs(10, rng), 12, **sheets("torn")))
-    assert_image_of_prb(scene, max_depth)
+    # With ten pairs, the bound of the spread is missed
+    assert_image_of_prb(scene, max_depth, seeds=16)
 
 
 def test_shadow_rays_pass_as_many_surfaces_as_allowed():

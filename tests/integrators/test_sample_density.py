@@ -8,6 +8,7 @@ import pytest
 
 from comparison.fine_film import fine_film, merged
 from comparison.single_pass import SharedStart, render_pass
+from tests.support.marks import stress
 from tests.support.rendering import plugin_with_model
 from tests.support.scenes import area_light, closed_box, image, sensor, wall
 from tests.support.statistics import assert_same_mean
@@ -129,8 +130,7 @@ def test_the_mean_of_every_pixel_is_that_of_equal_numbers(lights, parts):
     assert_same_mean_of_pixels(pair)
 
 
-@pytest.mark.parametrize("rays_of_part", [None, SPP * WIDTH], ids=["one part", "several parts"])
-@pytest.mark.parametrize("parts", [1, 2])
+@pytest.mark.parametrize(("parts", "rays_of_part"), [(1, None), (2, None), (1, SPP * WIDTH), *stress((2, SPP * WIDTH))])
 @with_and_without_lights
 def test_passes_that_share_lattices_have_the_mean_of_equal_numbers(monkeypatch, lights, parts, rays_of_part):
     """And in their mean less noise than passes with lattices of their own, wherever the image is divided."""
