@@ -25,18 +25,17 @@ import_drjit()
 
 import mitsuba as mi  # noqa: E402  (import_drjit explains import errors)
 
-# The class of each plugin, in the module with the plugin's name
-PLUGINS = {
-    "manylights": "ManyLightsIntegrator",
-    "vpl": "VPLIntegrator",
-    "lightcuts": "LightcutsIntegrator",
-    "mdlightcuts": "MultidimensionalLightcutsIntegrator",
-    "lightslice": "LightSliceIntegrator",
-    "matrixrecovery": "MatrixRecoveryIntegrator",
-    "illuminationcut": "IlluminationCutIntegrator",
-    "adaptivedirect": "AdaptiveDirectIntegrator",
-    "unoccludeddirect": "UnoccludedDirectIntegrator",
-}
+PLUGINS = (
+    "manylights",
+    "vpl",
+    "lightcuts",
+    "mdlightcuts",
+    "lightslice",
+    "matrixrecovery",
+    "illuminationcut",
+    "adaptivedirect",
+    "unoccludeddirect",
+)
 # Shared modules: each follows the modules that it imports
 _BASES = ("camera_samples", "gathering", "longer_renders", "bands", "common", "direct")
 VARIANTS = (
@@ -66,7 +65,8 @@ def _register(_old: str | None, variant: str) -> None:
 
 def _load(name: str, props: mi.Properties) -> mi.Integrator:
     """Import the module of a plugin, which registers its class in place of this function, and make an integrator."""
-    return getattr(importlib.import_module(f"{__name__}.{name}"), PLUGINS[name])(props)
+    importlib.import_module(f"{__name__}.{name}")
+    return mi.PluginManager.instance().create_object(props)
 
 
 # Kept: another thread may still call a function after the plugin's class has replaced it
