@@ -24,6 +24,7 @@ import sys
 import tempfile
 from contextlib import nullcontext
 from pathlib import Path
+from statistics import geometric_mean
 
 import mitsuba as mi
 import numpy as np
@@ -153,7 +154,7 @@ def table(names, options) -> dict:
         ]
         columns += [f"{slower[label]:.1f}" if label in slower else "-" for label in ratios]
         print(f"{name} | {' | '.join(columns)}", flush=True)
-    means = {label: f"{scenes.geometric_mean(values):.1f}" for label, values in ratios.items() if values}
+    means = {label: f"{geometric_mean(values):.1f}" for label, values in ratios.items() if values}
     print("geometric means:", ", ".join(f"{label} {value}" for label, value in means.items()))
     return rows
 

@@ -22,6 +22,7 @@ import resource
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import geometric_mean
 
 import mitsuba as mi
 import numpy as np
@@ -229,8 +230,8 @@ def equal_errors(names, width: int, samples: int, points: int, methods) -> dict:
                 print(
                     "  stages:", ", ".join(f"{stage} {spent:.2f}" for stage, spent in found.stages.items()), flush=True
                 )
-    for method, found in speedups.items():
-        print(f"geometric mean of the speedups of {method}: {scenes.geometric_mean(found):.2f}")
+    for method, found in speedups.items() if rows else ():
+        print(f"geometric mean of the speedups of {method}: {geometric_mean(found):.2f}")
     return rows
 
 

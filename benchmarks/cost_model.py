@@ -16,6 +16,7 @@ import time
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
+from statistics import geometric_mean
 
 import mitsuba as mi
 import numpy as np
@@ -117,7 +118,7 @@ def main() -> None:
     print(f"\n{'geometric means':24s}" + "".join(f"{'× ' + format(factor, 'g'):>8s}" for factor in FACTORS))
     for constant in ["default", *options.constants]:
         pairs = [of_scene[constant] for of_scene in found.values()]
-        means = [scenes.geometric_mean([pair[k] or 1.0 for pair in pairs]) for k in range(len(FACTORS))]
+        means = [geometric_mean([pair[k] or 1.0 for pair in pairs]) for k in range(len(FACTORS))]
         print(f"{constant:24s}" + "".join(f"{mean:8.2f}" for mean in means))
         rows[constant] = row_of(means) | {name: row_of(of_scene[constant]) for name, of_scene in found.items()}
     if options.json:

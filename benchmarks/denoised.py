@@ -17,7 +17,7 @@ from unittest import mock
 import numpy as np
 
 from benchmarks import scenes
-from benchmarks.rivals import SAMPLERS, TRIMMED, Rival, Timed, load, measure_in_turn
+from benchmarks.rivals import SAMPLERS, TRIMMED, Timed, Whole, load, measure_in_turn
 from comparison.convergence import smoothed
 from comparison.denoising import FALL, Denoiser
 from comparison.detail import LEAST_SAMPLES
@@ -68,8 +68,8 @@ class Truth:
         return float(error[int(TRIMMED * error.size) : int((1 - TRIMMED) * error.size)].mean())
 
 
-class Several(Rival):
-    """Images of ``path`` of about ``seconds``: `Passes`, a single one or an even number where memory limits a pass.
+class Several(Whole):
+    """Images of ``path`` of about ``seconds``, as :class:`comparison.rendering.Passes`.
 
     ``shorter``: an image of fewer samples for each of them, the first of its passes or a pass of a ninth to a quarter
     of the samples; ``doublings``: of the samples of a shorter image up to those of an image.
@@ -77,17 +77,12 @@ class Several(Rival):
 
     def __init__(self, name: str, scene, sampler: str, width: int, seconds: float, parts: int):
         super().__init__(name, scene, "path", sampler, width, seconds, parts=parts)
-        passes = seconds / self.pass_seconds
-        if passes > 1.5:
-            # Two halves of equal weight, for detail; Mitsuba rounds the samples of `multijitter` to squares
-            self.count = 2 * int(np.ceil(passes / 2))
-            self.spp = max(round((self.spp * passes / self.count) ** 0.5), 1) ** 2
         self._fewer = self.spp if self.count > 1 else max(int(self.spp**0.5) // 2, 1) ** 2
         self.shorter, self.doublings = [], float(np.log2(self.spp * self.count / self._fewer))
 
     def measure(self, seed: int) -> None:
         """Render and keep one more image, and a shorter one."""
-        rendered = [self.render(1000 * seed + number) for number in range(self.count)]
+        rendered = self.render_passes(seed)
         self.images.append(self._passes(*(image for image, _ in rendered)))
         self.seconds.append(sum(spent for _, spent in rendered))
         self.shorter.append(self._passes(rendered[0][0]) if self.count > 1 else self._short_image(seed))
@@ -143,8 +138,7 @@ class Way:
 
     def __str__(self) -> str:
         one, fine = self.images, ", fine" if self.images.parts > 1 else ""
-        samples = one.spp * one.count * one.parts**2
-        return f"  path ({one.sampler[:5]}{fine}) {self.error:.5f} ({samples}, {self.seconds:.2f} s)"
+        return f"  path ({one.sampler[:5]}{fine}) {self.error:.5f} ({one.samples}, {self.seconds:.2f} s)"
 
 
 def longer(error: float, goal: float, fall: float) -> float:

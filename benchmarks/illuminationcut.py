@@ -23,6 +23,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import geometric_mean
 
 import drjit as dr
 import mitsuba as mi
@@ -143,8 +144,8 @@ def equal_quality(title: str, names, samples: int, lightcuts_error: float, **set
                 f"{speedup:.1f}",
                 flush=True,
             )
-    for visibility, values in speedups.items():
-        print(f"geometric mean of the speedups, visibility={visibility}: {scenes.geometric_mean(values):.2f}")
+    for visibility, values in speedups.items() if rows else ():
+        print(f"geometric mean of the speedups, visibility={visibility}: {geometric_mean(values):.2f}")
     return rows
 
 

@@ -16,6 +16,7 @@ import json
 import sys
 import tempfile
 from pathlib import Path
+from statistics import geometric_mean
 
 import drjit as dr
 import mitsuba as mi
@@ -74,7 +75,8 @@ def brute_force(names) -> dict:
             f"{found['cut_size'] / points:.0f} | {100 * error:.2f}% | {common + brute:.0f} | {ratios[-1]:.0f}",
             flush=True,
         )
-    print(f"geometric mean of the ratios: {scenes.geometric_mean(ratios):.0f}")
+    if ratios:
+        print(f"geometric mean of the ratios: {geometric_mean(ratios):.0f}")
     return rows
 
 

@@ -14,9 +14,9 @@ in ``product`` also ``manylights``.
   passes, each of which has its own light set.
 - ``denoised``: error of ``--passes`` denoised images, and the time of ``path`` for equal error, see
   :mod:`benchmarks.denoised`.  Without ``--scenes``, of the scenes with a reference.
-- ``timed``: variance × time of ``--passes`` images that ``manylights.render`` ends after ``--seconds``, with their
-  pilots and first passes.  ``path`` uses its better sampler, ``manylights`` its own stratified samples.  Kernels are
-  compiled before.
+- ``timed``: variance × time of ``--passes`` images of ``--seconds``.  Those of ``manylights`` are ended by
+  ``manylights.render``, with their pilots and first passes, and have its own stratified samples.  Those of ``path``
+  have its better sampler in a single pass, which stratifies best.  Kernels are compiled before.
 - ``cost``: CPU seconds of a sample over those of ``path``, see :mod:`benchmarks.sample_cost`; alone and without
   ``--scenes``, also in scenes where virtual lights gain little.
 - ``classes``: shares of classes of light in the variance, see :mod:`benchmarks.noise_classes`.
@@ -34,6 +34,7 @@ import sys
 import tempfile
 from fractions import Fraction
 from pathlib import Path
+from statistics import geometric_mean
 
 import mitsuba as mi
 import numpy as np
@@ -43,7 +44,7 @@ mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
 from benchmarks import denoised, noise_classes, results, sample_cost, scenes  # noqa: E402
-from benchmarks.rivals import DEPTH, KINDS, SAMPLERS, Rival, Timed, load, measure_in_turn  # noqa: E402
+from benchmarks.rivals import DEPTH, KINDS, SAMPLERS, Rival, Timed, Whole, load, measure_in_turn  # noqa: E402
 from benchmarks.views import move_cameras  # noqa: E402
 
 NAMES = (*scenes.NAMES, "classroom", "hall")
@@ -97,7 +98,7 @@ def print_mean(rows: dict, speedup: str = "speedup", of: str = "") -> None:
     """Print the geometric mean and the least of the speedups, a key of the rows; ``of``: description."""
     ratios = [row[speedup] for row in rows.values()]
     if ratios:
-        print(f"{of}geometric mean {scenes.geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
+        print(f"{of}geometric mean {geometric_mean(ratios):.2f}, worst {min(ratios):.2f}")
 
 
 def best_of(rivals: list, scale: np.ndarray) -> dict:
@@ -108,8 +109,8 @@ def best_of(rivals: list, scale: np.ndarray) -> dict:
 def outcome(best: dict, scale: np.ndarray) -> tuple[dict, list[str]]:
     """(Row of the result file, columns for print) of the best rivals."""
     values = {kind: float(best[kind].product(scale)) for kind in KINDS}
-    row = {kind: {"product": values[kind], "samples": best[kind].spp} for kind in KINDS}
-    columns = [f"{values[kind]:.4g} ({best[kind].spp}, {best[kind].sampler[:5]})" for kind in KINDS]
+    row = {kind: {"product": values[kind], "samples": best[kind].samples} for kind in KINDS}
+    columns = [f"{values[kind]:.4g} ({best[kind].samples}, {best[kind].sampler[:5]})" for kind in KINDS]
     return row | {"speedup": values["path"] / values["manylights"]}, columns
 
 
@@ -143,17 +144,19 @@ def product_of(name: str, width: int, seconds: float, passes: int, view: int) ->
 
 
 def timed(names, width: int, seconds: float, passes: int) -> dict:
-    """Print variance × time of images that end by time, and the ratio."""
+    """Print variance × time of images of equal time, and the ratio."""
     print(f"timed, {width} wide, {passes} images of {seconds:g} s; variance × time, with samples of an image")
     rows = {}
     for name in names:
         scene = load(name, width)
-        rivals = [Timed(scene, "path", sampler, seconds) for sampler in SAMPLERS]
+        rivals = [Whole(name, scene, "path", sampler, width, seconds) for sampler in SAMPLERS]
         # manylights stratifies the samples of this sampler
         rivals.append(Timed(scene, "manylights", "independent", seconds))
         measure_in_turn(rivals, passes)
         scale = scale_of(name, [image for rival in rivals for image in rival.images], width)
         row, columns = outcome(best_of(rivals, scale), scale)
+        for rival in rivals[: len(SAMPLERS)]:
+            row[rival.sampler] = {"product": float(rival.product(scale)), "samples": rival.samples}
         print(f"{name:18s}" + "".join(f"{column:>22s}" for column in columns) + f"{row['speedup']:8.2f}", flush=True)
         rows[name] = row
     print_mean(rows)

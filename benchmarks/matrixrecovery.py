@@ -25,6 +25,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from statistics import geometric_mean
 from unittest.mock import patch
 
 import mitsuba as mi
@@ -86,7 +87,7 @@ def table(names, options) -> dict:
                 pair = (one.rays / ours.rays, one.seconds / ours.seconds)
                 ratios.setdefault(method, []).append(pair)
     for method, pairs in ratios.items():
-        rays, seconds = (scenes.geometric_mean(values) for values in zip(*pairs, strict=True))
+        rays, seconds = (geometric_mean(values) for values in zip(*pairs, strict=True))
         print(f"geometric means over {method}: {rays:.2f} times fewer rays, {seconds:.2f} times faster")
     return rows
 

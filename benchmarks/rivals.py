@@ -1,4 +1,4 @@
-"""Integrators that compete on a scene: passes of equal time, or images that end by time."""
+"""Integrators that compete on a scene: passes or images of equal time, or images that end by time."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Rival:
     ):  # fmt: skip
         self.parts, width = parts, parts * width
         self.kind, self.sampler, self.images, self.seconds, self.light_paths = kind, sampler, [], [], light_paths
-        self.scene, self.sensor = scene, SAMPLERS.index(sampler)
+        self.scene, self.sensor, self._image_seconds = scene, SAMPLERS.index(sampler), seconds
         more = more if kind == "manylights" else {}
         self.integrator = mi.load_dict({"type": kind, "max_depth": DEPTH, **more})
         # Two sizes separate the cost of samples from the fixed cost of a pass
@@ -107,14 +107,43 @@ class Rival:
         self.images.append(image)
         self.seconds.append(seconds)
 
+    @property
+    def samples(self) -> int:
+        """Samples of a pixel of an image."""
+        return self.spp * self.count * self.parts**2
+
     def product(self, scale: np.ndarray, trimmed: float = TRIMMED) -> float:
-        """Variance × seconds of a pass, without the fraction ``trimmed`` of the pixels with the largest errors."""
+        """Variance × seconds of an image, without the fraction ``trimmed`` of the pixels with the largest errors."""
         return trimmed_variance(self.images, scale, trimmed) * float(np.median(self.seconds))
 
     def mean(self) -> tuple[float, float]:
         """Mean of the image over passes, and its standard error."""
         means = [image.mean() for image in self.images]
         return float(np.mean(means)), float(np.std(means, ddof=1) / np.sqrt(len(means)))
+
+
+class Whole(Rival):
+    """Images of one integrator of about ``seconds`` each, as :class:`Rival`: a single pass, which stratifies best, or
+    the mean of an even number of passes where memory limits a pass."""
+
+    def __init__(self, *arguments, **more):
+        super().__init__(*arguments, **more)
+        passes = self._image_seconds / self.pass_seconds
+        if passes > 1.5:
+            # Two halves of equal weight, for the detail of denoised images; Mitsuba rounds the samples of `multijitter`
+            # to squares
+            self.count = 2 * int(np.ceil(passes / 2))
+            self.spp = max(round((self.spp * passes / self.count) ** 0.5), 1) ** 2
+
+    def render_passes(self, seed: int) -> list[tuple[np.ndarray, float]]:
+        """Render the passes of an image: (image, seconds) of each."""
+        return [self.render(1000 * seed + number) for number in range(self.count)]
+
+    def measure(self, seed: int) -> None:
+        """Render and keep one more image."""
+        images, seconds = zip(*self.render_passes(seed), strict=True)
+        self.images.append(np.mean(images, axis=0))
+        self.seconds.append(sum(seconds))
 
 
 class Timed(Rival):

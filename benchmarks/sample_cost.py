@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from contextlib import contextmanager
+from statistics import geometric_mean
 from unittest import mock
 
 import drjit as dr
@@ -104,7 +105,7 @@ def cost(names, width: int, passes: int) -> dict:
         rows[name] = row
     for spp in SAMPLES:
         ratios = [row[f"{spp} samples"]["cost_ratio"] for row in rows.values()]
-        print(f"geometric mean at {spp} samples: {scenes.geometric_mean(ratios):.2f}, highest {max(ratios):.2f}")
+        print(f"geometric mean at {spp} samples: {geometric_mean(ratios):.2f}, highest {max(ratios):.2f}")
     return rows
 
 

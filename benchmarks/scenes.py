@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import subprocess
 import sys
@@ -12,6 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from comparison.scene_files import SceneFile
+
 PROJECT = Path(__file__).resolve().parent.parent
 SHARED = PROJECT.parent / "shared"
 REFERENCES, REFERENCE_WIDTH = SHARED / "references", 256
@@ -19,12 +22,6 @@ NAMES = (
     "cornell", "kitchen", "sponza_crytek", "staircase2", "living_room", "dining_room", "bistro_interior",
     "veach_ajar", "everything8003",
 )  # fmt: skip
-# Heights at a width of 256, from the aspect ratios of the references
-_HEIGHTS = {
-    "cornell": 256, "glossy": 256, "everything8003": 256, "bistro_interior": 192, "kitchen_lamps": 192,
-    "kitchen_windows": 192, "forest_lights": 192, "concourse": 192, "veils": 192, "foliage": 192,
-    "lamp_grid": 192,
-}  # fmt: skip
 
 
 def scene_file(name: str) -> Path:
@@ -60,9 +57,16 @@ def scale_of_truth(truth: np.ndarray) -> np.ndarray:
     return truth**2 + 0.01 * truth.mean() ** 2
 
 
+@functools.cache
+def size_of(name: str) -> tuple[int, int]:
+    """Width and height of the image in a scene's file, in pixels."""
+    return SceneFile(scene_file(name)).size
+
+
 def height(name: str, width: int) -> int:
     """Height of a scene's image for a width in pixels."""
-    return round(_HEIGHTS.get(name, 144) * width / 256)
+    own_width, own_height = size_of(name)
+    return round(own_height * width / own_width)
 
 
 def load(name: str, width: int = 256):
@@ -113,11 +117,3 @@ def numbers_of(code: str, cache: str, count: int, *arguments) -> list[float]:
     command = [sys.executable, "-c", code, *map(str, arguments)]
     output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
     return [float(number) for number in output.split()[-count:]]
-
-
-def geometric_mean(values) -> float:
-    """Geometric mean of positive numbers."""
-    product = 1.0
-    for value in values:
-        product *= value ** (1 / len(values))
-    return product

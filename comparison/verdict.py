@@ -7,6 +7,8 @@ images and the first integrator is one of Mitsuba's unbiased integrators: only t
 number of samples.
 """
 
+from statistics import geometric_mean
+
 import numpy as np
 
 from . import analysis, curves, metrics, tables
@@ -133,14 +135,14 @@ def _mean_of_readings(entries, base, label):
     if exact:
         ends = [None, None]
         if all(one["speed_up_low"] for one in exact):
-            ends = [1 / _mean(one[f"speed_up_{end}"] for one in exact) for end in ("high", "low")]
-        return _ratio(1 / _mean(one["speed_up"] for one in exact), None, *ends)
+            ends = [1 / geometric_mean(one[f"speed_up_{end}"] for one in exact) for end in ("high", "low")]
+        return _ratio(1 / geometric_mean(one["speed_up"] for one in exact), None, *ends)
     least = [one["speed_up_at_least"] for one in readings if one["speed_up_at_least"]]
     if least:
-        return _ratio(1 / _mean(least), "at_most")
+        return _ratio(1 / geometric_mean(least), "at_most")
     pairs = [(entry[label]["value"], entry[base]["at_most"]) for entry in entries if label in entry and base in entry]
     over = [value / most for value, most in pairs if value and most]
-    return _ratio(_mean(over), "at_least") if over else None
+    return _ratio(geometric_mean(over), "at_least") if over else None
 
 
 def _ratio_of_points(first, other, value):
@@ -158,11 +160,6 @@ def _ratio_of_points(first, other, value):
     return _ratio(value(*means[0]) / value(*bounds[1]), "at_least") if means[0] and bounds[1] else None
 
 
-def _mean(values):
-    """Return the geometric mean of positive numbers."""
-    return float(np.exp(np.mean(np.log(list(values)))))
-
-
 def _over_scenes(ratios):
     """Return the geometric mean of the known ratios of several scenes, with their number "scenes". Return None without
     known ratios, or with bounds in both directions."""
@@ -170,7 +167,7 @@ def _over_scenes(ratios):
     bounds = {ratio["bound"] for ratio in known} - {None}
     if not known or len(bounds) > 1:
         return None
-    mean = _ratio(_mean(ratio["value"] for ratio in known), *bounds)
+    mean = _ratio(geometric_mean(ratio["value"] for ratio in known), *bounds)
     return mean | {"extrapolated": any(ratio["extrapolated"] for ratio in known), "scenes": len(known)}
 
 

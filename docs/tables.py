@@ -13,6 +13,7 @@ import argparse
 import json
 import math
 import re
+import statistics
 import sys
 from functools import cache
 from pathlib import Path
@@ -51,7 +52,7 @@ def quantity(row, path):
 
 
 def geometric_mean(values):
-    return Number(math.exp(sum(map(math.log, values)) / len(values)))
+    return Number(statistics.geometric_mean(values))
 
 
 def machine(name):
