@@ -141,6 +141,9 @@ def _add_scene(parser):
     add = parser.add_argument
     add("--max-depth", type=int, metavar="N", help="maximum path depth (default: of the scene)")
     add("--width", type=positive(int), metavar="N", help="width of the images (default: of the scene)")
+    add("--sampler", metavar="PLUGIN",
+        help="sampler of the images and references, such as multijitter, by which all integrators stratify "
+             "(default: of the scene)")  # fmt: skip
     add("--aovs", type=_names, default=[], metavar="NAME,...",
         help="AOVs to show in false colours, for integrators that support them: shadow_rays, upper_bounds, cut_size, "
              "phase_one (see the integrators' docstrings)")  # fmt: skip

@@ -36,6 +36,7 @@ import integrators  # noqa: E402, F401
 from benchmarks import results, scenes  # noqa: E402
 from benchmarks.printed_passes import as_printed  # noqa: E402
 from comparison import references  # noqa: E402
+from comparison.command_line import positive  # noqa: E402
 from comparison.metrics import compare  # noqa: E402
 from comparison.scene_files import SceneFile  # noqa: E402
 
@@ -270,14 +271,16 @@ def main() -> None:
     """Parse the command line and run the parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(NAMES), choices=NAMES)
-    parser.add_argument("--parts", nargs="+", default=["table", "paper", "lights", "cold"])
+    results.add_options(parser, ["table", "paper", "lights", "cold"])
     parser.add_argument("--against", nargs="+", default=list(AGAINST), choices=AGAINST, help="columns of part table")
-    parser.add_argument("--error", type=float, default=0.03, help="the rule of parts table and paper (default: 0.03)")
-    parser.add_argument("--width", type=int, default=128, help="pixels (default: 128)")
-    parser.add_argument("--spp", type=int, default=256, help="samples a pixel of direct and path (default: 256)")
-    results.add_json_option(parser)
-    options = parser.parse_args()
-    results.check_json_option(parser, options)
+    parser.add_argument(
+        "--error", type=positive(float), default=0.03, help="the rule of parts table and paper (default: 0.03)"
+    )
+    parser.add_argument("--width", type=positive(int), default=128, help="pixels (default: 128)")
+    parser.add_argument(
+        "--spp", type=positive(int), default=256, help="samples a pixel of direct and path (default: 256)"
+    )
+    options = results.parse(parser)
     names = scenes.available(options.scenes)
     parts = {
         "table": lambda: table(names, options),
@@ -286,10 +289,7 @@ def main() -> None:
         "cold": lambda: cold_starts(options),
     }
     settings = {"error": options.error, "width": options.width, "camera_rays": RAYS, "samples": options.spp}
-    for part in options.parts:
-        rows = parts[part]()
-        if options.json:
-            results.write_results(options.json, part, settings, rows)
+    results.run_parts(options, parts, settings)
 
 
 if __name__ == "__main__":

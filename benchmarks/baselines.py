@@ -21,6 +21,7 @@ import multiprocessing
 import resource
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import geometric_mean
 
@@ -32,6 +33,7 @@ mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
 from benchmarks import results, scenes  # noqa: E402
+from comparison.command_line import positive  # noqa: E402
 from vpl.core.arrays import download, upload  # noqa: E402
 from vpl.transport.evaluation import sum_all_lights  # noqa: E402
 
@@ -294,20 +296,20 @@ def main() -> None:
     """Parse the command line and run the parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(scenes.NAMES), choices=scenes.NAMES)
-    parser.add_argument("--parts", nargs="+", default=["curve", "samples", "slices", "growth", "memory"])
-    parser.add_argument("--width", type=int, default=256, help="pixels (default: 256)")
-    parser.add_argument("--samples", type=int, default=16, help="samples a pixel of part samples (default: 16)")
-    parser.add_argument("--points", type=int, default=8000, help="where all lights are summed (default: 8000)")
-    results.add_json_option(parser)
-    options = parser.parse_args()
-    results.check_json_option(parser, options)
+    results.add_options(parser, ["curve", "samples", "slices", "growth", "memory"])
+    parser.add_argument("--width", type=positive(int), default=256, help="pixels (default: 256)")
+    parser.add_argument(
+        "--samples", type=positive(int), default=16, help="samples a pixel of part samples (default: 16)"
+    )
+    parser.add_argument(
+        "--points", type=positive(int), default=8000, help="where all lights are summed (default: 8000)"
+    )
+    options = results.parse(parser)
     names = scenes.available(options.scenes)
     parts = {"curve": curves, "samples": many_samples, "slices": slices, "growth": growth, "memory": memory}
     settings = {"max_depth": DEPTH, "vpl_count": VPLS, "width": options.width, "points": options.points, "runs": RUNS}
-    for part in options.parts:
-        rows = parts[part](names, options)
-        if options.json:
-            results.write_results(options.json, part, settings, rows)
+    runs = {part: partial(function, names, options) for part, function in parts.items()}
+    results.run_parts(options, runs, settings)
 
 
 if __name__ == "__main__":

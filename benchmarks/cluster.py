@@ -1,6 +1,6 @@
 """Overhead of passes on workers: against a single process, per pass, and as idle time of the workers.
 
-    python benchmarks/cluster.py --parts speed,overhead,busy
+    python benchmarks/cluster.py --parts speed overhead busy
 
 `speed`: seconds of an image by a process with two threads, and by two workers with one thread each; compiled kernels.
 `overhead`: seconds of an empty pass, with and without the transfer of an image.
@@ -29,7 +29,6 @@ from comparison.scene_files import SceneFile
 from comparison.single_pass import Pass, PassImage
 
 ROOT = Path(__file__).resolve().parent.parent
-PARTS = ("speed", "overhead", "busy")
 SECONDS, PASSES = 0.5, 20  # per sleeping pass; per worker
 
 
@@ -107,9 +106,12 @@ def busy(_):
                 print(f"  {count} workers, {shape[1]} × {shape[0]}: busy {SECONDS * PASSES / taken:.0%}")
 
 
+PARTS = {"speed": speed, "overhead": overhead, "busy": busy}
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", default=",".join(PARTS), help="default: all")
+    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=list(PARTS), help="default: all")
     parser.add_argument("--scenes", nargs="+", default=[str(ROOT / "scenes" / "hall.xml")])
     parser.add_argument("--integrator", default="manylights")
     parser.add_argument("--width", type=int, help="width and height (default: of the scene)")
@@ -118,9 +120,9 @@ def main():
     parser.add_argument("--repetitions", type=int, default=3, help="default: 3, after a warm-up run")
     options = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    for part in options.parts.split(","):
+    for part in options.parts:
         print(part)
-        globals()[part](options)
+        PARTS[part](options)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ mi.set_variant("llvm_ad_rgb")
 import integrators  # noqa: E402, F401
 from benchmarks import results, scenes  # noqa: E402
 from benchmarks.rivals import DEPTH, trimmed_variance  # noqa: E402
+from comparison.command_line import positive  # noqa: E402
 from vpl.split.cost_model import CostModel  # noqa: E402
 
 # Rooms with one and with many emitters, noisy and smooth indirect light
@@ -104,11 +105,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--constants", nargs="+", default=names, choices=names, metavar="NAME")
     parser.add_argument("--scenes", nargs="+", default=list(NAMES), metavar="NAME")
-    parser.add_argument("--width", type=int, default=128, help="width in pixels (default: 128)")
-    parser.add_argument("--spp", type=int, default=64, help="samples per pixel (default: 64)")
-    parser.add_argument("--passes", type=int, default=4, help="images with each value (default: 4)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the ratios to a result file")
-    options = parser.parse_args()
+    parser.add_argument("--width", type=positive(int), default=128, help="width in pixels (default: 128)")
+    parser.add_argument("--spp", type=positive(int), default=64, help="samples per pixel (default: 64)")
+    parser.add_argument("--passes", type=positive(int), default=4, help="images with each value (default: 4)")
+    results.add_json_option(parser)
+    options = results.parse(parser)
     available = scenes.available(options.scenes)
     if not available:
         parser.error("--scenes names no scene that is present")

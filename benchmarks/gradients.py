@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import drjit as dr
@@ -28,6 +29,7 @@ mi.set_variant("llvm_ad_rgb")
 
 import integrators  # noqa: E402, F401
 from benchmarks import results, scenes  # noqa: E402
+from comparison.command_line import positive  # noqa: E402
 
 NAMES = ("cornell", "kitchen", "staircase2", "veach_ajar")
 # What renders the images, by the name in the table
@@ -162,21 +164,24 @@ def compare(names, width: int, seconds: float, target_spp: int, adjoint_spp: int
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS)
+    results.add_options(parser, PARTS)
     parser.add_argument("--scenes", nargs="+", default=NAMES, metavar="NAME")
-    parser.add_argument("--width", type=int, default=128, metavar="PIXELS")
-    parser.add_argument("--seconds", type=float, default=30, help="of each optimisation (default: 30)")
-    parser.add_argument("--target", type=int, default=256, metavar="SPP", help="samples of the target (default: 256)")
-    parser.add_argument("--adjoint", type=int, default=16, metavar="SPP", help="of the derivatives (default: 16)")
-    results.add_json_option(parser)
-    options = parser.parse_args()
-    results.check_json_option(parser, options)
+    parser.add_argument("--width", type=positive(int), default=128, metavar="PIXELS")
+    parser.add_argument("--seconds", type=positive(float), default=30, help="of each optimisation (default: 30)")
+    parser.add_argument(
+        "--target", type=positive(int), default=256, metavar="SPP", help="samples of the target (default: 256)"
+    )
+    parser.add_argument(
+        "--adjoint", type=positive(int), default=16, metavar="SPP", help="of the derivatives (default: 16)"
+    )
+    options = results.parse(parser)
     names = scenes.available(options.scenes)
-    rows = compare(names, options.width, options.seconds, options.target, options.adjoint)
-    if options.json:
-        settings = {"width": options.width, "seconds": options.seconds, "max_depth": DEPTH}
-        samples = {"target_samples": options.target, "adjoint_samples": options.adjoint}
-        results.write_results(options.json, PARTS[0], settings | samples, rows)
+    settings = {
+        "width": options.width, "seconds": options.seconds, "max_depth": DEPTH, "target_samples": options.target,
+        "adjoint_samples": options.adjoint,
+    }  # fmt: skip
+    measured = partial(compare, names, options.width, options.seconds, options.target, options.adjoint)
+    results.run_parts(options, {PARTS[0]: measured}, settings)
 
 
 if __name__ == "__main__":

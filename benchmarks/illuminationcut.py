@@ -287,11 +287,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = ("table", "tight", "samples", "lights", "rays", "public")
     parser.add_argument("--scenes", nargs="+", default=list(NAMES), choices=NAMES)
-    parser.add_argument("--parts", nargs="+", default=list(parts), choices=parts)
+    results.add_options(parser, parts)
     parser.add_argument("--memory-of", choices=NAMES, help=argparse.SUPPRESS)
-    results.add_json_option(parser)
-    options = parser.parse_args()
-    results.check_json_option(parser, options)
+    options = results.parse(parser)
     if options.memory_of:
         memory_of(options.memory_of)
         return
@@ -306,10 +304,7 @@ def main() -> None:
         "public": public_settings,
     }
     settings = {"max_depth": DEPTH, "vpl_count": VPLS, "width": WIDTH, "runs": RUNS}
-    for part in options.parts:
-        rows = runs[part]()
-        if options.json:
-            results.write_results(options.json, part, settings, rows)
+    results.run_parts(options, runs, settings)
 
 
 if __name__ == "__main__":

@@ -217,7 +217,7 @@ def main():
     parser.add_argument("--cuts", action="store_true", help="compare cut sizes instead of build times")
     parser.add_argument("counts", nargs="*", type=int, help="numbers of lights")
     results.add_json_option(parser)
-    arguments = parser.parse_args()
+    arguments = results.parse(parser)
     if arguments.cuts and arguments.json:
         parser.error("--json writes build times, not --cuts")
     if arguments.cuts:

@@ -28,6 +28,7 @@ mi.set_variant("llvm_ad_rgb")
 import compare  # noqa: E402
 import integrators  # noqa: E402, F401
 from benchmarks import results, scenes  # noqa: E402
+from comparison.command_line import positive  # noqa: E402
 from vpl.core.arrays import download, upload  # noqa: E402
 from vpl.core.stages import Stage  # noqa: E402
 from vpl.cuts.light_cuts import collect_cuts, limited_cuts  # noqa: E402
@@ -180,13 +181,16 @@ def against_path(names, budget: float) -> dict:
     files = [str(scenes.scene_file(name)) for name in names if scenes.reference_file(name)]
     if not files:
         return {}
-    compare.main(
+    status = compare.main(
         [
             *files, "--integrators", "path,lightcuts,mdlightcuts", "--param", "mdlightcuts.error=0.02",
-            "--max-depth", str(DEPTH), "--time", f"{budget:g}", "--reference", str(scenes.REFERENCES),
-            "--out", "output/path",
+            "--sampler", "multijitter", "--max-depth", str(DEPTH), "--time", f"{budget:g}",
+            "--reference", str(scenes.REFERENCES), "--out", "output/path",
         ]
     )  # fmt: skip
+    if status:
+        # The folder may hold the results of an earlier comparison
+        raise SystemExit(status)
     return _compared_rows(json.loads(Path("output/path/results.json").read_text()))
 
 
@@ -209,11 +213,9 @@ def main() -> None:
     """Parse the command line and run the parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(scenes.NAMES), choices=scenes.NAMES)
-    parser.add_argument("--parts", nargs="+", default=["brute", "rays", "cold", "path"])
-    parser.add_argument("--time", type=float, default=10.0, help="seconds of part path (default: 10)")
-    results.add_json_option(parser)
-    options = parser.parse_args()
-    results.check_json_option(parser, options)
+    results.add_options(parser, ["brute", "rays", "cold", "path"])
+    parser.add_argument("--time", type=positive(float), default=10.0, help="seconds of part path (default: 10)")
+    options = results.parse(parser)
     names = scenes.available(options.scenes)
     parts = {
         "brute": lambda: brute_force(names),
@@ -222,10 +224,7 @@ def main() -> None:
         "path": lambda: against_path(names, options.time),
     }
     settings = {"max_depth": DEPTH, "vpl_count": VPLS, "width": 256}
-    for part in options.parts:
-        rows = parts[part]()
-        if options.json:
-            results.write_results(options.json, part, settings, rows)
+    results.run_parts(options, parts, settings)
 
 
 if __name__ == "__main__":

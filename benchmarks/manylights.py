@@ -46,6 +46,7 @@ import integrators  # noqa: E402, F401
 from benchmarks import denoised, noise_classes, results, sample_cost, scenes  # noqa: E402
 from benchmarks.rivals import DEPTH, KINDS, SAMPLERS, Rival, Timed, Whole, load, measure_in_turn  # noqa: E402
 from benchmarks.views import move_cameras  # noqa: E402
+from comparison.command_line import positive  # noqa: E402
 
 NAMES = (*scenes.NAMES, "classroom", "hall")
 # Scenes where virtual lights gain little: leaves, equal emitters, gloss, masks, no noise
@@ -245,15 +246,15 @@ def first_render(kind: str, name: str, width: int, cache: str) -> tuple[float, f
 def main() -> None:
     """Run the parts that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS)
+    results.add_options(parser, PARTS)
     parser.add_argument("--scenes", nargs="+", metavar="NAME")
-    parser.add_argument("--width", type=int, default=256, metavar="PIXELS")
-    parser.add_argument("--seconds", type=float, default=2.5, help="of one pass, or image, about (default: 2.5)")
-    parser.add_argument("--passes", type=int, default=6, help="of each (default: 6)")
+    parser.add_argument("--width", type=positive(int), default=256, metavar="PIXELS")
+    parser.add_argument(
+        "--seconds", type=positive(float), default=2.5, help="of one pass, or image, about (default: 2.5)"
+    )
+    parser.add_argument("--passes", type=positive(int), default=6, help="of each (default: 6)")
     parser.add_argument("--views", type=int, default=0, help="how many other cameras the product is of (default: none)")
-    results.add_json_option(parser)
-    options = parser.parse_args()
-    results.check_json_option(parser, options)
+    options = results.parse(parser)
     between = [part for part in options.parts if part in BETWEEN]
     least = 2 if between else 1
     if options.passes < least:
@@ -274,10 +275,7 @@ def main() -> None:
         "cold": lambda: cold(names, width),
     }
     settings = {"width": width, "seconds": seconds, "passes": passes, "max_depth": DEPTH}
-    for part in options.parts:
-        rows = parts[part]()
-        if options.json:
-            results.write_results(options.json, part, settings, rows)
+    results.run_parts(options, parts, settings)
 
 
 if __name__ == "__main__":

@@ -20,10 +20,10 @@ light trees, gather points).
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 from statistics import geometric_mean
 from unittest.mock import patch
@@ -36,6 +36,8 @@ mi.set_variant("llvm_ad_rgb")
 from benchmarks import results, scenes  # noqa: E402
 from benchmarks.baselines import QUALITY, VPLS, Found, Problem  # noqa: E402
 from benchmarks.separated_light import light_of_entries  # noqa: E402
+from comparison.command_line import positive  # noqa: E402
+from comparison.images import replacing  # noqa: E402
 from vpl.core.stages import Stage  # noqa: E402
 from vpl.matrix import recovery  # noqa: E402
 
@@ -195,9 +197,8 @@ def pictures(names, options) -> None:
         plugin = problem.plugin(METHOD)
         job = max(problem.prepared.jobs, key=lambda one: one.share)
         file = options.out / f"{name}_slice{options.slice}.png"
-        unfinished = file.with_suffix(".part.png")
-        draw_slice(plugin, job, options.slice, unfinished, {"scene": name, "VPLs": VPLS, "seed": 0})
-        os.replace(unfinished, file)
+        with replacing(file) as temporary:
+            draw_slice(plugin, job, options.slice, temporary, {"scene": name, "VPLs": VPLS, "seed": 0})
         print(file, flush=True)
 
 
@@ -207,24 +208,22 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(NAMES), choices=scenes.NAMES)
     parts = {"table": table, "cost": costs, "steps": steps, "pictures": pictures}
     usual = [part for part in parts if part != "cost"]
-    parser.add_argument("--parts", nargs="+", default=usual, choices=list(parts))
-    parser.add_argument("--width", type=int, default=256, help="width in pixels (default: 256)")
-    parser.add_argument("--points", type=int, default=8000, help="gather points with exact sums (default: 8000)")
+    results.add_options(parser, parts, usual)
+    parser.add_argument("--width", type=positive(int), default=256, help="width in pixels (default: 256)")
+    parser.add_argument(
+        "--points", type=positive(int), default=8000, help="gather points with exact sums (default: 8000)"
+    )
     parser.add_argument("--slice", type=int, default=20, help="number of the slice in part pictures (default: 20)")
     parser.add_argument(
         "--out", type=Path, default=Path("matrices"), help="output folder of part pictures (default: matrices)"
     )
-    results.add_json_option(parser)
-    options = parser.parse_args()
-    results.check_json_option(parser, options)
+    options = results.parse(parser)
     if options.json and options.parts == ["pictures"]:
         parser.error("--json: part pictures has no rows")
     names = scenes.available(options.scenes)
     settings = {"vpl_count": VPLS, "width": options.width, "samples": SAMPLES, "points": options.points}
-    for part in options.parts:
-        rows = parts[part](names, options)
-        if options.json:
-            results.write_results(options.json, part, settings, rows)
+    runs = {part: partial(function, names, options) for part, function in parts.items()}
+    results.run_parts(options, runs, settings)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from comparison import machine
+from comparison.images import replacing
 
 ROOT = Path(__file__).resolve().parents[1]
 DIGITS = 6
@@ -42,6 +43,7 @@ UNITS = {
     "loss": "mean squared error of an image, over its squared target plus a hundredth of the squared mean",
     "memory": "GiB at the peak, above the loaded scene where `path` has none",
     "new_scene_seconds": "s of the first render with the compiled kernels of another scene",
+    "not_reached": "whether the error of the other method was not reached",
     "plain_speedup": "as speedup, by the variances of all pixels",
     "product": "relative variance times s",
     "product_ratio": "product over that with the chosen value",
@@ -67,15 +69,41 @@ UNITS = {
 }
 
 
+def add_options(parser, parts, usual=None) -> None:
+    """Add the options ``--parts``, some of ``parts`` and by default the ``usual`` ones or all, and ``--json FILE``."""
+    parser.add_argument("--parts", nargs="+", default=list(usual or parts), choices=list(parts))
+    add_json_option(parser)
+
+
 def add_json_option(parser) -> None:
     """Add the option ``--json FILE`` to an argument parser."""
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows of the one part to a result file")
 
 
-def check_json_option(parser, options) -> None:
-    """End the program with a message if ``--json`` is given with several ``--parts``."""
-    if options.json and len(options.parts) != 1:
-        parser.error(f"--json takes one part, --parts names {len(options.parts)}: {' '.join(options.parts)}")
+def parse(parser, arguments=None):
+    """Parse the command line; end the program with a message, before hours of work, if a result file would have several
+    parts or could not be written."""
+    options = parser.parse_args(arguments)
+    if options.json:
+        parts, folder = getattr(options, "parts", [""]), options.json.absolute().parent
+        if len(parts) != 1:
+            parser.error(f"--json takes one part, --parts names {len(parts)}: {' '.join(parts)}")
+        if not folder.is_dir():
+            parser.error(f"--json {options.json}: no folder '{folder}'")
+        try:
+            commit()
+        except (OSError, subprocess.CalledProcessError) as error:
+            parser.error(f"--json needs the commit of the sources, which git does not tell: {error}")
+    return options
+
+
+def run_parts(options, parts: dict, settings: dict) -> None:
+    """Run the functions of ``parts`` that ``options`` name, each of which returns its rows, and write the result file
+    with the ``settings``."""
+    for part in options.parts:
+        rows = parts[part]()
+        if options.json:
+            write_results(options.json, part, settings, rows)
 
 
 def write_results(path, part: str, settings: dict, rows: dict) -> None:
@@ -97,10 +125,8 @@ def write_results(path, part: str, settings: dict, rows: dict) -> None:
         "units": {name: UNITS[name] for name in sorted(quantities)},
         "rows": rows,
     }
-    path = Path(path)
-    unfinished = path.with_name(f"{path.name}.part")
-    unfinished.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
-    os.replace(unfinished, path)
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
 
 def _checked(row: dict, place: str, quantities: set) -> dict:

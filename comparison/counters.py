@@ -14,7 +14,7 @@ class TotalStatistics:
     """Sum of the integrators' counters over passes.
 
     Numbers are summed, also in nested dicts ("seconds"); the sum of "precision" is that of the image. Descriptions,
-    such as the text "plan", the dict "lights" and the list "growth", come from the pass with the most samples, the
+    such as the text "plan", the dict "lights" and the list "costs", come from the pass with the most samples, the
     last of equal passes.
     """
 

@@ -171,9 +171,9 @@ def write(
     """Write an image (height, width, channels) to an .exr file with all channels, or tone-mapped to a .png file.
 
     `image`: linear values, as from `mi.render` and `manylights.render`. `channels`: names; by default Y, YA, RGB or
-    RGBA by the number of channels. `metadata`: attributes of an .exr file. `exposure`: a .png file is scaled by
-    2^exposure, by default so that the 95th percentile of the brightness is 0.8. Works with a single thread, unlike
-    `mi.util.write_bitmap`. Raises ValueError for another extension, and for a wrong number of names.
+    RGBA by the number of channels. `metadata`: attributes of an .exr file, texts of a .png file. `exposure`: a .png
+    file is scaled by 2^exposure, by default so that the 95th percentile of the brightness is 0.8. Works with a single
+    thread, unlike `mi.util.write_bitmap`. Raises ValueError for another extension, and for a wrong number of names.
     """
     planes = np.atleast_3d(np.asarray(image, np.float32))
     names = list(channels or CHANNELS.get(planes.shape[-1], ()))
@@ -186,7 +186,7 @@ def write(
         write_exr(path, planes, names, metadata)
         return
     rgb = colour(planes, names)
-    write_png(path, tone_map(rgb, automatic_exposure(rgb) if exposure is None else 2.0**exposure))
+    write_png(path, tone_map(rgb, automatic_exposure(rgb) if exposure is None else 2.0**exposure), metadata)
 
 
 def check_extension(path):
@@ -201,9 +201,9 @@ def read_png(path):
 
 
 def write_png(path, pixels, metadata=None):
-    """Write sRGB values (height, width, 3) uint8, and metadata, a dict of text."""
+    """Write sRGB values (height, width, 3) uint8, and metadata as text, JSON unless a value is text."""
     bitmap = mi.Bitmap(np.ascontiguousarray(pixels))
     for key, value in (metadata or {}).items():
-        bitmap.metadata()[key] = value
+        bitmap.metadata()[key] = value if isinstance(value, str) else json.dumps(value)
     with replacing(path) as temporary:
         bitmap.write(str(temporary))

@@ -170,9 +170,6 @@ class Output:
     def write(self):
         """Write the last image."""
         took, image = self._took, self._image
-        if self.path.suffix == ".png":
-            images.write(self.path, image, took.channels, exposure=self._exposure)
-            return
         metadata = self.metadata | {
             "spp": took.spp,
             "passes": took.passes,
@@ -184,7 +181,10 @@ class Output:
         if took.layer_spp is not None:
             metadata["layer_spp"] = took.layer_spp
         if took.raw is not None:
-            described = metadata | {"denoise_seconds": took.denoise_seconds} | took.denoiser
-            images.write(self.path.with_suffix(".denoised.exr"), image, took.channels, described)
-            image = np.array(took.raw)
-        images.write(self.path, image, took.channels, metadata)
+            denoised = metadata | {"denoise_seconds": took.denoise_seconds} | took.denoiser
+            if self.path.suffix == ".png":
+                metadata = denoised
+            else:
+                images.write(self.path.with_suffix(".denoised.exr"), image, took.channels, denoised)
+                image = np.array(took.raw)
+        images.write(self.path, image, took.channels, metadata, self._exposure)

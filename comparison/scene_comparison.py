@@ -102,6 +102,8 @@ class SceneComparison:
             file.set_max_depth(self.options.max_depth)
         if self.options.width:
             file.set_width(self.options.width)
+        if self.options.sampler:
+            file.set_sampler(self.options.sampler)
         return file
 
     def _first_reference(self, file):
@@ -196,6 +198,7 @@ class SceneComparison:
             # Defaults to the width of the reference; a width given by the user must match, or the comparison fails
             width=options.width or (self._reference.size[0] if self._reference else None),
             max_depth=options.max_depth,
+            sampler=options.sampler,
             seed=seed,
             budget=setting.time,
             spp=setting.spp,

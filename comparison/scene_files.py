@@ -85,10 +85,7 @@ class SceneFile:
         if nodes:
             nodes[0].props = properties
         else:
-            node = mi.parser.SceneNode()
-            node.type, node.props = mi.ObjectType.Integrator, properties
-            self._state.nodes.append(node)
-            self._state.root.props["integrator"] = mi.Properties.ResolvedReference(len(self._state.nodes) - 1)
+            self._state.root.props["integrator"] = self._add(mi.ObjectType.Integrator, properties)
 
     def set_max_depth(self, depth):
         """Set `max_depth`, by the integrator `path`; later integrators inherit it."""
@@ -113,10 +110,23 @@ class SceneFile:
         return samplers[0].props.plugin_name() if samplers else "independent"
 
     def set_sampler(self, name):
-        """Replace the type of all samplers and keep their parameters."""
+        """Replace the type of all samplers and keep their parameters; sensors without a sampler get one. Raises
+        RuntimeError for an unknown plugin, ValueError for a plugin that is no sampler."""
         self.changes.append(("set_sampler", (name,)))
+        if not isinstance(mi.PluginManager.instance().create_object(mi.Properties(name)), mi.Sampler):
+            raise ValueError(f"'{name}' is no sampler")
         for sampler in self._nodes(mi.ObjectType.Sampler):
             sampler.props.set_plugin_name(name)
+        for sensor in self._nodes(mi.ObjectType.Sensor):
+            if all(part.type != mi.ObjectType.Sampler for part in self._parts(sensor)):
+                sensor.props["sampler"] = self._add(mi.ObjectType.Sampler, mi.Properties(name))
+
+    def _add(self, kind, properties):
+        """Add a node; return the reference to it."""
+        node = mi.parser.SceneNode()
+        node.type, node.props = kind, properties
+        self._state.nodes.append(node)
+        return mi.Properties.ResolvedReference(len(self._state.nodes) - 1)
 
     def set_width(self, width):
         """Set the width in pixels; the height keeps the aspect ratio of the first film."""
@@ -157,8 +167,7 @@ class SceneFile:
         sensors = self._nodes(mi.ObjectType.Sensor)
         if not 0 <= sensor < len(sensors):
             raise ValueError(f"no sensor {sensor}: the scene has {len(sensors)}")
-        values = [value for _, value in mi.Properties(sensors[sensor].props).items()]
-        parts = [self._state.nodes[one.index()] for one in values if isinstance(one, mi.Properties.ResolvedReference)]
+        parts = self._parts(sensors[sensor])
         film, sampler = (
             mi.Properties(next((part.props for part in parts if part.type == kind), mi.Properties(default)))
             for kind, default in ((mi.ObjectType.Film, "hdrfilm"), (mi.ObjectType.Sampler, "independent"))
@@ -184,6 +193,11 @@ class SceneFile:
 
     def _nodes(self, kind):
         return [node for node in self._state.nodes if node.type == kind]
+
+    def _parts(self, node):
+        """Return the nodes that a node refers to."""
+        values = [value for _, value in mi.Properties(node.props).items()]
+        return [self._state.nodes[one.index()] for one in values if isinstance(one, mi.Properties.ResolvedReference)]
 
 
 def known_parameters(name, parameters):

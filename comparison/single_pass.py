@@ -18,8 +18,8 @@ from .images import colour
 
 MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the time to the first image
 MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
-# Stages of `manylights` with times about proportional to the samples
-PER_SAMPLE = Stage.LIGHTS, Stage.TREE, Stage.TRACED, Stage.CLUSTERS, Stage.CUTS
+# Stages of `manylights` with times that grow with the samples, by the parts of a predicted cost: paths, lights, cuts
+PER_SAMPLE = (Stage.TRACED,), (Stage.LIGHTS, Stage.TREE), (Stage.CLUSTERS, Stage.CUTS)
 
 
 def pass_seed(seed, index):
@@ -40,6 +40,10 @@ def largest_pass(pixels, in_parts=False):
     """Return the maximum samples per pixel of a pass, at least 1: up to `MAXIMUM_PASS_SAMPLES` samples over all pixels,
     or `MORE_IN_PARTS` times as many for a pass in parts."""
     return max(1, (MORE_IN_PARTS if in_parts else 1) * MAXIMUM_PASS_SAMPLES // pixels)
+
+
+# Below the resolution of the clock
+LEAST_SECONDS = 1e-9
 
 
 @dataclass
@@ -66,9 +70,25 @@ class Pass:
 
     @property
     def growth(self):
-        """Expected costs of a sample of passes of other sizes, a list of (ratio of the sizes, cost over that in this
-        pass) by size; None if the integrator does not predict them."""
-        return self.statistics.get("growth")
+        """Expected seconds of a sample of passes of other sizes, a list of (ratio of the sizes, seconds over those in
+        this pass) by size; None if the integrator does not predict costs.
+
+        The seconds of each part of the cost grow with the predicted cost. A part that this pass lacks, such as virtual
+        lights, is compared with its paths.
+        """
+        costs = self.statistics.get("costs")
+        if not costs:
+            return None
+        own, measured = dict(costs)[1], self._seconds_by_part
+        each = [seconds / cost if cost else measured[0] / own[0] for seconds, cost in zip(measured, own, strict=True)]
+        whole = max(sum(measured), LEAST_SECONDS)
+        return [(ratio, float(np.dot(other, each)) / whole) for ratio, other in costs]
+
+    @property
+    def _seconds_by_part(self):
+        """Seconds of the parts of `PER_SAMPLE`."""
+        stages = self.statistics.get("seconds", {})
+        return [sum(stages.get(stage, 0.0) for stage in part) for part in PER_SAMPLE]
 
     @property
     def repeated_seconds(self):
@@ -88,7 +108,7 @@ class Pass:
         stages = self.statistics.get("seconds", {})
         if Stage.TRACED not in stages:
             return None
-        return max(self.repeated_seconds - sum(stages.get(stage, 0.0) for stage in PER_SAMPLE), 0.0)
+        return max(self.repeated_seconds - sum(self._seconds_by_part), 0.0)
 
 
 @dataclass

@@ -218,5 +218,5 @@ def _unequal_samplers(scene):
         return []
     return [
         "The scene's sampler is independent: manylights stratifies camera samples, and other integrators do not. With "
-        "a stratified sampler in the scene, such as multijitter, all of them do."
+        "--sampler multijitter, all of them do."
     ]

@@ -51,6 +51,7 @@ class Job:
     defines: dict = field(default_factory=dict)
     width: int | None = None
     max_depth: int | None = None
+    sampler: str | None = None
     seed: int = 0
     budget: float | None = None
     spp: int | None = None
@@ -201,6 +202,8 @@ def _parse(job):
         file.set_width(job.width)
     if job.max_depth is not None:
         file.set_max_depth(job.max_depth)
+    if job.sampler:
+        file.set_sampler(job.sampler)
     file.set_integrator(job.integrator, job.parameters)
     return file
 

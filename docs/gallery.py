@@ -45,7 +45,8 @@ INTRODUCTION = """\
 Every scene of [scenes/](../scenes/README.md) by `path` and by `manylights` at equal time ({seconds:g} seconds), and \
 the reference. On the site, drag across a picture to compare two images. Images are {width} pixels wide, not \
 denoised. Below each image are its samples per pixel and its error: the mean absolute difference from the \
-reference over the mean of the reference. The smaller error is bold.
+reference over the mean of the reference. References are by `manylights`, and by `adaptivedirect` in scenes of \
+direct light alone, with other seeds. Their noise is a part of each error.
 
 {doubts}One image shows noise, not speed: [results](results.md) has times at equal error. \
 `./run -- python docs/gallery.py` renders all images again.
@@ -83,9 +84,7 @@ def rows(scene, introduced):
     errors = {label: found[label]["errors"]["relative_l1"] for label in INTEGRATORS}
     cells = []
     for label in INTEGRATORS:
-        one, error = found[label], f"{float(f'{100 * errors[label]:.2g}'):g}%"
-        bold = "**" if errors[label] == min(errors.values()) else ""
-        cells.append(f"{one['spp']} samples, {bold}{error}{bold}")
+        cells.append(f"{found[label]['spp']} samples, {float(f'{100 * errors[label]:.2g}'):g}%")
     labels = [*INTEGRATORS, REFERENCE]
     pictures = [f"![{name} by {label}](gallery/{name}.{label}.jpg)" for label in labels]
     cells.append(f"{scene['reference']['spp']} samples")

@@ -9,7 +9,7 @@ class Column:
 
     ``cell``: format of the quantities of a row. ``ratio``: path of a quantity that is bold below 1, with a geometric
     mean below the table. ``bound``: path of a quantity that marks the cell as a bound; ``sign`` is then written before
-    the cell.
+    the cell. ``measure``: of the error that is equal, in a brief table.
     """
 
     title: str
@@ -17,6 +17,7 @@ class Column:
     ratio: str = ""
     bound: str = ""
     sign: str = ""
+    measure: str = ""
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,9 @@ class Table:
     """Table of one row a scene.
 
     ``files``: result files by the prefix of their quantities in columns, "" for no prefix. Of several files with the
-    same prefix, later files add rows. ``order``: path of the quantity that sorts rows,
-    largest first. ``first``: title of the column of row names. ``is_brief``: without the commands of the files.
+    same prefix, later files add rows. ``order``: path of the quantity that sorts rows, largest first. ``first``: title
+    of the column of row names. ``is_brief``: with equal errors and commits below the columns, in place of the commands
+    of the files.
     """
 
     files: dict
@@ -67,14 +69,30 @@ TABLES = {
             "direct": ("adaptivedirect_table",),
         },
         (
-            Column("`manylights` over `path`, 10 s", ratio="manylights.speedup"),
-            Column("the same, denoised", ratio="denoised.speedup"),
-            Column("`mdlightcuts` over `path`", ratio="path.speedup", bound="path.mdlightcuts.hidden", sign="≥ "),
-            Column("`mdlightcuts` over `lightcuts`, 16 samples", ratio="samples.mdlightcuts.speedup"),
-            Column("`illuminationcut` over `lightcuts`", ratio="ic.all.speedup"),
-            Column("`lightslice` over `lightcuts`", ratio="slices.lightslice.speedup"),
-            Column("`matrixrecovery` over `mdlightcuts`", ratio="msr.mdlightcuts.speedup"),
-            Column("`adaptivedirect` over `path`, direct light", ratio="direct.path.speedup"),
+            Column("`manylights` over `path`, 10 s", ratio="manylights.speedup", measure="variance"),
+            Column("the same, denoised", ratio="denoised.speedup", measure="relMSE"),
+            Column(
+                "`mdlightcuts` over `path`",
+                ratio="path.speedup",
+                bound="path.mdlightcuts.hidden",
+                sign="≥ ",
+                measure="relMSE",
+            ),
+            Column(
+                "`mdlightcuts` over `lightcuts`, 16 samples",
+                ratio="samples.mdlightcuts.speedup",
+                measure="mean absolute",
+            ),
+            Column("`illuminationcut` over `lightcuts`", ratio="ic.all.speedup", measure="RMSE"),
+            Column(
+                "`lightslice` over `lightcuts`",
+                ratio="slices.lightslice.speedup",
+                bound="slices.lightslice.not_reached",
+                sign="≤ ",
+                measure="mean absolute",
+            ),
+            Column("`matrixrecovery` over `mdlightcuts`", ratio="msr.mdlightcuts.speedup", measure="mean absolute"),
+            Column("`adaptivedirect` over `path`, direct light", ratio="direct.path.speedup", measure="relMSE"),
         ),
         order="manylights.speedup",
         is_brief=True,

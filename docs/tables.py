@@ -62,16 +62,26 @@ def machine(name):
 
 
 def sources(table):
-    """Commands, commits, dates and machines of the files of a table; of a brief table, commits and machines alone."""
-    names = [file for files in table.files.values() for file in files]
-    if table.is_brief:
-        commits = ", ".join(dict.fromkeys(f"`{result(name)['commit']}`" for name in names))
-        return f"Commits {commits}; {'; '.join(dict.fromkeys(map(machine, names)))}."
-    found = [(name, result(name)) for name in names]
-    return "\n".join(
-        f"- `{name}.json`: `{one['command']}`; commit `{one['commit']}`, {one['date']}, {machine(name)}."
-        for name, one in found
-    )
+    """Commands, commits, dates and machines of the files of a table."""
+    return "\n".join(f"- `{name}.json`: {source(name)}." for files in table.files.values() for name in files)
+
+
+def origins(table):
+    """Last rows of a brief table: the equal error of each column; commits and vector width of its files."""
+    cells = []
+    for column in table.columns:
+        found = [result(name) for name in table.files[column.ratio.partition(".")[0]]]
+        commits = dict.fromkeys(f"`{one['commit']}`" for one in found)
+        widths = dict.fromkeys(f"{one['machine']['vector_width']:.0f}-wide" for one in found)
+        cells.append(", ".join([*commits, *widths]))
+    return [["equal error", *(column.measure for column in table.columns)], ["commit, vectors", *cells]]
+
+
+def source(name):
+    """Command, commit, date and machine of a result file."""
+    found = result(name)
+    copied = ", figures copied by hand from what the command printed" if found.get("transcribed") else ""
+    return f"`{found['command']}`; commit `{found['commit']}`, {found['date']}, {machine(name)}{copied}"
 
 
 def rows_of(table):
@@ -118,7 +128,10 @@ def table_text(name):
         means.append(sign + ratio_text(geometric_mean(known.values())) if len(known) > 1 else "")
     if any(means[1:]):
         lines.append(means)
-    return f"\n{sources(table)}\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n\n"
+    if table.is_brief:
+        lines += origins(table)
+    head = "" if table.is_brief else f"{sources(table)}\n\n"
+    return f"\n{head}" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n\n"
 
 
 def value_text(words):

@@ -119,7 +119,7 @@ class DirectLightIntegrator(GatheringIntegrator):
         self.statistics = totals
 
     def _find_level(self, scene, sensor, seed: int) -> float:
-        """Mean radiance of direct light over the film, from one pass with _LEVEL_RAYS camera rays."""
+        """Mean radiance of direct light over the gather points, from one pass with _LEVEL_RAYS camera rays."""
         camera = self.begin(scene, *random_rays(sensor, seed, _LEVEL_RAYS))
         if camera.dark or self.max_depth < 2:
             return 0.0
@@ -128,7 +128,7 @@ class DirectLightIntegrator(GatheringIntegrator):
             scene, camera.traits, Sources(scene, camera.emitters), camera.paths.points, PixelGrid(8, 1),
             self.max_depth, quick, derived_seed(seed, 1), level=0.0,
         )  # fmt: skip
-        return float(download(found.radiance).sum(dtype="float64")) / (3 * _LEVEL_RAYS)
+        return float(download(found.radiance).mean(dtype="float64"))
 
     def pixel_grid(self, scene, sampler):
         """Layout of the camera rays of this pass or band in the image."""

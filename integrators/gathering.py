@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from vpl.core.arrays import add_at, download, usable
+from vpl.core.arrays import NO_LIMIT, add_at, download, usable
 from vpl.core.clock import Clock
 from vpl.core.exclusive import exclusive
 from vpl.core.garbage import garbage_kept
@@ -25,7 +25,7 @@ from .camera_samples import film_size
 from .knobs import PATH_KNOBS, Integer, read_knobs, show_knobs
 
 # A property of Mitsuba's integrators, whose value Mitsuba does not expose
-_SAMPLES_PER_PASS = Integer("samples_per_pass", 2**32 - 1, "Most samples of a pixel in a pass.", minimum=1)
+_SAMPLES_PER_PASS = Integer("samples_per_pass", NO_LIMIT, "Most samples of a pixel in a pass.", minimum=1)
 
 
 def whole_sum(values) -> int:
@@ -58,7 +58,7 @@ def _for_all_samples(sampler, ray, active):
     """(Camera rays, mask) with a lane for each sample: some sensors, such as ``radiancemeter``, give a single ray."""
     count = dr.width(ray) if dr.width(ray.o, ray.d) > 1 else sampler.wavefront_size()
     ray, wide = mi.Ray3f(ray), dr.zeros(mi.Float, max(count, 1))
-    ray.o, ray.d, ray.time = ray.o + wide, ray.d + wide, ray.time + wide
+    ray.o, ray.d, ray.time, ray.maxt = ray.o + wide, ray.d + wide, ray.time + wide, ray.maxt + wide
     return ray, mi.Bool(active) & dr.full(mi.Bool, True, len(wide))
 
 

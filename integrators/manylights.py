@@ -34,8 +34,6 @@ from .manual import manual_page
 
 # Least samples of a pixel by which the pilot and its learning are sized where passes share them: a usual pass
 _SHARED_SAMPLES = 16
-# Largest depth that prb can count, with 32 bits
-_DEEPEST = 2**32 - 1
 # Ratios of the sizes of later passes of a render, of which a pass predicts the cost
 _OTHER_SIZES = 0.25, 0.5, 1, 1.5, 2, 4, 8, 16
 # Names of channels and layers of images, which are no names of groups of emitters
@@ -242,7 +240,8 @@ class ManyLightsIntegrator(PassRenderer):
             raise ValueError('manylights: images with "layers" or "light_groups" have no derivatives; leave these out')
         with exclusive(sensor=sensor, integrator=self), garbage_kept():
             self.check_scene(scene)
-            depth = self.max_depth if self.max_depth <= _DEEPEST else -1
+            # prb counts with 32 bits
+            depth = self.max_depth if self.max_depth <= NO_LIMIT else -1
             paths = {"max_depth": depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
             yield mi.load_dict({"type": "prb", **paths}), sensor
 
@@ -290,10 +289,8 @@ class ManyLightsIntegrator(PassRenderer):
         self.statistics = found.statistics | {"pilots": int(known is None), "measured": start.measured - before}
         # Mitsuba's passes of `samples_per_pass` have the same size in larger renders
         if shared and self.samples_per_pass == NO_LIMIT:
-            rays = self.statistics.get("shadow_rays", 0) / view.pixels
             sizes = sorted({max(round(times * view.samples), 1) for times in _OTHER_SIZES})
-            growth = [(size / view.samples, found.decision.growth(size, rays)) for size in sizes]
-            self.statistics["growth"] = growth
+            self.statistics["costs"] = [(size / view.samples, found.decision.costs(size)) for size in sizes]
         channels = [channel for name in self._layer_names for channel in found.layers[name]]
         if self._pass.half:
             number = cells.rays.places(dr.arange(mi.UInt32, view.count)).number

@@ -56,15 +56,35 @@ def test_unknown_quantities_and_numbers_that_are_not_finite_are_refused(row, mes
     assert not list(tmp_path.iterdir())
 
 
-def test_one_file_takes_one_part(capsys):
+def parsed(*arguments):
     parser = argparse.ArgumentParser()
-    results.add_json_option(parser)
-    parser.add_argument("--parts", nargs="+")
-    results.check_json_option(parser, parser.parse_args(["--json", "a.json", "--parts", "cold"]))
-    results.check_json_option(parser, parser.parse_args(["--parts", "cold", "path"]))
+    results.add_options(parser, ["cold", "path", "table"])
+    return results.parse(parser, [*map(str, arguments)])
+
+
+def test_a_file_takes_one_part_and_is_checked_before_the_work(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "a.json"
+    assert parsed("--json", file, "--parts", "cold").json == file
+    assert parsed().parts == ["cold", "path", "table"]
+    for arguments, message in (
+        (("--json", file, "--parts", "cold", "path"), "--parts names 2"),
+        (("--json", tmp_path / "missing" / "a.json", "--parts", "cold"), "no folder"),
+        (("--parts", "warm"), "invalid choice: 'warm'"),
+    ):
+        with pytest.raises(SystemExit):
+            parsed(*arguments)
+        assert message in capsys.readouterr().err
+    monkeypatch.setenv("PATH", "")
     with pytest.raises(SystemExit):
-        results.check_json_option(parser, parser.parse_args(["--json", "a.json", "--parts", "cold", "path"]))
-    assert "--parts names 2" in capsys.readouterr().err
+        parsed("--json", file, "--parts", "cold")
+    assert "--json needs the commit" in capsys.readouterr().err
+
+
+def test_parts_write_their_rows(tmp_path):
+    options = parsed("--json", tmp_path / "a.json", "--parts", "cold")
+    results.run_parts(options, {"cold": lambda: {"hall": {"seconds": 2.0}}}, {"width": 9})
+    written = json.loads((tmp_path / "a.json").read_text())
+    assert written["part"] == "cold" and written["rows"] == {"hall": {"seconds": 2.0}}
 
 
 def test_a_variance_needs_two_passes():

@@ -100,6 +100,28 @@ def test_fingerprint_follows_everything_that_matters(tmp_path):
     assert SceneFile(scene).fingerprint() != before
 
 
+def test_every_sensor_gets_the_sampler(tmp_path):
+    scene = tmp_path / "scene.xml"
+    own = '<sampler type="independent"><integer name="sample_count" value="9"/></sampler>'
+    sensors = "".join(f'<sensor type="perspective">{sampler}</sensor>' for sampler in (own, ""))
+    scene.write_text(f'<scene version="3.0.0">{sensors}<shape type="sphere"/></scene>')
+    file = SceneFile(scene)
+    file.set_sampler("multijitter")
+    assert [sensor.sampler().class_name() for sensor in file.load().sensors()] == ["MultijitterSampler"] * 2
+    assert SceneFile(scene, changes=file.changes).load().sensors()[0].sampler().sample_count() == 9
+    with pytest.raises(ValueError, match="'path' is no sampler"):
+        file.set_sampler("path")
+
+
+def test_all_images_have_the_sampler_of_the_option(tmp_path):
+    common = [CORNELL, "-i", "path", "-D", "resx=8", "-D", "resy=8", "--spp", "7", "-r", "path:16"]
+    assert compare.main([*common, "--sampler", "multijitter", "-o", str(tmp_path)]) == 0
+    (scene,) = json.loads((tmp_path / "results.json").read_text())["scenes"]
+    # Mitsuba rounds the samples of this sampler
+    assert scene["sampler"] == "multijitter" and scene["renders"][0]["spp"] == 8
+    assert compare.main([*common, "--sampler", "gaussian", "-o", str(tmp_path)]) == 1
+
+
 # --- Passes ---
 
 

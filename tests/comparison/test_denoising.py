@@ -152,9 +152,13 @@ def test_the_command_passes_the_quality_on(tmp_path, capsys):
 def test_png_shows_the_denoised_image(tmp_path):
     assert command("-o", tmp_path / "a.png", "--denoise", "--exposure", "0") == 0
     assert command("-o", tmp_path / "a.exr", "--denoise") == 0
-    denoised, channels, _ = images.read_exr(tmp_path / "a.denoised.exr")
+    denoised, channels, described = images.read_exr(tmp_path / "a.denoised.exr")
     expected = images.tone_map(images.colour(denoised, channels), 1.0)
     assert np.abs(images.read_png(tmp_path / "a.png").astype(int) - expected).max() <= 1
+    texts = mi.Bitmap(str(tmp_path / "a.png")).metadata()
+    assert {"spp", "seed", "denoise_quality", "mitsuba"} <= set(texts) & set(described)
+    # Mitsuba writes texts in quotes
+    assert texts["integrator"].strip('"') == described["integrator"] == "manylights"
 
 
 def test_without_the_package_the_message_says_what_to_install(tmp_path, monkeypatch, capsys):

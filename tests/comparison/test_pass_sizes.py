@@ -285,8 +285,8 @@ def second_size(growth=(), compiled=0.0, time=10.0, **limits):
     and predicts the costs `growth` of 16, 32, ... samples; the rest of `time` is left."""
     sizes = TimedSizes(SQUARE // 2, time, in_parts=True, **limits)
     # Ratios of sizes, as the integrator gives them
-    costs = [(4.0 * 2**index, cost) for index, cost in enumerate(growth)]
-    statistics = {"seconds": {Stage.TRACED: 0.3}} | ({"growth": costs} if costs else {})
+    costs = [(1.0, (1.0, 0.0, 0.0)), *((4.0 * 2**index, (cost, 0.0, 0.0)) for index, cost in enumerate(growth))]
+    statistics = {"seconds": {Stage.TRACED: 0.3}} | ({"costs": costs} if growth else {})
     first = Pass(0, sizes.next([], 0.0), 0.4 + (compiled or 0), statistics, compiled)
     size = sizes.next([first], 0.4)
     # Samplers refuse other numbers
@@ -330,8 +330,9 @@ def lit_passes(time, traced, cuts, pixels=SQUARE, predicts=True):
         return size * traced + cuts
 
     while not isinstance(spp := sizes.next(passes, elapsed), str):
-        growth = [(size / spp, seconds_of(size) / size / (seconds_of(spp) / spp)) for size in other_sizes(spp)]
-        stages = {"seconds": {Stage.TRACED: spp * traced, Stage.CUTS: cuts}} | ({"growth": growth} if predicts else {})
+        # In a unit of which the model knows nothing
+        costs = [(size / spp, (1.0, 0.0, 0.3 / size)) for size in other_sizes(spp)]
+        stages = {"seconds": {Stage.TRACED: spp * traced, Stage.CUTS: cuts}} | ({"costs": costs} if predicts else {})
         passes.append(Pass(0, spp, seconds_of(spp) + 0.1, stages, 0.0))
         elapsed += passes[-1].seconds
     return [one.spp for one in passes], elapsed
@@ -358,13 +359,27 @@ def test_predicted_costs_are_those_of_passes_with_a_fixed_part(size, fixed):
     assert (np.diff(whole) > 0).all()
 
 
+def test_the_seconds_of_each_part_of_the_cost_grow_with_it():
+    stages = {Stage.TRACED: 2.0, Stage.LIGHTS: 0.5, Stage.TREE: 0.5, Stage.CLUSTERS: 0.25, Stage.CUTS: 0.75}
+    costs = [(1, (1.0, 2.0, 0.5)), (4, (1.1, 0.5, 0.25))]
+    # A quarter of the lights of a sample, and half of its cuts
+    lit = Pass(0, 4, 9.0, {"seconds": stages, "costs": costs})
+    assert lit.growth == [(1, 1.0), (4, pytest.approx((2.2 + 0.25 + 0.5) / 4))]
+    # Without lights, their cost is relative to that of the paths
+    dark = Pass(0, 4, 9.0, {"seconds": {Stage.TRACED: 2.0}, "costs": [(1, (1.0, 0.0, 0.0)), costs[1]]})
+    assert dark.growth == [(1, 1.0), (4, pytest.approx(1.1 + 0.5 + 0.25))]
+    assert Pass(0, 4, 9.0, {"seconds": stages}).growth is None
+
+
 def test_costs_are_those_of_the_pass_that_others_are_compared_with():
     """A checkpoint may end with a small pass, and the first pass after it may be larger."""
-    stages = {"seconds": {Stage.TRACED: 0.4, Stage.CUTS: 2.0}, "growth": [(1, 1.0), (4, 0.4), (16, 0.2)]}
+    costs = [(1, (1.0, 0.0, 1.0)), (4, (1.0, 0.0, 0.28)), (16, (1.0, 0.0, 0.04))]
+    stages = {"seconds": {Stage.TRACED: 0.4, Stage.CUTS: 2.0}, "costs": costs}
     sizes = TimedSizes(SQUARE, 60, in_parts=True)
     passes = [Pass(0, 4, 2.5, stages, 0.0)]
     sizes.next(passes, 2.5)
-    larger = {"seconds": {Stage.TRACED: 1.6, Stage.CUTS: 2.0}, "growth": [(0.25, 2.7), (1, 1.0), (4, 0.6)]}
+    costs = [(0.25, (1.0, 0.0, 3.9)), (1, (1.0, 0.0, 1.0)), (4, (1.0, 0.0, 0.28))]
+    larger = {"seconds": {Stage.TRACED: 1.6, Stage.CUTS: 2.0}, "costs": costs}
     sizes._asked = 16
     passes.append(Pass(0, 16, 3.7, larger, 0.0))
     sizes.next(passes, 6.2)

@@ -305,7 +305,8 @@ def test_passes_that_cost_more_than_expected_end_by_the_limit():
         # Virtual lights from 24 samples on, whose cost is 1.2 times the predicted one
         seconds = 0.05 + 0.04 * spp * (1.8 if spp >= 24 else 1)
         stages = {"traced": seconds - 0.05} | ({"cuts": 0.0} if spp >= 24 else {})
-        statistics = {"seconds": stages, "growth": [(4, 1.0 if spp >= 24 else 1.5)]}
+        costs = [(1, (1.0, 0.0, 0.0)), (4, (1.0 if spp >= 24 else 1.5, 0.0, 0.0))]
+        statistics = {"seconds": stages, "costs": costs}
         passes.append(single_pass.Pass(0, spp, seconds, statistics))
         elapsed += seconds
     assert 9 < elapsed < 10.5

@@ -319,6 +319,14 @@ def test_sensors(kind):
     assert_same_mean(pair, 8, 0.02, tiles=1 if kind in ONE_PIXEL else 4)
 
 
+def test_surfaces_beyond_the_far_plane_of_the_camera_are_not_seen():
+    """But they reflect light."""
+    box = closed_box(lamp_behind_the_camera(), 16)
+    box["sensor"]["far_clip"] = 1.5
+    assert (render(mi.load_dict(box), "manylights", 4)[8, 8] == 0).all()
+    assert_image_of_path(box, max_depth=4)
+
+
 @pytest.mark.parametrize("wrapper", ["moment", "aov"])
 def test_inside_of_other_integrators(wrapper):
     scene = mi.load_dict(closed_box({"light": area_light()}, 16))

@@ -86,7 +86,7 @@ def light_directly(
 ) -> DirectLight:  # fmt: skip
     """Direct light of ``sources`` at all gather points.
 
-    ``level``: mean radiance of the image, the unit of ``dark_floor``; None lets a pilot estimate it.
+    ``level``: mean radiance of the gather points, the unit of ``dark_floor``; None lets a pilot estimate it.
     ``stopped``: called before every pass; True ends the render.
     """
     start = perf_counter()

@@ -46,12 +46,13 @@ class Node:
 class DeviceTree:
     """A light tree's packed records on the device.
 
-    ``second_representative``: (2n - 1,), a light per node, drawn independently of the tree's representatives.
+    ``second_representative``: (2n - 1,), a light per node, drawn independently of the tree's representatives; None for
+    a tree without representatives.
     """
 
-    def __init__(self, kind: str, tree: LightTree, second_representative):
+    def __init__(self, kind: str, tree: LightTree, second_representative=None):
         self.kind = kind
-        self._second = upload(mi.UInt32, second_representative)
+        self._second = None if second_representative is None else upload(mi.UInt32, second_representative)
         self.count = len(tree.records)
         self._records = upload(mi.Float, tree.records)
 

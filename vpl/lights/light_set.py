@@ -5,14 +5,13 @@ With ``direct="vpl"`` emitters with an extent become virtual lights, as in the p
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NO_LIMIT, channel_mean, download, finite_or_zero, spectrum_to_rgb, upload
+from ..core.arrays import channel_mean, download, finite_or_zero, spectrum_to_rgb, upload, upload_limit
 from ..core.clock import Clock
 from ..core.cones import COSINE_ROUNDING
 from ..core.sampling import Choice, GuidedSums, derived_seed, independent_sampler, stratified
@@ -99,6 +98,7 @@ class LightSet:
 
     def __post_init__(self):
         self.clamp = dr.opaque(mi.Float, self.smallest_distance)
+        self._limit = upload_limit(self.max_depth)
 
     @property
     def count(self) -> int:
@@ -110,15 +110,11 @@ class LightSet:
 
     def allowed(self, point_depth, light_depth):
         """Whether a path through a gather point and a light has at most ``max_depth`` edges."""
-        if math.isinf(self.max_depth):
-            return mi.Bool(True)
-        return point_depth + light_depth + 1 <= mi.UInt32(self.max_depth)
+        return point_depth + light_depth + 1 <= self._limit
 
     def edges_left(self, point_depth, light_depth):
         """Number of edges that a path through a gather point and a light may gain, UInt32."""
-        if math.isinf(self.max_depth):
-            return mi.UInt32(NO_LIMIT)
-        return mi.UInt32(self.max_depth) - (point_depth + light_depth + 1)
+        return self._limit - (point_depth + light_depth + 1)
 
 
 def _leaf_ranges(tree: LightTree) -> np.ndarray:
@@ -177,8 +173,9 @@ def light_tree(lights: VirtualLights, seed: int) -> DeviceTree:
     return DeviceTree(lights.kind, tree, second)
 
 
-def _tree_of(lights: VirtualLights, generator, window: int = WINDOW) -> LightTree:
-    """Tree over lights of one kind; cones of spot trees are widened by the largest cut-off angle below each node."""
+def _tree_of(lights: VirtualLights, generator=None, window: int = WINDOW) -> LightTree:
+    """Tree over lights of one kind, without representatives if there is no ``generator``; cones of spot trees are
+    widened by the largest cut-off angle below each node."""
     direction = None if lights.kind == "point" else lights.direction
     tree = build_light_tree(lights.position, direction, lights.intensity, generator, window)
     if lights.kind == "spot":
@@ -200,22 +197,20 @@ class ScatteredGroup(LightGroup):
     nodes: mi.UInt32
 
     @classmethod
-    def of(cls, lights: VirtualLights, seed: int, sign: float = 1.0) -> ScatteredGroup:
-        """Group with a tree over lights of one kind; ``seed``: of the representatives; ``sign``: see LightGroup.
+    def of(cls, lights: VirtualLights, sign: float = 1.0) -> ScatteredGroup:
+        """Group with a tree over lights of one kind; ``sign``: see LightGroup.
 
         Surface lights need a c.  Their clusters have the least c in place of a representative.
         """
-        tree = _tree_of(lights, np.random.default_rng(seed), _SMALL_WINDOW)
+        tree = _tree_of(lights, window=_SMALL_WINDOW)
         ranges, order = _leaf_ranges(tree).astype(np.uint32), tree.leaf_order
-        lights, tree = lights.select(order), tree.in_leaf_order()
-        representative = tree.representative.copy()
         if lights.kind == "surface":
             tree.records[:, LEAST_C] = -largest_below(tree, -lights.c)
+        lights = lights.select(order)
         bits = tree.records[:, INTENSITY].copy().view(np.uint32)
         nodes = upload(mi.UInt32, np.column_stack([ranges, order[ranges[:, 0]], bits]))
         sums = GuidedSums(lights.intensity.mean(1, dtype=np.float64))
-        device_tree = DeviceTree(lights.kind, tree, representative)
-        return cls(lights.kind, DeviceLights(lights), device_tree, sums, nodes, sign=sign)
+        return cls(lights.kind, DeviceLights(lights), DeviceTree(lights.kind, tree), sums, nodes, sign=sign)
 
     def first_light(self, nodes):
         """The caller's index of the first light of each node: nodes of a cut differ in it, and similar trees have equal

@@ -79,16 +79,9 @@ class LightTree:
 
     @property
     def representative(self) -> np.ndarray:
-        """(2n - 1,) uint32 view: representative light of each node, an index into the caller's arrays."""
+        """(2n - 1,) uint32 view: representative light of each node, an index into the caller's arrays; 0 in trees
+        without any."""
         return self.records.view(np.uint32)[:, REPRESENTATIVE]
-
-    def in_leaf_order(self) -> LightTree:
-        """The same tree for lights in the order of ``leaf_order``."""
-        rank = np.empty_like(self.leaf_order)
-        rank[self.leaf_order] = np.arange(len(rank), dtype=rank.dtype)
-        tree = LightTree(self.records.copy(), np.arange(len(rank), dtype=rank.dtype), self.depth)
-        tree.representative[:] = rank[self.representative]
-        return tree
 
     @property
     def is_leaf(self) -> np.ndarray:
@@ -96,13 +89,13 @@ class LightTree:
         return self.escape == np.arange(len(self.records)) + 1
 
 
-def build_light_tree(position, direction, flux, rng, window=WINDOW, angular_weight=ANGULAR_WEIGHT) -> LightTree:
+def build_light_tree(position, direction, flux, rng=None, window=WINDOW, angular_weight=ANGULAR_WEIGHT) -> LightTree:
     """Cluster lights into a binary tree by the method of the module's docstring.
 
     position: (n, 3) float32, world units; None for lights at infinity, which are clustered by direction alone.
     direction: (n, 3) float32 unit vectors; None for omnidirectional lights, which are clustered by position alone.
     flux: (n, 3) float32, finite, not negative, any unit, positive in at least one channel per light.
-    rng: numpy.random.Generator for the representatives; the tree's topology is independent of it.
+    rng: numpy.random.Generator for the representatives, None for a tree without any; the topology is independent of it.
     window: neighbours tried to either side, 1 to 1024; clustering time is proportional to the window.
     angular_weight: factor of the squared angular term of the metric, relative to the squared positional term.
 
@@ -233,7 +226,8 @@ def _assemble(order, rounds, position, direction, flux, rng) -> LightTree:
     records[:, INTENSITY], records[:, FLUX] = total.mean(axis=0), total.T
     bits = records.view(np.uint32)
     bits[node_at, ESCAPE] = np.arange(len(node_at)) + 2 * leaves - 1
-    bits[:, REPRESENTATIVE] = _draw_representatives(order, rounds, total.mean(axis=0), rng)
+    if rng is not None:
+        bits[:, REPRESENTATIVE] = _draw_representatives(order, rounds, total.mean(axis=0), rng)
     records[:, CONE_AXIS], records[:, CONE_COS] = (0, 0, 1), -1
     if direction is not None:
         unit = (direction / np.linalg.norm(direction.astype(np.float64), axis=1, keepdims=True)).astype(np.float32)

@@ -38,6 +38,8 @@ class CameraRays:
         """The rays with the indices ``lane``."""
         ray, places = view.ray, view.rays.places(lane)
         part = mi.Ray3f(*(dr.gather(type(x), x, lane) for x in (ray.o, ray.d, ray.time)))
+        # Of sensors with `far_clip`
+        part.maxt = dr.gather(mi.Float, ray.maxt, lane)
         # All numbers of rays, and counted and chosen lanes, use the same kernel
         dr.eval(lane, places)
         importance = dr.gather(mi.Float, view.importance, places.pixel)

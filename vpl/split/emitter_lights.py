@@ -10,6 +10,7 @@ estimation draws a single emitter.  Next-event estimation keeps the second term.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -65,15 +66,21 @@ class EmitterLights:
         area = float(self.emitters.area.area[self.carried & (self.emitters.area.power > 0)].sum(dtype=np.float64))
         return (area / count) ** 0.5
 
+    @cached_property
+    def _of_omni(self) -> list[ScatteredGroup]:
+        """The point and spot emitters with their tree, for all passes of a render."""
+        return [ScatteredGroup.of(self.omni)] if self.omni.count else []
+
     def groups(self, count: int, c: float, seed: int) -> list[ScatteredGroup]:
         """The lights with their trees; ``count``: number of points on area emitters; ``c``: of the points."""
-        lights, weight = [self.omni], self._weight
-        if weight.any():
-            on_areas = area_lights(self.emitters, count, derived_seed(seed, 0), weight)
-            # `facing` is set as for lights on surfaces: both kinds use the same kernels
-            on_areas = replace(on_areas, kind="surface", facing=on_areas.direction).without_bad()[0]
-            lights.append(replace(on_areas, c=np.full(on_areas.count, c, np.float32)))
-        return [ScatteredGroup.of(x, derived_seed(seed, 1, k)) for k, x in enumerate(lights) if x.count]
+        weight = self._weight
+        if not weight.any():
+            return self._of_omni
+        lights = area_lights(self.emitters, count, derived_seed(seed, 0), weight)
+        # `facing` is set as for lights on surfaces: both kinds use the same kernels
+        lights = replace(lights, kind="surface", facing=lights.direction).without_bad()[0]
+        lights = replace(lights, c=np.full(lights.count, c, np.float32))
+        return [*self._of_omni, *([ScatteredGroup.of(lights)] if lights.count else [])]
 
 
 def has_true_normals(shape) -> bool:

@@ -30,8 +30,8 @@ from .pilot import Pilot, error_scale, finite, kept_of_both, means_of_others, pi
 from .pixel_rays import RayNumbers
 from .view import Stream, View, ViewLights
 
-# Candidate multiples, powers of two at half steps; 0 for one sample everywhere. Expected differences of 0.01 to 10 get
-# the largest number by one of them
+# Candidate multiples, powers of two at half steps; 0 for one sample everywhere. By one of them, expected differences of
+# 0.17 to 124 get the largest number
 _MULTIPLES = np.concatenate([[0.0], 2.0 ** np.arange(-3, 7, 0.5)])
 # Paths of a group that measures the effect of stratification, and largest number of groups. What 8 paths retain, 64
 # nearly retain, too (decisions.md)

@@ -194,25 +194,20 @@ class Decision:
         remains = next(x.expected for x in self.options if (x.surfaces, x.emitters) == kinds)
         return np.maximum(self.pilot.nearby(self.pilot.radiance - remains), 0)
 
-    def growth(self, samples: int, rays: float | None = None) -> float:
-        """Expected cost of a path of a pass with so many ``samples`` for a pixel, over that in this pass: larger passes
-        may have virtual lights where this one has none, and more samples share the cuts of a pixel.
+    def costs(self, samples: int) -> tuple[float, float, float]:
+        """Expected costs of a path of a pass with so many ``samples`` for a pixel: that of the path with its emitter
+        samples, and its shares of lights and of cuts.  Larger passes may have virtual lights where this one has none,
+        and more samples share the cuts of a pixel.
 
         Depends on the options measured so far, unlike the plan, so only renders with a limit of time use it.
-
-        ``rays``: shadow rays of a pixel's cuts in this pass, None for the expected number.
         """
-        paths = round(self.evidence.paths * samples / self.evidence.samples)
-        other = replace(self.evidence, paths=paths, samples=samples)
-        excess = rays / self.plan.rays - 1 if rays is not None and self.plan.rays else 0.0
-        return self._cost(other, choose(other, self.options, measures=False), excess) / self._cost(
-            self.evidence, self.plan, excess
-        )
-
-    def _cost(self, evidence: Evidence, plan: Plan, excess: float) -> float:
-        """Cost of a path whose cuts take 1 + ``excess`` times the expected shadow rays."""
-        of_cuts = self.evidence.model.ray_cost * plan.rays / evidence.samples
-        return self._emitter_samples(evidence, plan).cost + excess * of_cuts
+        evidence, plan = self.evidence, self.plan
+        if samples != evidence.samples:
+            paths = round(evidence.paths * samples / evidence.samples)
+            evidence = replace(evidence, paths=paths, samples=samples)
+            plan = choose(evidence, self.options, measures=False)
+        cuts = evidence.model.ray_cost * plan.rays / samples
+        return self._emitter_samples(evidence, plan).cost - (plan.cost - 1), plan.cost - 1 - cuts, cuts
 
     def precision(self, samples: int) -> float:
         """Expected inverse of the relative variance of a pixel with ``samples``; ``samples`` for a black image.

@@ -66,8 +66,7 @@ def surface_lights(view: View, sampler: LineSampler, count: int, announce_tree: 
     parts = _by_sign(lights)
     if parts:
         announce_tree()
-    seed = derived_seed(view.seed, Stream.TREE)
-    return SurfaceLights(lights, c, [ScatteredGroup.of(part, seed, sign) for part, sign in parts])
+    return SurfaceLights(lights, c, [ScatteredGroup.of(part, sign) for part, sign in parts])
 
 
 def _by_sign(lights: VirtualLights) -> list[tuple[VirtualLights, float]]:
@@ -76,8 +75,9 @@ def _by_sign(lights: VirtualLights) -> list[tuple[VirtualLights, float]]:
     Surfaces with a negative reflectance send negative light.  ``path`` adds negative light, and the traced part
     subtracts the share of virtual lights.
     """
+    signs = (1, -1) if (lights.intensity < 0).any() else (1,)
     parts = [
-        (replace(lights, intensity=np.maximum(sign * lights.intensity, 0)).without_bad()[0], sign) for sign in (1, -1)
+        (replace(lights, intensity=np.maximum(sign * lights.intensity, 0)).without_bad()[0], sign) for sign in signs
     ]
     return [(part, sign) for part, sign in parts if part.count]
 

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import ones
+from ..core.arrays import ones, upload_limit
 from ..core.materials import Materials
 from ..lights.light_set import LightGroup, LightSet
 from .contributions import Layers
@@ -28,7 +28,6 @@ class Stream(IntEnum):
 
     PILOT = 1
     SURFACE_LIGHTS = 2
-    TREE = 3
     IMAGE = 4
     GATHER = 5
     LEARNING = 6
@@ -131,8 +130,8 @@ class FirstEdge(Edge):
         count = dr.width(ray.d)
         # Arrays of full width, opaque and distinct, give a single kernel for every use
         wide = dr.opaque(mi.Float, 0.0, count)
-        ray = mi.Ray3f(ray.o + wide, ray.d + wide, ray.time + wide)
-        ray.maxt = dr.largest(mi.Float) + wide
+        limit, ray = ray.maxt + wide, mi.Ray3f(ray.o + wide, ray.d + wide, ray.time + wide)
+        ray.maxt = limit
         active = mi.Bool(active) & dr.opaque(mi.Bool, True, count)
         edge = cls(
             vertex + dr.opaque(mi.Float, 0.0, count),
@@ -236,9 +235,8 @@ class View:
         # Without lights on surfaces, lights representing emitters are gathered at x1 only: at the few lit later
         # vertices, the lights would add more variance than the lights remove
         gathering = Gathering.EVERYWHERE if lights.surfaces else Gathering.AT_FIRST if lights.emitters else least
-        longest = dr.opaque(mi.UInt32, int(min(self.rules.max_depth, 0xFFFFFFFF)))
         return PathSettings(
-            longest, dr.opaque(mi.UInt32, self.rules.rr_depth), lights.c, dr.opaque(mi.UInt32, gathering),
-            dr.opaque(mi.Bool, lights.emitters is not None), dr.opaque(mi.Float, lights.emitters_c**2),
-            self.outgoing, self.with_minorant, self.rules.hide_emitters,
+            upload_limit(self.rules.max_depth), dr.opaque(mi.UInt32, self.rules.rr_depth), lights.c,
+            dr.opaque(mi.UInt32, gathering), dr.opaque(mi.Bool, lights.emitters is not None),
+            dr.opaque(mi.Float, lights.emitters_c**2), self.outgoing, self.with_minorant, self.rules.hide_emitters,
         )  # fmt: skip

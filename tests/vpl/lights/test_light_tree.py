@@ -406,14 +406,13 @@ def test_a_wider_window_and_the_angular_weight_do_what_they_say():
 # --- Representatives ---
 
 
-def test_a_tree_in_the_order_of_its_leaves_is_the_same_tree():
-    rng = np.random.default_rng(2)
-    position, direction, flux = random_lights(rng, 70)
-    tree = build(position, direction, flux)
-    order, ordered = tree.leaf_order, tree.in_leaf_order()
-    check_tree(ordered, position[order], direction[order], flux[order])
-    np.testing.assert_array_equal(order[ordered.representative], tree.representative)
-    np.testing.assert_array_equal(ordered.leaf_order, np.arange(70))
+def test_a_tree_without_representatives_is_the_same_tree():
+    lights = random_lights(np.random.default_rng(2), 70)
+    with_them, without = build(*lights), build_light_tree(*lights)
+    assert not without.representative.any() and with_them.representative.any()
+    without.representative[:] = with_them.representative
+    np.testing.assert_array_equal(without.records, with_them.records)
+    np.testing.assert_array_equal(without.leaf_order, with_them.leaf_order)
 
 
 @pytest.mark.stress

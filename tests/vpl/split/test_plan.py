@@ -240,33 +240,23 @@ def decision(samples, pixels=10**6):
     return Decision(None, evidence, choose(evidence, [option]), [option], {False: same, True: same})
 
 
-def test_samples_of_larger_passes_share_cuts():
+def test_samples_of_larger_passes_share_lights_and_cuts():
     """The largest error limits how coarse the cuts of few samples are."""
-    one = decision(1)
-    assert one.plan.gathers and one.growth(1) == 1
-    sizes = np.array([1, 2, 4, 8, 16])
-    costs = np.array([one.growth(int(size)) for size in sizes])
-    assert (np.diff(costs) < 0).all() and costs[2] < 0.7
+    one, sizes = decision(1), np.array([1, 2, 4, 8, 16])
+    assert one.plan.gathers and sum(one.costs(1)) == pytest.approx(one.emitter_samples.cost)
+    paths, lights, cuts = np.array([one.costs(int(size)) for size in sizes]).T
+    assert (paths == 1).all() and (np.diff(lights) < 0).all() and (np.diff(cuts) <= 0).all()
+    assert cuts[2] < 0.7 * cuts[0]
     # The whole pass costs more
-    assert (np.diff(costs * sizes) > 0).all()
-    assert decision(16).growth(1) == pytest.approx(1 / costs[-1])
-
-
-def test_cuts_with_more_rays_than_expected_are_a_larger_part_of_the_cost():
-    one = decision(1)
-    expected = one.plan.rays
-    assert one.growth(4, expected) == pytest.approx(one.growth(4))
-    assert one.growth(4, 4 * expected) < one.growth(4) < one.growth(4, 0.5 * expected)
-    assert one.growth(1, 4 * expected) == 1
-    # Without a single ray, the cuts cost nothing
-    assert one.growth(4) < one.growth(4, 0.0)
+    assert (np.diff((paths + lights + cuts) * sizes) > 0).all()
+    np.testing.assert_allclose(decision(16).costs(1), one.costs(1))
 
 
 def test_the_variance_of_paths_is_computed_once(monkeypatch):
     one, calls = decision(16), []
     monkeypatch.setattr(plan, "relative_variance", lambda *arguments: calls.append(arguments))
     for samples in (1, 4, 16, 64):
-        one.growth(samples)
+        one.costs(samples)
     assert not calls
 
 

@@ -228,7 +228,7 @@ def ranges_of(group):
 
 def test_the_first_light_of_a_node_has_the_index_of_the_caller():
     lights = surface_lights(np.random.default_rng(6), 100)
-    group = ScatteredGroup.of(lights, 1)
+    group = ScatteredGroup.of(lights)
     node = dr.arange(mi.UInt32, group.tree.count)
     found = np.array(group.lights.gather(group._record(node).x).position).T
     np.testing.assert_array_equal(found, lights.position[np.array(group.first_light(node))])
@@ -236,7 +236,7 @@ def test_the_first_light_of_a_node_has_the_index_of_the_caller():
 
 def test_nodes_know_the_least_c_of_their_lights():
     lights = surface_lights(np.random.default_rng(5), 200)
-    group = ScatteredGroup.of(lights, 1)
+    group = ScatteredGroup.of(lights)
     first, last, order = ranges_of(group)
     least = download(group.tree.gather(dr.arange(mi.UInt32, group.tree.count)).least_c)
     np.testing.assert_array_equal(least, [lights.c[order[a:b]].min() for a, b in zip(first, last, strict=True)])
@@ -245,7 +245,7 @@ def test_nodes_know_the_least_c_of_their_lights():
 def test_lights_of_a_node_are_drawn_by_their_share_of_its_intensity():
     rng = np.random.default_rng(0)
     lights = surface_lights(rng, 60)
-    group = ScatteredGroup.of(lights, 1)
+    group = ScatteredGroup.of(lights)
     first, last, order = ranges_of(group)
     level = lights.intensity.mean(1)
     draws = 200_000

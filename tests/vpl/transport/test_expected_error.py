@@ -126,7 +126,7 @@ def test_cuts_of_pixels_compare_expected_errors():
     position, normal = rng.uniform(-3, 3, (300, 3)), unit_vectors(rng, 300)
     lights = VirtualLights.of("surface", position, normal, 10.0 ** rng.uniform(-2, 0, (300, 3)))
     lights.facing, lights.c = lights.direction, np.full(300, 0.5, np.float32)
-    group = ScatteredGroup.of(lights, 1)
+    group = ScatteredGroup.of(lights)
     lights, receivers = LightSet([group], 0, np.inf, 0, 0, {}), Receivers.of(*uploaded(random_boxes(rng, 0.1)))
     threshold = dr.opaque(mi.Float, 0.01, PAIRS)
     sizes = cuts_at(lights, receivers, threshold)

@@ -51,7 +51,7 @@ class EmitterTree:
         least = _LEAST_INTENSITY * float(intensity.max()) or 1.0
         intensity = np.maximum(intensity, least)
         colours = np.repeat(intensity[:, None], 3, axis=1).astype(np.float32)
-        tree = build_light_tree(position.astype(np.float32), None, colours, np.random.default_rng(0))
+        tree = build_light_tree(position.astype(np.float32), None, colours)
         roots = _cut(tree, most_clusters)
         self.clusters = len(roots)
         self._root = upload(mi.UInt32, roots)
