@@ -292,7 +292,7 @@ def _runner(options):
 
 def _compare(options, settings, command, runner):
     """Make all runs and write the report after each scene; return the content of `results.json`."""
-    made_by = {"versions": machine.versions(), "machine": machine.identity()}
+    made_by = {"versions": machine.software(), "machine": machine.identity()}
     store = Runs(options.out, made_by | ({"workers": True} if options.workers else {}))
     progress = Progress(options.scenes, sweeps.order(settings, options.seeds))
     done = []

@@ -35,7 +35,7 @@ mi.set_variant("llvm_ad_rgb")
 import integrators  # noqa: E402, F401
 from benchmarks import results, scenes  # noqa: E402
 from benchmarks.printed_passes import as_printed  # noqa: E402
-from comparison import references  # noqa: E402
+from comparison import machine, references  # noqa: E402
 from comparison.command_line import positive  # noqa: E402
 from comparison.metrics import compare  # noqa: E402
 from comparison.scene_files import SceneFile  # noqa: E402
@@ -47,6 +47,8 @@ NAMES = (
 AGAINST = ("unoccluded", "all", "direct", "path")
 RAYS, REFERENCE_ERROR, REFERENCE_RENDERS = 64, 0.015, 4
 PRINTED = "adaptivedirect, printed"
+# Files that determine an image by ``adaptivedirect``
+SOURCES = ("vpl/**/*.py", "integrators/*.py")
 
 
 class Problem:
@@ -58,7 +60,9 @@ class Problem:
         self.pixels = width * height
         file = SceneFile(path, defines)
         file.set_sampler("multijitter")
-        cached = references.default_cache() / f"direct-{name}-{file.fingerprint()[:16]}.exr"
+        # An image by other sources does not judge these
+        made_by = f"{file.fingerprint()[:16]}-{machine.sources(SOURCES)}"
+        cached = references.default_cache() / f"direct-{name}-{made_by}.exr"
         self.scene = file.load()
         if not cached.exists():
             self._make_reference(cached)
@@ -74,7 +78,7 @@ class Problem:
             image = np.array(mi.render(self.scene, integrator=fine, spp=RAYS, seed=seed), np.float64)
             batches = batches.with_batch(image[..., :3], RAYS)
         file.parent.mkdir(parents=True, exist_ok=True)
-        batches.write(file, {"integrator": "adaptivedirect", "error": REFERENCE_ERROR})
+        batches.write(file, {"integrator": "adaptivedirect", "error": REFERENCE_ERROR, **machine.software()})
 
     def error(self, image) -> float:
         """relMSE over pixels without emitters, without the largest 0.1%, corrected for the reference's noise."""

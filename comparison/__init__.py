@@ -1,10 +1,12 @@
 """Modules of `manylights.py` and `compare.py`: scene files, rendering in passes, images, errors, reports.
 
 `scene_files`   parse a scene file, change its integrator or size, load it
-`rendering`     average passes with different seeds, for samples or seconds
+`single_pass`, `rendering`
+                a pass; the average of passes with different seeds
+`measuring`     passes of a comparison, for samples or seconds
 `counters`      sums of the integrators' counters over passes
-`render`, `pass_sizes`, `timed_sizes`, `convergence`, `interruption`
-                render until a time or an error: pass sizes, error estimate, Ctrl-C
+`render`, `pass_sizes`, `timed_sizes`, `convergence`, `ending`, `interruption`
+                render until a time or an error: pass sizes, error estimate, end, Ctrl-C
 `checkpoint`    state of an unfinished render
 `one_image`, `batch`
                 an image of the command, rendered locally or by workers; batches of frames, scenes and sensors
@@ -33,6 +35,7 @@
 `strip`         a row of pictures for a paper
 `baseline`      regression test of speed-ups
 `machine`       processor, load, versions
+`threads`       limits of threads
 `command_line`  common options and error messages of the two commands
 """
 

@@ -50,7 +50,7 @@ def load():
     return os.getloadavg()[0]
 
 
-def versions():
+def software():
     """Return the versions (text) of the software of a comparison; "sources" is a hash of this project's sources."""
     return command_line.versions() | {"python": platform.python_version(), "sources": sources()}
 

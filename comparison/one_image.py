@@ -65,7 +65,7 @@ class Image:
                 "scene": scene.file.fingerprint(),
                 "sensor": sensor,
                 "seed": options.seed,
-                **machine.versions(),
+                **machine.software(),
             }
             self._checkpoint = Checkpoint(file_of(self.path), made_by, options.resume)
         if pool:

@@ -182,9 +182,11 @@ class Batches:
     squares: np.ndarray | float = 0.0  # sum of squared deviations, weighted by samples per pixel
 
     def with_batch(self, image, spp):
-        """Return the batches with another one of `spp` samples per pixel, in which pixels that are not finite are
-        black."""
-        image = np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0)
+        """Return the batches with another one of `spp` samples per pixel. Values that are not finite become 0, with a
+        warning."""
+        if bad := np.count_nonzero(~np.isfinite(image)):
+            mi.Log(mi.LogLevel.Warn, f"{bad} value(s) of a reference that are not finite become 0.")
+            image = np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0)
         difference, total = image - self.mean, self.spp + spp
         mean = self.mean + difference * (spp / total)
         return Batches(total, self.count + 1, mean, self.squares + spp * difference * (image - mean))
@@ -212,7 +214,8 @@ class Batches:
         return cls(spp, count, mean.astype(np.float64), np.square(error, dtype=np.float64) * spp * (count - 1))
 
 
-def main():
+def main(arguments=None):
+    """Run the command; return its exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m comparison.references", description="Make a path-traced reference."
     )
@@ -222,7 +225,14 @@ def main():
     parser.add_argument("--cache", type=Path, default=default_cache(), help="default: ~/.cache/manylights")
     parser.add_argument("--output", type=Path, required=True, help="EXR file")
     command_line.add_common_options(parser)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
+    kept = "the cache keeps the samples so far, and the same command goes on"
+    return command_line.exit_status("references", lambda: _run(options), kept, options.verbose)
+
+
+def _run(options):
+    if not options.output.absolute().parent.is_dir():
+        raise command_line.UsageError(f"no folder '{options.output.absolute().parent}' for the output")
     command_line.set_variant(options.mode)
     file = SceneFile(options.scene, dict(options.define))
     if options.width:
@@ -231,7 +241,8 @@ def main():
     made = {key: value for key, value in reference.description.items() if key not in ("file", "generatedBy")}
     made |= {"command": shlex.join(["python", "-m", "comparison.references", *sys.argv[1:]]), **command_line.versions()}
     write(options.output, reference.image, reference.standard_error, made, half=True)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

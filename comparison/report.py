@@ -18,7 +18,7 @@ def describe(command, options, scenes, complete):
         "complete": complete,
         "seeds": options.seeds,
         "variant": options.mode,
-        "versions": machine.versions(),
+        "versions": machine.software(),
         "machine": machine.describe(),
         "metrics": {"epsilon": metrics.EPSILON, "trimmed": metrics.TRIMMED, "compared": options.metric},
         "summary": verdict.summarise(scenes, options.metric),

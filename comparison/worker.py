@@ -215,7 +215,7 @@ def _render_vpl(job, rendered, described):
     file = _parse(job)
     file.set_integrator("vpl", {"aovs": ""}, keep=None)  # AOVs are not needed, and `vpl` may not know them
     passes, parts = rendered.passes, rendered.parts
-    shared = [file.fingerprint(), machine.versions(), parts, [(one.spp, one.seed) for one in passes]]
+    shared = [file.fingerprint(), machine.software(), parts, [(one.spp, one.seed) for one in passes]]
     key = hashlib.sha256(json.dumps(shared).encode()).hexdigest()[:16]
     output = Path(job.vpl_folder) / f"{file.name}.vpl.{key}.exr"
     if not output.is_file():

@@ -20,7 +20,7 @@ ARE_NOTED = ("numpy", "python", "llvm", "processor")
 
 def identity():
     """Return the compared properties of this process, a dict from name to text."""
-    found = machine.versions() | {
+    found = machine.software() | {
         "sources": machine.sources(SOURCES),
         "distributed": metadata.version("distributed"),
         "python": ".".join(platform.python_version_tuple()[:2]),

@@ -6,7 +6,7 @@ import pytest
 
 from comparison import references, rendering
 from comparison.scene_files import SceneFile
-from tests.support.paths import ROOT
+from tests.support.paths import CORNELL, ROOT
 from tests.support.scenes import cornell
 
 
@@ -117,3 +117,20 @@ def test_shipped_reference_fits_the_shipped_hall():
     assert file.size == reference.size
     image = mi.render(file.load(), spp=64).numpy()
     assert image.mean() == pytest.approx(reference.image.mean(), rel=0.03)
+
+
+def test_the_command_makes_a_reference_and_checks_its_output_first(tmp_path, capsys):
+    common = [CORNELL, "--width", "8", "--spp", "4", "--cache", str(tmp_path / "cache"), "--output"]
+    assert references.main([*common, str(tmp_path / "none" / "a.exr")]) == 2
+    assert "no folder" in capsys.readouterr().err and not list(tmp_path.iterdir())
+    assert references.main([*common, str(tmp_path / "a.exr")]) == 0
+    found = references.read(tmp_path / "a.exr")
+    assert found.image.shape == (8, 8, 3) and found.description["spp"] >= 4
+
+
+def test_values_that_are_not_finite_become_0_with_a_warning(capfd):
+    image = np.ones((2, 2, 3))
+    image[0, 0, 1] = np.nan
+    batches = references.Batches().with_batch(image, 4)
+    assert batches.mean[0, 0].tolist() == [1, 0, 1] and batches.mean[1, 1].tolist() == [1, 1, 1]
+    assert "1 value(s) of a reference" in "".join(capfd.readouterr())
