@@ -36,7 +36,10 @@ def is_perturbed(bsdf: mi.BSDF) -> bool:
 
 def perturbed_shapes(shapes: SceneShapes) -> tuple[int, ...]:
     """Registry indices of the shapes with a bump or normal map."""
-    return tuple(index for index, shape in shapes.of_hits if is_perturbed(shape.bsdf()))
+    of_shapes = [(index, shape.bsdf()) for index, shape in shapes.of_hits]
+    # Printing a material takes long, and shapes share materials
+    judged = {id(bsdf): is_perturbed(bsdf) for bsdf in {id(bsdf): bsdf for _, bsdf in of_shapes}.values()}
+    return tuple(index for index, bsdf in of_shapes if judged[id(bsdf)])
 
 
 @dataclass(init=False)

@@ -28,7 +28,7 @@ from .path_tracer import Traced
 from .pilot import error_scale
 from .pixel_clusters import PixelClusters, light_clusters
 from .pixel_rays import PixelRays
-from .plan import Decision, Plan, choose, without_lights
+from .plan import LEAST_VARIANCE, Decision, Plan, choose, without_lights
 from .roulette import best_multiple
 from .spread_light import spread
 from .start import Start, evidence_of
@@ -109,7 +109,7 @@ def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
     if not np.isfinite(multiple):
         return view, {}
     # The less variance remains, the more a contribution matters
-    multiple *= (whole / max(decision.variance, 1e-9)) ** 0.5
+    multiple *= (whole / max(decision.variance, LEAST_VARIANCE)) ** 0.5
     importance = upload(mi.Float, multiple / error_scale(of_pixels, model))
     return replace(view, outgoing=outgoing, importance=importance), {"roulette": f"{multiple:.3g}"}
 
@@ -141,7 +141,7 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
         drawn.append(wanted)
         return surface_lights(view, pilot.line_sampler, wanted, lambda: clock.begin(Stage.TREE))
 
-    made = kept.find(view.scene, (view.seed, view.rules.max_depth, view.model.shared), make) if kept else make()
+    made = kept.find(view.scene, (view.seed, view.rules.max_depth, view.model), make) if kept else make()
     statistics = {"light_paths": sum(drawn), "lights": {"surface": made.lights.count}}
     if not made.groups:
         return ViewLights(), statistics

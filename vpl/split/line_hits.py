@@ -98,11 +98,12 @@ def _uncertainty(scene, found: _Found, scene_size: float) -> np.ndarray:
     position, shape = download(found.position), download(found.shape)
     offset = mi.math.RayEpsilon * (1 + np.abs(position).max(1, initial=0))
     shapes = dict(registered_shapes(scene))
+    extents = np.zeros(int(shape.max(initial=0)) + 1)
     # Shapes of groups are not registered
-    extents = np.zeros(int(max([*shapes, shape.max(initial=0)])) + 1)
-    for index, one in shapes.items():
+    for index in np.intersect1d(shape, list(shapes)):
+        box = shapes[index].bbox()
         # Rectangles that Mitsuba merged have no box
-        extents[index] = max(one.bbox().extents()) if one.bbox().valid() else scene_size
+        extents[index] = max(box.extents()) if box.valid() else scene_size
     uncertainty = (_UNCERTAINTY * extents[shape]).astype(np.float32)
     large = uncertainty > offset
     for index in np.unique(shape[large]):

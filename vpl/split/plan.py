@@ -1,6 +1,6 @@
 """Plan: whether virtual lights pay, the number of lights, and the fineness of the clusters.
 
-An :class:`Option` is a choice of light kinds.  :func:`price` predicts the variance × cost of an option by the cost
+An :class:`Option` is a choice of light kinds.  :func:`priced` predicts the variance × cost of an option by the cost
 model; :func:`choose` measures the options that may pay, and takes the one with the least product, or no lights.  The
 variance is that of the paths.  In images that are denoised, that of the choice of lit vertices and of the lights on
 surfaces adds to it: neighbouring pixels share the noise of lights, and a denoiser keeps more of it.  There, the product
@@ -22,6 +22,7 @@ from .view import ViewLights
 
 _TINY = np.finfo(np.float64).tiny
 _FEWEST_RAYS = 1e-9  # for a sample; the largest error of cuts limits the rays
+LEAST_VARIANCE = 1e-9  # stands for a relative variance of 0 in ratios
 
 
 @dataclass(frozen=True)
@@ -233,10 +234,10 @@ def choose(evidence: Evidence, options: list[Option], measures: bool = True) -> 
     if not options:
         return without_lights("no light comes by way of surfaces that virtual lights could stand for")
     most, found = _most_to_pay(evidence), []
-    for product, plan, option in sorted(((*_priced(evidence, x), x) for x in options), key=lambda priced: priced[0]):
+    for product, plan, option in sorted(((*priced(evidence, x), x) for x in options), key=lambda one: one[0]):
         if measures and option.to_measure and product <= min([most, *(other for other, _ in found)]):
             option.measure()
-            product, plan = _priced(evidence, option)
+            product, plan = priced(evidence, option)
         found.append((product, plan))
     product, best = min(found, key=lambda priced: priced[0])
     remains = (best.variance + best.of_lights) / max(evidence.whole, _TINY)
@@ -251,18 +252,14 @@ def without_lights(reason: str) -> Plan:
     return Plan(0, False, 0.0, 0, 0.0, 0.0, 1.0, 0.0, reason)
 
 
-def price(evidence: Evidence, option: Option) -> float:
-    """Variance × cost with the lights of an option; a power of the variance in images that are denoised."""
-    return _priced(evidence, option)[0]
-
-
 def _most_to_pay(evidence: Evidence) -> float:
     """Largest price of lights that pay: a multiple of the price of paths alone."""
     return evidence.model.pays_below * evidence.whole**evidence.model.denoised_power
 
 
-def _priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:
-    """(:func:`price`, plan) with the lights of an option."""
+def priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:
+    """(Price, plan) with the lights of an option.  The price is variance × cost, with a power of the variance in images
+    that are denoised."""
     found, plan = _planned(evidence, option, option.remaining(evidence))
     if option.residual is None:
         return found, plan
@@ -302,7 +299,7 @@ def _cut_rays(rest: float, cuts: float, samples: int, model: CostModel) -> tuple
     (rest + cuts × cut variance / r)^power × (1 + cuts × r × cost of a ray), without fixed costs.  It is the positive
     root of cost × rest × r² + (1 - power) × cost × cuts × cut variance × r = power × cut variance.
     """
-    power, rest = model.denoised_power, max(rest, 1e-9)
+    power, rest = model.denoised_power, max(rest, LEAST_VARIANCE)
     half = 0.5 * (1 - power) * cuts * model.cut_variance / rest
     squared = power * model.cut_variance / (model.chosen_ray_cost * rest)
     # The root as a fraction, because a difference would cancel for a small rest

@@ -8,13 +8,18 @@ import pytest
 from vpl.split import plan
 from vpl.split.cost_model import CostModel, table
 from vpl.split.emitter_samples import EmitterSamples
-from vpl.split.plan import Decision, Evidence, Option, choose, price
+from vpl.split.plan import Decision, Evidence, Option, choose, priced
 
 DENOISED = CostModel()
 # Lights pay as in raw images, and are as many as in denoised ones
 MODEL = replace(DENOISED, denoised_power=1.0)
 # No emitter is seen directly
 UNSEEN = 0.0
+
+
+def price(evidence, option):
+    """The price alone."""
+    return priced(evidence, option)[0]
 
 
 def balanced(direct, indirect, paths, samples, left=None):
@@ -84,7 +89,7 @@ def test_lights_do_not_pay_where_they_leave_what_they_should_carry():
     assert balanced(0.1 * direct, indirect, 10**8, 64, left=0.95 * indirect).light_paths == 0
 
 
-def priced(samples=64, **constants):
+def price_of_lights(samples=64, **constants):
     """Price of lights on surfaces that carry all of an image's noise but a tenth, with as many lights in any case."""
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
@@ -98,21 +103,21 @@ def priced(samples=64, **constants):
 def test_the_noise_of_lights_counts_in_their_price():
     """With the weight of noise that a denoiser leaves."""
     (none, plan), (usual, _), (heavy, _) = (
-        priced(light_variance=noise, shared=shared) for noise, shared in ((0.0, 1.0), (50.0, 1.0), (50.0, 4.0))
+        price_of_lights(light_variance=noise, shared=shared) for noise, shared in ((0.0, 1.0), (50.0, 1.0), (50.0, 4.0))
     )
     assert heavy - none == pytest.approx(4 * (usual - none)) and usual > 1.01 * none
-    assert plan.light_paths == 10**5 and priced(light_variance=5000.0)[1].light_paths == 0
+    assert plan.light_paths == 10**5 and price_of_lights(light_variance=5000.0)[1].light_paths == 0
     # It does not count in raw images
     assert MODEL.without_denoiser().noise_of_lights == 0
-    assert priced(light_variance=5000.0, shared=1.0, noise_of_lights=0.0)[0] == pytest.approx(none)
+    assert price_of_lights(light_variance=5000.0, shared=1.0, noise_of_lights=0.0)[0] == pytest.approx(none)
 
 
 def test_the_choice_of_lit_vertices_counts_in_the_price_unless_all_are_lit():
-    prices = [priced(vertex_variance=noise, least_vertices=1.0)[0] for noise in (0.03, 0.06)]
+    prices = [price_of_lights(vertex_variance=noise, least_vertices=1.0)[0] for noise in (0.03, 0.06)]
     assert prices[0] == prices[1]
     # An eighth of the vertices is lit
-    few = [priced(vertex_variance=noise, vertex_cost=1e6)[0] for noise in (0.03, 0.06)]
-    assert few[1] - few[0] == pytest.approx(few[0] - priced(vertex_variance=0.0, vertex_cost=1e6)[0])
+    few = [price_of_lights(vertex_variance=noise, vertex_cost=1e6)[0] for noise in (0.03, 0.06)]
+    assert few[1] - few[0] == pytest.approx(few[0] - price_of_lights(vertex_variance=0.0, vertex_cost=1e6)[0])
 
 
 @pytest.mark.parametrize("power", (0.2, 0.45, 1.0))
