@@ -9,6 +9,7 @@ import pytest
 
 import manylights
 from tests.support.many_emitters import bulbs, panels
+from tests.support.marks import stress
 from tests.support.rendering import render, render_with_statistics
 from tests.support.rooms import sunny, veiled_room
 from tests.support.scenes import area_light, closed_box, image, rgb, sensor, wall
@@ -166,7 +167,7 @@ MEMBERS = {
 
 
 @pytest.mark.usefixtures("lights_cost_nothing")
-@pytest.mark.parametrize("room", MEMBERS)
+@pytest.mark.parametrize("room", ["few emitters", *stress("many emitters")])
 def test_groups_are_the_images_of_their_emitters(room):
     describe, groups = ROOMS[room]
     description = describe()
@@ -193,7 +194,7 @@ def test_groups_are_the_images_of_their_emitters(room):
 
 
 @pytest.mark.usefixtures("lights_cost_nothing")
-@pytest.mark.parametrize("describe", [open_room, crowded_room])
+@pytest.mark.parametrize("describe", [open_room, *stress(crowded_room)])
 def test_lengths_are_differences_of_depths(describe):
     scene = mi.load_dict(describe())
 

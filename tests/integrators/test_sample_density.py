@@ -1,5 +1,6 @@
 """Passes of ``manylights`` whose pixels have different numbers of samples; channels with every second sample."""
 
+import itertools
 from dataclasses import replace
 
 import mitsuba as mi
@@ -130,8 +131,16 @@ def test_the_mean_of_every_pixel_is_that_of_equal_numbers(lights, parts):
     assert_same_mean_of_pixels(pair)
 
 
-@pytest.mark.parametrize(("parts", "rays_of_part"), [(1, None), (2, None), (1, SPP * WIDTH), *stress((2, SPP * WIDTH))])
-@with_and_without_lights
+DIVISIONS = list(itertools.product((1, 2), (None, SPP * WIDTH)))
+# What the quick run tests: lights and a divided image apart
+QUICK_SHARED = [(True, 1, None), (True, 2, None), (False, 1, None), (False, 1, SPP * WIDTH)]
+ALL_SHARED = [(lights, *division) for lights in (True, False) for division in DIVISIONS]
+
+
+@pytest.mark.parametrize(
+    ("lights", "parts", "rays_of_part"),
+    [*QUICK_SHARED, *stress(*(one for one in ALL_SHARED if one not in QUICK_SHARED))],
+)
 def test_passes_that_share_lattices_have_the_mean_of_equal_numbers(monkeypatch, lights, parts, rays_of_part):
     """And in their mean less noise than passes with lattices of their own, wherever the image is divided."""
     scene, integrator = room(), plugin(lights)

@@ -12,6 +12,7 @@ import pytest
 from tests.integrators.test_light_groups import LENGTHS, assert_sums, layers_of
 from tests.integrators.test_null_surfaces import sheets
 from tests.support.many_emitters import bulbs, panels
+from tests.support.marks import stress
 from tests.support.rendering import plugin_with_model, render, render_with_statistics
 from tests.support.scenes import area_light, closed_box, rgb, wall
 from tests.support.statistics import assert_same_mean
@@ -140,8 +141,12 @@ def four_samples(monkeypatch):
     monkeypatch.setattr(EmitterSamples, "numbers", lambda self, multiple: np.full(len(self.expected), 4, np.uint32))
 
 
-@pytest.mark.parametrize("lights", [False, True])
-@pytest.mark.parametrize("name", ["gloss", "points", "masks", "emitters"])
+ROOMS_AND_LIGHTS = list(itertools.product(["gloss", "points", "masks", "emitters"], [False, True]))
+# What the quick run tests
+QUICK = [("gloss", False), ("masks", True), ("emitters", True)]
+
+
+@pytest.mark.parametrize(("name", "lights"), [*QUICK, *stress(*(one for one in ROOMS_AND_LIGHTS if one not in QUICK))])
 def test_more_samples_keep_the_mean(name, lights, four_samples):
     constants = {"fixed_cost": 0.0, "fewest_light_paths": 2000} if lights else {}
     scene, depth = mi.load_dict(rooms()[name]), 4
