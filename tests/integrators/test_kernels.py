@@ -17,7 +17,7 @@ from vpl.core.registry import RegistryTable
 from vpl.lights.emitters import read_emitters
 from vpl.points.camera_paths import shape_in
 from vpl.split import surface_lights
-from vpl.split.emitters import base, learned
+from vpl.split.emitters import cell_emitters, irradiance
 
 MITSUBAS = 2  # one makes the camera's rays, one puts samples on the film; both hold the image's width
 SETTINGS = {"manylights": {}, "adaptivedirect": {}, "unoccludeddirect": {}}
@@ -135,7 +135,7 @@ def test_shapes_that_are_told_apart_are_in_no_kernel(compiled):
 
 def test_sites_and_lights_find_irradiance_by_one_kernel(monkeypatch, lights_cost_nothing):
     scene = mi.load_dict(closed_box({"lamp": area_light(), "other": area_light()}))
-    find, launched = base.irradiance_from_emitters, []
+    find, launched = irradiance.irradiance_from_emitters, []
 
     def watched(*arguments):
         dr.kernel_history_clear()
@@ -143,7 +143,7 @@ def test_sites_and_lights_find_irradiance_by_one_kernel(monkeypatch, lights_cost
         launched.append(max(dr.kernel_history(), key=lambda one: one.get("operation_count") or 0)["hash"])
         return found
 
-    monkeypatch.setattr(learned, "irradiance_from_emitters", watched)
+    monkeypatch.setattr(cell_emitters, "irradiance_from_emitters", watched)
     monkeypatch.setattr(surface_lights, "irradiance_from_emitters", watched)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         mi.render(scene, integrator=mi.load_dict({"type": "manylights", "max_depth": 4}), spp=64).numpy()

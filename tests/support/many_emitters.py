@@ -7,8 +7,8 @@ from tests.support.properties import unit_vectors
 from tests.support.scenes import rgb
 from vpl.core.arrays import upload_vectors
 from vpl.lights.emitters import read_emitters
-from vpl.split.emitters.base import Places
-from vpl.split.emitters.tree import TreeEmitters
+from vpl.split.emitters.irradiance import Places
+from vpl.split.emitters.tree_emitters import TreeEmitters
 
 
 def panels(number, rng):

@@ -17,8 +17,8 @@ The formula, in the order to read in:
 The terms of the estimator:
 
 - ``camera_rays``: camera rays of a view, traced to the ends of their paths
-- ``view``: camera rays, settings of their paths, streams of random numbers
-- ``path_state``: paths on their current edges, the surfaces that they hit, the result
+- ``view``: camera rays, streams of random numbers
+- ``path_state``: settings and edges of paths, the surfaces that they hit, the result
 - ``emitter_samples``: numbers of emitter samples at first scattering vertices
 - ``roulette``: Russian roulette and the choice of its probabilities
 - ``contributions``: sums of the contributions of paths, for the image and for its layers

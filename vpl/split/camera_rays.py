@@ -11,9 +11,10 @@ from ..core.sampling import derived_seed, independent_sampler
 from .contributions import LayerSums
 from .emitters.base import EmitterSampler
 from .lattice import Lattice
+from .path_state import FirstEdge, PathSettings
 from .path_tracer import Traced, trace_paths
 from .pixel_rays import RayNumbers
-from .view import FirstEdge, PathSettings, View
+from .view import View
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from .camera_rays import trace_camera_rays
 from .contributions import LayerSums
 from .gather_vertices import LitVertices
 from .line_hits import has_large_curves
+from .path_state import PathSettings
 from .path_tracer import Traced
 from .pilot import error_scale
 from .pixel_clusters import PixelClusters, light_clusters
@@ -33,7 +34,7 @@ from .roulette import best_multiple
 from .spread_light import spread
 from .start import Start, evidence_of
 from .surface_lights import KeptLights, surface_lights
-from .view import PathSettings, Stream, View, ViewLights
+from .view import Stream, View, ViewLights
 
 # Smallest and largest number of camera rays per part; the target is half of the image. Filling new memory of a process
 # is slow, which matters for small images. Dr.Jit records the kernels anew for each part, 15 to 100 ms by the number of

@@ -34,9 +34,8 @@ from .contributions import Contributions, LayerSums
 from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
 from .gather_vertices import Gathered, GatherVertices, SecondVertices
 from .lattice import Lattice
-from .path_state import Hit, Path, Traced, Vertex
+from .path_state import FirstEdge, Gathering, Hit, Path, PathSettings, State, Traced, Vertex
 from .roulette import residual_survival, throughput_survival
-from .view import FirstEdge, Gathering, PathSettings, State
 
 
 @recorded_once

@@ -17,9 +17,10 @@ from .camera_rays import trace_camera_rays
 from .cost_model import CostModel
 from .gather_vertices import GatherVertices, SecondVertices
 from .line_sampling import LineSampler
+from .path_state import Gathering
 from .path_tracer import Traced
 from .roulette import OutgoingRadiance
-from .view import Gathering, Stream, View, ViewLights
+from .view import Stream, View, ViewLights
 
 # Emitter samples at the first scattering vertex of a path of the pilot: two tell how much they differ
 PILOT_SAMPLES = 2

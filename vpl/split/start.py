@@ -20,9 +20,10 @@ from .emitter_samples import EmitterSamples, retained_fraction
 from .emitters.base import EmitterSampler
 from .emitters.cell_choice import learning_rays
 from .local_c import LocalC
+from .path_state import Gathering
 from .pilot import PILOT_SAMPLES, Pilot, kept_of_both, pilot_lanes, relative_errors, single_sample_radiance
 from .plan import Evidence, Option
-from .view import Gathering, Stream, View, ViewLights
+from .view import Stream, View, ViewLights
 
 
 @dataclass(frozen=True)

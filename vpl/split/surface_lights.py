@@ -23,14 +23,16 @@ from ..core.parameters import fingerprint_without_camera
 from ..core.sampling import derived_seed, independent_sampler
 from ..lights.light_set import ScatteredGroup
 from ..lights.virtual_lights import VirtualLights
-from .emitters.base import EmitterSampler, Places, irradiance_from_emitters
+from .emitters.base import EmitterSampler
+from .emitters.irradiance import Places, irradiance_from_emitters
 from .lattice import Lattice
 from .line_hits import LineHits, hits_of
 from .line_sampling import LineSampler
 from .local_c import LocalC
+from .path_state import FirstEdge, Gathering, PathSettings, State
 from .path_tracer import trace_paths
 from .roulette import OutgoingRadiance
-from .view import FirstEdge, Gathering, PathSettings, State, Stream, View, ViewLights
+from .view import Stream, View, ViewLights
 
 # Emitter samples of a light in scenes of many emitters: with one, a light near a lamp was a bright blotch
 _EMITTER_SAMPLES = 4

@@ -1,4 +1,4 @@
-"""View: the camera rays of one image or pass, the virtual lights, and the path settings."""
+"""View: the camera rays of one image or pass, and the virtual lights."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import ones, upload_limit
+from ..core.arrays import upload_limit
 from ..core.materials import Materials
 from ..lights.light_set import LightGroup, LightSet
 from .contributions import Layers
 from .cost_model import CostModel
 from .emitters.base import EmitterSampler
 from .local_c import LocalC
+from .path_state import Gathering, PathSettings
 from .pixel_rays import PixelRays
 from .roulette import OutgoingRadiance
 
@@ -37,25 +38,6 @@ class Stream(IntEnum):
     STRATA = 10
 
 
-class State:
-    """Position of a path relative to its first gather vertex x1: plain integers, for comparison with Dr.Jit arrays."""
-
-    SEEKING = 1  # before x1
-    CONNECTING = 2  # on the edge from a gather vertex to the next vertex
-    PAST = 3  # on any other edge
-
-
-class Gathering:
-    """Vertices where irradiance from virtual lights is gathered, by the last state in which a minorant is evaluated."""
-
-    NOWHERE = 0
-    AT_FIRST = State.CONNECTING
-    EVERYWHERE = State.PAST
-    # Virtual lights are placed at the first vertices, also where the shading normal faces away: the density of lights
-    # does not depend on the shading normal
-    PLACING = State.PAST + 1
-
-
 @dataclass(frozen=True)
 class PathRules:
     """Parameters of Mitsuba's ``path``: ``max_depth`` (edges, may be infinite), ``rr_depth``, ``hide_emitters``."""
@@ -63,91 +45,6 @@ class PathRules:
     max_depth: float
     rr_depth: int
     hide_emitters: bool
-
-
-@dataclass
-class PathSettings:
-    """Settings of :func:`trace_paths`, opaque on the device unless stated.
-
-    ``max_depth``, ``rr_depth``: as in ``path``; ``c``: of lights on surfaces; ``gathering``: a :class:`Gathering`;
-    ``emitters_carried``: whether virtual lights represent emitters, with ``emitters_squared_c``; ``outgoing``: for
-    Russian roulette; ``with_minorant``: materials with a minorant; ``hide_emitters``: a Python bool.
-    """
-
-    max_depth: mi.UInt32
-    rr_depth: mi.UInt32
-    c: LocalC
-    gathering: mi.UInt32
-    emitters_carried: mi.Bool
-    emitters_squared_c: mi.Float
-    outgoing: OutgoingRadiance
-    with_minorant: Materials
-    hide_emitters: bool
-
-
-@dataclass
-class Edge:
-    """Edges of paths, one per lane.
-
-    ``vertex``: origin; ``ray``; ``throughput``: β; ``density`` of the direction, 1 / sr; ``delta``: whether the
-    direction has no density; ``state``: a :class:`State`; ``cell`` of the origin, see
-    :class:`vpl.split.emitters.base.EmitterSampler`; ``emitter_samples``: their number at the origin;
-    ``importance``: see :meth:`vpl.split.roulette.OutgoingRadiance.survival`; ``active``.
-    """
-
-    vertex: mi.Point3f
-    ray: mi.Ray3f
-    throughput: mi.UnpolarizedSpectrum
-    density: mi.Float
-    delta: mi.Bool
-    state: mi.UInt32
-    cell: mi.UInt32
-    emitter_samples: mi.UInt32
-    importance: mi.Float
-    active: mi.Bool
-
-
-@dataclass
-class FirstEdge(Edge):
-    """First edges of paths, evaluated; ``direct_samples``: number of emitter samples at the first scattering vertex."""
-
-    direct_samples: mi.UInt32
-
-    @classmethod
-    def of_camera(cls, ray, importance, active, direct_samples) -> FirstEdge:
-        """Rays without a surface at the origin, for example camera rays."""
-        density = dr.opaque(mi.Float, 1.0, dr.width(ray.d))
-        return cls.of(
-            ray.o, ray, ones(len(density)), density, True, State.SEEKING, mi.UInt32(0), importance, active,
-            direct_samples,
-        )  # fmt: skip
-
-    @classmethod
-    def of(
-        cls, vertex, ray, throughput, density, delta: bool, state: int, cell, importance, active, direct_samples
-    ) -> FirstEdge:  # fmt: skip
-        """Rays whose directions have a ``density``."""
-        count = dr.width(ray.d)
-        # Arrays of full width, opaque and distinct, give a single kernel for every use
-        wide = dr.opaque(mi.Float, 0.0, count)
-        limit, ray = ray.maxt + wide, mi.Ray3f(ray.o + wide, ray.d + wide, ray.time + wide)
-        ray.maxt = limit
-        active = mi.Bool(active) & dr.opaque(mi.Bool, True, count)
-        edge = cls(
-            vertex + dr.opaque(mi.Float, 0.0, count),
-            ray,
-            throughput,
-            density,
-            wide == (0 if delta else 1),
-            dr.full(mi.UInt32, state, count),
-            cell + dr.opaque(mi.UInt32, 0, count),
-            dr.full(mi.UInt32, 1, count),
-            importance + wide,
-            active,
-            direct_samples + dr.opaque(mi.UInt32, 0, count),
-        )
-        dr.make_opaque(edge)
-        return edge
 
 
 @dataclass(frozen=True)

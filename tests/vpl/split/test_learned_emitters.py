@@ -16,8 +16,8 @@ from vpl.cuts import traversal
 from vpl.lights.light_set import LightSet
 from vpl.split.camera_rays import trace_camera_rays
 from vpl.split.emitters import cell_choice
-from vpl.split.emitters.base import Irradiance
 from vpl.split.emitters.cell_choice import CellChoice
+from vpl.split.emitters.irradiance import Irradiance
 from vpl.split.emitters.learned import LearnedEmitters
 from vpl.split.gather_vertices import LitVertices
 from vpl.split.local_c import LocalC

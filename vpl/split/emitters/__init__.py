@@ -1,20 +1,24 @@
 """Emitter samplers: the choice of an emitter for next-event estimation, and the density.
 
-- ``base``: interface and results of samplers, the uniform sampler, irradiance by a sampler
+- ``base``: interface of the samplers, and their results
+- ``uniform``: Mitsuba's own choice
 - ``cell_choice``: learned probabilities of sources by spatial cell
 - ``arriving_power``: light of each source that arrives in each cell, from which they are learned
+- ``cell_emitters``: shared part of the samplers that learn by cell
 - ``learned``: emitters and regions of the environment, chosen by visibility from a pilot's vertices
 - ``emitter_tree``: tree over emitters, walked to draw one or to find the probability of one
-- ``tree``: many emitters, chosen through this tree
+- ``tree_emitters``: many emitters, chosen through this tree
+- ``irradiance``: irradiance that a sampler finds at places on surfaces
 """
 
 from __future__ import annotations
 
 from ...lights.emitter_groups import EmitterGroups
 from ...lights.emitters import read_emitters
-from .base import EmitterSampler, UniformEmitters
+from .base import EmitterSampler
 from .learned import LearnedEmitters
-from .tree import TreeEmitters
+from .tree_emitters import TreeEmitters
+from .uniform import UniformEmitters
 
 # With fewer emitters, occlusion matters more than distance, and the tree gains nothing over learned probabilities
 _FEWEST_IN_TREE = 64

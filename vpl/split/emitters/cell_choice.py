@@ -13,7 +13,7 @@ from ...core.arrays import download, upload, upload_vectors
 from ...core.sampling import RowChoice, derived_seed, independent_sampler
 from ..spatial_cells import SpatialCells
 from .arriving_power import RAYS, Looks, arriving_power
-from .base import Places
+from .irradiance import Places
 
 # Rays to learn by, as a fraction of the camera rays: learning may take a few percent of a render
 _LEARNING_SHARE = 0.25
@@ -94,8 +94,8 @@ class CellChoice:
     def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int, look: Callable) -> bool:
         """Learn from vertices (n, 3) with at most about ``rays`` rays; returns whether anything was learned.
 
-        ``look(places, cell, seed)``: :func:`vpl.split.emitters.base.irradiance_from_emitters` with a single sample
-        each.
+        ``look(places, cell, seed)``: :func:`vpl.split.emitters.irradiance.irradiance_from_emitters` with a single
+        sample each.
         """
         each = RAYS * self.count
         most = rays // each

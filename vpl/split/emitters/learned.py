@@ -8,8 +8,6 @@ samples the window.
 
 from __future__ import annotations
 
-from copy import copy
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -18,54 +16,15 @@ from ...core.arrays import download, finite_or_zero, upload
 from ...core.registry import RegistryTable
 from ...direct.environment_regions import regions_of
 from ...lights.emitter_groups import EmitterGroups
-from ...points.camera_paths import SceneTraits, scene_traits
-from .base import EmitterSample, MetEmitter, irradiance_from_emitters
+from ...points.camera_paths import scene_traits
+from .base import EmitterSample, MetEmitter
 from .cell_choice import CellChoice
+from .cell_emitters import CellEmitters
 
 # Regions of the environment; columns of the radiance table for building regions
 _REGIONS, _COLUMNS = 256, 512
 # Fraction of the samples with Mitsuba's probabilities: a cell may see emitters invisible from the pilot vertices
 _USUAL_SHARE = 0.2
-# Null surfaces on the way to an emitter, at most, while emitters are learned: a bound of the time. The veils of the
-# scene veils are 16
-_MOST = 32
-
-
-class CellEmitters:
-    """Shared part of the samplers with a :class:`CellChoice`; ``_scene``, ``choice``, ``groups``, ``traits``: set by
-    the subclass."""
-
-    learns_sky = False
-
-    choice: CellChoice
-    groups: EmitterGroups | None
-    traits: SceneTraits
-
-    def cell(self, position, facing):
-        """See :meth:`vpl.split.emitters.base.EmitterSampler.cell`."""
-        return self.choice.cell(position, facing)
-
-    def _group_met(self, si) -> mi.UInt32:
-        """Group of the emitter at the end of a ray, 0 without groups."""
-        return self.groups.met(si) if self.groups else mi.UInt32(0)
-
-    def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int) -> bool:
-        """See :meth:`vpl.split.emitters.base.EmitterSampler.learn`."""
-
-        def look(places, cell, seed: int):
-            return irradiance_from_emitters(self._scene, self, places, cell, 1, dr.opaque(mi.UInt32, _MOST), seed)
-
-        return self.choice.learn(position, normal, rays, seed, look)
-
-    def forget(self) -> None:
-        """See :meth:`vpl.split.emitters.base.EmitterSampler.forget`."""
-        self.choice.forget()
-
-    def copy(self):
-        """See :meth:`vpl.split.emitters.base.EmitterSampler.copy`."""
-        other = copy(self)
-        other.choice = copy(self.choice)
-        return other
 
 
 class LearnedEmitters(CellEmitters):

@@ -19,8 +19,8 @@ from ...points.camera_paths import emitted_towards, scene_traits
 from ..emitter_lights import EmitterLights, has_true_normals
 from .base import EmitterSample, MetEmitter
 from .cell_choice import CellChoice
+from .cell_emitters import CellEmitters
 from .emitter_tree import EmitterTree, Found
-from .learned import CellEmitters
 
 # Largest number of clusters; their number grows with the root of the rays to learn by, as does the number of cells
 _MOST_CLUSTERS, _CLUSTERS_BY_RAYS = 256, 0.25

@@ -1,0 +1,53 @@
+"""Mitsuba's own choice of an emitter."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ...core.arrays import finite_or_zero
+from ...lights.emitter_groups import EmitterGroups
+from ...points.camera_paths import scene_traits
+from .base import EmitterSample, MetEmitter
+
+
+class UniformEmitters:
+    """Mitsuba's own choice, of at most one emitter.  There is nothing to learn."""
+
+    lights, learns_sky = None, False
+
+    def __init__(self, scene, groups: EmitterGroups | None = None):
+        self._scene, self.groups, self.traits = scene, groups, scene_traits(scene)
+        emitters = scene.emitters()
+        self._group = dr.opaque(mi.UInt32, groups.number(emitters[0]) if groups and emitters else 0)
+
+    def cell(self, position, facing):
+        """The only cell."""
+        return mi.UInt32(0)
+
+    def sample(self, si, cell, chosen, member, place, active) -> EmitterSample:
+        """See :meth:`EmitterSampler.sample`."""
+        ds, weight = self._scene.sample_emitter_direction(si, place, False, active)
+        far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        ray = dr.select(far, si.spawn_ray(ds.d), si.spawn_ray_to(ds.p))
+        return EmitterSample(ds.d, finite_or_zero(mi.unpolarized_spectrum(weight)), ds.pdf, ds.delta, ray, self._group)
+
+    def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
+        """See :meth:`EmitterSampler.met`."""
+        origin = dr.zeros(mi.Interaction3f)
+        origin.p = vertex
+        ds = mi.DirectionSample3f(self._scene, si, origin)
+        density = self._scene.pdf_emitter_direction(origin, ds, active & has_density)
+        emitted = si.emitter(self._scene, active).eval(si, active)
+        return MetEmitter(finite_or_zero(mi.unpolarized_spectrum(emitted)) & active, density, self._group)
+
+    def learn(self, position, normal, rays: int, seed: int) -> bool:
+        """See :meth:`EmitterSampler.learn`."""
+        return False
+
+    def forget(self) -> None:
+        """See :meth:`EmitterSampler.forget`."""
+
+    def copy(self) -> UniformEmitters:
+        """See :meth:`EmitterSampler.copy`."""
+        return self
