@@ -30,7 +30,7 @@ from .traversal import LARGEST_STORE, Cuts, collect, several, traverse
 _PAIRS_PER_CHUNK = 1 << 22
 # Search for the threshold of a cut with limited size: first factor of the bracket, and number of bisections
 _BRACKET, _BISECTIONS = 4.0, 3
-# Error bound of the coarse cuts as a fraction of the image's mean
+# Error bound of the coarse cuts as a fraction of the image's mean: their radiance sets thresholds alone
 _ESTIMATE_ERROR = 0.05
 
 

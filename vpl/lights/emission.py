@@ -19,8 +19,11 @@ from .emitters import Emitters
 from .focus import Focus
 from .virtual_lights import VirtualLights, spot_falloff
 
+# Samples of the power of an emitter, which sets probabilities alone
+_SAMPLES = 4096
 
-def solid_angle_radiance(emitter, center, count: int = 4096) -> float:
+
+def solid_angle_radiance(emitter, center, count: int = _SAMPLES) -> float:
     """Integral of an emitter's radiance over all directions at ``center``, averaged over channels.
 
     ``count``: number of samples.
@@ -36,7 +39,7 @@ def other_power(emitter, bounding_sphere) -> float:
     """Power of any emitter, estimated by Mitsuba's sampling routines and averaged over channels."""
     if emitter.is_environment():
         return solid_angle_radiance(emitter, bounding_sphere.center) * np.pi * bounding_sphere.radius**2
-    sampler = independent_sampler(0, 4096)
+    sampler = independent_sampler(0, _SAMPLES)
     _, weight = emitter.sample_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
     return float(download(finite_or_zero(weight)).mean(dtype=np.float64))
 

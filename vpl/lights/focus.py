@@ -9,13 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Radius of the focus over the median distance of visible points from its centre
+# Radius of the focus over the median distance of visible points from its centre: twice the radius that holds a half
 _MARGIN = 2.0
-# Ratio of scene radius to focus radius from which a focus is used
+# Ratio of scene radius to focus radius from which a focus is used: below, at least a sixteenth of the rays that an
+# environment sends to the disk of the scene meets the focus
 _SCENE_TO_FOCUS = 4.0
-# Most lights and places whose distances are computed; number of nearest lights per place
+# Most lights and places whose distances are computed, two million in all; number of nearest lights per place
 _LIGHTS, _PLACES, _NEAREST = 8192, 256, 8
-# Quantile of the spacing over the places
+# Quantile of the spacing over the places: lights are densest where most of the light is
 _QUANTILE = 0.25
 
 

@@ -31,15 +31,15 @@ from .focus import Focus
 from .perturbed import Perturbed, Scattered, scatter_perturbed
 from .virtual_lights import VirtualLights
 
-# Pilot paths of each emitter sampler
+# Pilot paths of each emitter sampler; they set the numbers of its paths alone
 _PILOT_PATHS = 4096
 # Light paths traced at a time
 _LARGEST_WAVEFRONT = 1 << 20
 # Upper bound of emitted paths per wanted light, for scenes in which few paths store a light
 _MOST_PATHS_PER_LIGHT = 16
-# Fraction of the lights divided equally between the emitter samplers
+# Fraction of the lights divided equally between the emitter samplers: a pilot may miss the light of one
 _DEFENSIVE_SHARE = 0.05
-# Fraction of effective lights below which a warning is logged
+# Fraction of effective lights below which a warning is logged: 4000 of the usual 200 000
 _LEAST_EFFECTIVE = 0.02
 
 

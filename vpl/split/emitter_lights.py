@@ -25,7 +25,7 @@ from .cost_model import CostModel
 _SAME_NORMAL = 0.99999
 # Fraction of the points that are uniform over the emitters: around a dim emitter without points, c would be too small
 _UNIFORM_SHARE = 0.5
-# Least mean number of points on an area emitter that has power
+# Least mean number of points on an area emitter that has power: a spacing below the emitter's size
 _LEAST_POINTS = 4
 
 

@@ -28,7 +28,8 @@ _MOST_CLUSTERS, _CLUSTERS_BY_RAYS = 256, 0.25
 _ROOT_SHARE = 0.2
 # Fraction of the draws from the root that are uniform over the emitters: near emitters may be hidden or shine elsewhere
 _UNIFORM_SHARE = 0.1
-# Least fraction of the draws from the root for located emitters, and for distant emitters, in scenes with both
+# Least fraction of the draws from the root for located emitters, and for distant emitters, in scenes with both: the
+# unoccluded light of one kind does not tell what arrives of the other
 _LEAST_SHARE = 0.1
 
 
