@@ -296,6 +296,8 @@ def _compare(options, settings, command, runner):
     store = Runs(options.out, made_by | ({"workers": True} if options.workers else {}))
     progress = Progress(options.scenes, sweeps.order(settings, options.seeds))
     done = []
+    if options.workers:
+        runner.save = store.save
     comparisons = [SceneComparison(path, settings, options, store, progress, runner) for path in options.scenes]
     try:
         for comparison in comparisons:

@@ -1,6 +1,7 @@
 """Runs of a comparison on the workers of a pool; the counterpart of `comparison.worker`.
 
-A worker makes one run at a time, in a new process, as `comparison.worker` does. Images are returned as files.
+A worker makes one run at a time, in a new process, as `comparison.worker` does. Images are returned as files, written
+and saved as soon as a run is finished: runs may be finished long before their results are requested.
 """
 
 from collections import defaultdict
@@ -18,11 +19,13 @@ OWN = ("label", "scene", "output", "denoised_output", "vpl_folder", "kernel_cach
 
 
 class DistributedRuns:
-    """Runs that workers begin in advance, and whose results are then requested in sequence."""
+    """Runs that workers begin in advance, and whose results are then requested in sequence. `save` is called with each
+    successful result; set it before the first run."""
 
     def __init__(self, pool):
-        self._pool, self._waiting = pool, []
-        self._results = defaultdict(list)  # a list for each run, as two labels may share a run
+        self._pool, self._waiting, self.save = pool, [], lambda result: None
+        # Lists for each run, as two labels may share a run
+        self._jobs, self._results = defaultdict(list), defaultdict(list)
         pool.sources.append(self)
 
     def expect(self, job, scene_file):
@@ -30,6 +33,7 @@ class DistributedRuns:
         kernels = f"{scene_file.name}.{job.label}"
         arguments = (bundle(scene_file), job, None if job.cold else kernels)
         self._waiting.append(Task(self, job.run, worker.run_job, arguments))
+        self._jobs[job.run].append(job)
 
     def run(self, job, tick=lambda: None):
         """Return the result of an expected job, as `comparison.worker.run` does, with the dict `machine`, which names
@@ -37,18 +41,7 @@ class DistributedRuns:
         while not self._results[job.run]:
             self._pool.wait(TICK)
             tick()
-        found = self._results[job.run].pop(0)
-        own = {key: getattr(job, key) for key in OWN}
-        if isinstance(found, Exception):
-            return vars(job) | {"load_average": 0.0, "error": str(found), "traceback": ""}
-        result, files = found
-        try:
-            for key, content in files.items():
-                with replacing(Path(own[key])) as temporary:
-                    temporary.write_bytes(content)
-        except OSError as error:
-            return result | own | failure(error)
-        return result | own
+        return self._results[job.run].pop(0)
 
     # --- For the pool ---
 
@@ -57,9 +50,20 @@ class DistributedRuns:
         return self._waiting.pop(0) if self._waiting else None
 
     def done(self, run, result, address):
-        """Take the result of a run."""
+        """Write the images of a run, and save its result."""
+        job, (result, files) = self._jobs[run].pop(0), result
+        result |= {key: getattr(job, key) for key in OWN}
+        try:
+            for key, content in files.items():
+                with replacing(Path(result[key])) as temporary:
+                    temporary.write_bytes(content)
+            if "error" not in result:
+                self.save(result)
+        except OSError as error:
+            result |= failure(error)
         self._results[run].append(result)
 
     def failed(self, run, error):
         """Take the error of a failed run."""
-        self._results[run].append(error)
+        job = self._jobs[run].pop(0)
+        self._results[run].append(vars(job) | {"load_average": 0.0, "error": str(error), "traceback": ""})

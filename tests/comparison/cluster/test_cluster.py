@@ -461,8 +461,8 @@ def test_a_comparison_has_the_images_of_one_machine(two, tmp_path, capsys):
     assert compare.main([*command, "--reference", "vpl", "-o", str(tmp_path / "vpl"), "--workers", two]) == 2
 
 
-def test_the_same_run_by_two_labels_is_given_to_both():
-    """Both results may be there before the first is asked for."""
+def test_the_same_run_by_two_labels_is_given_to_both(tmp_path):
+    """Both results may be there before the first is asked for, and are written and saved by then."""
 
     class Workers:
         def __init__(self):
@@ -473,13 +473,17 @@ def test_the_same_run_by_two_labels_is_given_to_both():
             tasks = list(iter(lambda: source.next_task(0), None))
             assert tasks, "waits for ever"
             for task in tasks:
-                source.done(task.name, ({"label": "?"}, {}), "tcp://here")
+                source.done(task.name, ({"label": "?"}, {"output": b"image"}), "tcp://here")
 
-    found, file = runs.DistributedRuns(Workers()), SceneFile(CORNELL, TINY)
-    jobs = [Job(label, "path", CORNELL, f"{label}.exr", run="same") for label in "ab"]
+    found, file, saved = runs.DistributedRuns(Workers()), SceneFile(CORNELL, TINY), []
+    found.save = saved.append
+    jobs = [Job(label, "path", CORNELL, str(tmp_path / f"{label}.exr"), run="same") for label in "ab"]
     for job in jobs:
         found.expect(job, file)
-    assert [found.run(job)["label"] for job in jobs] == ["a", "b"]
+    first = found.run(jobs[0])
+    assert [one["label"] for one in saved] == ["a", "b"] and first is saved[0]
+    assert all((tmp_path / f"{label}.exr").read_bytes() == b"image" for label in "ab")
+    assert found.run(jobs[1])["label"] == "b"
 
 
 # ---------------------- Many images ----------------------
