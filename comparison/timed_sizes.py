@@ -1,6 +1,9 @@
-"""Samples per pixel of the next pass of a render with a limit of time: passes take about two seconds, in parts ten.
+"""Samples per pixel of the next pass of a render with a limit of time: passes take two to five seconds, in parts ten.
 
-Passes in parts take long, as they can be stopped between parts, and large passes are the most efficient. Such a pass
+A pass takes a third of the time limit, from two to five seconds, or five times the time of its start: samples are
+stratified within a pass, and the start, such as recording kernels with the code of many shapes, is lost.
+
+Passes in parts take longer, as they can be stopped between parts, and large passes are the most efficient. Such a pass
 takes about ten seconds, or twice the time of its start, and the last pass up to twice that. With a time limit of ten
 seconds a render has a small pass, one of about half of the time, and one that fills the rest.
 
@@ -21,7 +24,8 @@ from typing import NamedTuple
 
 from .pass_sizes import PARTS, PROBE, USUAL, PassSizes, power_of_two
 
-PASS_SECONDS = 2.0
+# Of a pass: a fraction of the time limit, within limits; minimum ratio of its rest to its start
+PASS_SHARE, PASS_SECONDS, LONG_PASS_SECONDS, PASS_REST = 1 / 3, 2.0, 5.0, 4.0
 PART_SECONDS, LEAST_REST = 10.0, 1.0  # of a pass in parts; minimum ratio of its rest to its start, which has priority
 LEAST_GAIN = 1 / 16  # minimum size of a last pass with virtual lights, as a fraction of the intended size
 LIT = 2.0  # usual cost of a sample with virtual lights over that without, at most: small passes have no lights
@@ -214,10 +218,10 @@ class TimedSizes(PassSizes):
 
     def _wanted(self):
         """Return the intended seconds of a pass."""
-        if not self._in_parts:
-            return PASS_SECONDS
-        line = self._line()
-        return max(PART_SECONDS, (1 + LEAST_REST) * line[0]) if line else PART_SECONDS
+        line, rest = self._line(), LEAST_REST if self._in_parts else PASS_REST
+        usual = min(max(PASS_SHARE * self._time, PASS_SECONDS), LONG_PASS_SECONDS)
+        usual = PART_SECONDS if self._in_parts else usual
+        return max(usual, (1 + rest) * line[0]) if line else usual
 
     def _expected(self, size):
         """Return the expected seconds of a pass: those of an earlier pass of this size, or by `_line`, or, if that is

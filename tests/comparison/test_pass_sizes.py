@@ -8,7 +8,7 @@ import pytest
 
 from comparison.pass_sizes import PassSizes
 from comparison.single_pass import MAXIMUM_PASS_SAMPLES, Pass
-from comparison.timed_sizes import PASS_SECONDS, TimedSizes, _cost_of_sample, _costs_by_size
+from comparison.timed_sizes import LONG_PASS_SECONDS, PASS_SECONDS, TimedSizes, _cost_of_sample, _costs_by_size
 from vpl.core.stages import Stage
 
 SQUARE = 256 * 256
@@ -45,12 +45,26 @@ def test_samples_are_those_that_were_asked_for(spp, limits, each):
 
 @pytest.mark.parametrize("start", [0.0, 0.5])
 @pytest.mark.parametrize("each", [0.001, 0.02, 0.3])
-def test_passes_take_about_two_seconds_and_repeat(start, each):
-    passes, _ = render(SQUARE // 16, start, each, time=120)
+def test_passes_of_long_renders_take_about_five_seconds_and_repeat(start, each):
+    passes, _ = render(SQUARE // 16, start, each, time=240)
     usual, count = Counter(one.spp for one in passes).most_common(1)[0]
     assert count > 0.7 * len(passes)
-    assert passes[-2].seconds <= 1.5 * PASS_SECONDS
-    assert 2 * (start + each * usual) > PASS_SECONDS or usual * SQUARE // 16 == MAXIMUM_PASS_SAMPLES
+    seconds = start + each * usual
+    assert seconds <= 2 * LONG_PASS_SECONDS
+    assert 2 * seconds > LONG_PASS_SECONDS or usual * SQUARE // 16 == MAXIMUM_PASS_SAMPLES
+
+
+@pytest.mark.parametrize(("time", "most"), [(4, PASS_SECONDS), (12, 4.0)])
+def test_passes_of_short_renders_take_a_third_of_the_time_and_at_least_two_seconds(time, most):
+    # The first pass takes three seconds more
+    passes, _ = render(SQUARE // 16, 0.0, 0.02, time=time + 3)
+    longest = max(one.seconds for one in passes[1:])
+    assert most / 2 < longest <= 1.5 * most
+
+
+def test_passes_that_take_long_to_start_are_longer():
+    passes, _ = render(SQUARE // 16, 2.0, 0.02, time=60)
+    assert max(one.seconds for one in passes) > 8 and sum(one.spp for one in passes) > 1800
     assert len({one.spp for one in passes if one.spp < 4}) == 0
 
 

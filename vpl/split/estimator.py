@@ -210,7 +210,8 @@ def _traced_part(
     clock.begin(Stage.CLUSTERS)
     seed = derived_seed(derived_seed(view.seed, Stream.GATHER, part.first), 0)
     gathered = traced.gathered
-    return traced, LitVertices.of(gathered.first, gathered.later, part.rays, plan.vertices, seed)
+    lit = LitVertices.of(gathered.first, gathered.later, part.rays, plan.vertices, seed, part.pixels[0])
+    return traced, lit
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ lit fractions, so the sum over lit vertices has the expectation of the sum over 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -16,8 +16,8 @@ import numpy as np
 
 from ..core.arrays import channel_mean, rgb_to_spectrum, select_record, spectrum_to_rgb, upload
 from ..core.loops import recorded_once
-from ..core.sampling import independent_sampler, precise_sample
-from .pixel_rays import PixelRays
+from ..core.sampling import HASH_ROUNDS, derived_seed, independent_sampler, precise_sample
+from .pixel_rays import PixelRays, RayNumbers
 
 # Values of a packed vertex: a cache line of 64 bytes
 _RECORD = 16
@@ -177,19 +177,22 @@ class LitVertices:
     alone: int
 
     @classmethod
-    def of(cls, first: GatherVertices, later: GatherVertices, rays: PixelRays, most: int, seed: int) -> LitVertices:
+    def of(
+        cls, first: GatherVertices, later: GatherVertices, rays: PixelRays, most: int, seed: int, before: int = 0
+    ) -> LitVertices:  # fmt: skip
         """Choose first vertices of every pixel with the camera ``rays``, and later vertices by weight: at most ``most``
-        first vertices of a pixel with the mean number of rays, and as large a fraction of those of the others."""
+        first vertices of a pixel with the mean number of rays, and as large a fraction of those of the others;
+        ``before``: number of pixels of the image before these."""
         kept = rays.lit(most)
         places = rays.places(dr.arange(mi.UInt32, rays.count))
         of_level = (np.array(values) for values in (rays.sizes, kept))
         number, lighted = (dr.gather(mi.UInt32, upload(mi.UInt32, x), places.level) for x in of_level)
         # The lanes that fill a packet hold zeros, by which processors do not divide
         number = dr.maximum(number, 1)
-        # Evenly among the samples of a pixel
-        lit = mi.UInt64(places.number) * mi.UInt64(lighted) % mi.UInt64(number) >= mi.UInt64(number - lighted)
+        of_image = replace(places, pixel=places.pixel + dr.opaque(mi.UInt32, before))
+        lit = _are_lit(of_image, number, lighted, dr.opaque(mi.UInt32, rays.cells), derived_seed(seed, 1))
         chosen = dr.compress(lit & (dr.max(dr.abs(first.weight)) > 0))
-        later_rays, factor = drawn_later(first, later, rays, most, seed)
+        later_rays, factor = drawn_later(first, later, rays, most, derived_seed(seed, 0))
         # A lit vertex represents the first vertices of its pixel
         stands_for = dr.gather(mi.Float, mi.Float(number) / mi.Float(lighted), chosen)
         picked = first.select(chosen, stands_for).and_then(later.select(later_rays, factor))
@@ -198,6 +201,25 @@ class LitVertices:
     @property
     def count(self) -> int:
         return len(self.rays)
+
+
+def _are_lit(places: RayNumbers, number: mi.UInt32, lighted: mi.UInt32, cells: mi.UInt32, seed: int) -> mi.Bool:
+    """Mask of the rays whose first vertices are lit: systematic sampling of ``lighted`` of the ``number`` rays of each
+    pixel, from a random start.
+
+    In the order of the sampling, the rays of a cell of the film follow each other, first those of one half
+    (:func:`vpl.split.pixel_rays.half_of`), then those of the other; the second half comes first in two of four cells,
+    the second and the third.  Cells and halves thus have about equal numbers of lit vertices, and no ray is preferred.
+    """
+    cell, turn = places.in_cells(cells)
+    each, is_second = number // cells, (turn & 1) == 1
+    comes_later = is_second ^ (((cell ^ (cell >> 1)) & 1) == 1)
+    of_first = (each + 1) // 2
+    before = dr.select(comes_later, dr.select(is_second, of_first, each - of_first), 0)
+    order = cell * each + before + turn // 2
+    start = dr.mul_hi(mi.sample_tea_32(places.pixel, dr.opaque(mi.UInt32, seed), HASH_ROUNDS)[0], number)
+    walked = mi.UInt64(order) * mi.UInt64(lighted) + mi.UInt64(start)
+    return walked % mi.UInt64(number) >= mi.UInt64(number - lighted)
 
 
 def drawn_later(
