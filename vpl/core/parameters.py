@@ -91,6 +91,8 @@ def _digest(node, known: dict) -> bytes:
             digest.update(_digest(value, known))
             continue
         value = value if cpptype is None else mi.get_property(value, cpptype, node)
+        # Mitsuba prints six digits of a transformation
+        value = getattr(value, "matrix", value)
         digest.update(np.ascontiguousarray(value).tobytes() if dr.is_array_v(value) else str(value).encode())
     known[node] = digest.digest()
     return known[node]

@@ -18,6 +18,7 @@ from ..core.arrays import LARGEST_VALUE, download, finite_or_zero, rgb_to_spectr
 from ..core.compilation import unrecorded
 from ..core.parameters import matrix_of, numbers, parameters_of
 from ..core.registry import RegistryTable
+from ..core.sampling import independent_sampler
 from ..core.shapes import registered_shapes
 from .spheres import SphereRows
 from .virtual_lights import VirtualLights
@@ -26,6 +27,8 @@ from .virtual_lights import VirtualLights
 SAMPLED_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
 # Time to record a call of one shape object, in calls of one shape by pointer
 _SHAPES_BY_POINTER = 4
+# Least and largest number of samples of a textured emitter along each axis: as many as texels, up to a million in all
+_GRID = 64, 1024
 
 
 @dataclass
@@ -152,11 +155,14 @@ def _frame_of(to_world):
 
 
 def _textured_radiance(emitter, shape) -> np.ndarray:
-    """Mean radiance of a textured area emitter, from a regular grid of surface samples."""
-    side = 64
-    u, v = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
-    sample = mi.Point2f(upload(mi.Float, u), upload(mi.Float, v))
-    position = shape.sample_position(0, sample)
+    """Mean radiance of a textured area emitter, from random surface samples in a grid as fine as its textures."""
+    shapes = [getattr(value, "shape", ()) for value in parameters_of(emitter).values()]
+    side = int(np.clip(max((max(one[:2]) for one in shapes if len(one) == 3), default=0), *_GRID))
+    cell, across = dr.arange(mi.UInt32, side * side), dr.opaque(mi.UInt32, side)
+    # At random in a cell: a regular grid may miss the bright texels of a regular texture
+    place = mi.Point2f(mi.Float(cell % across), mi.Float(cell // across))
+    place += independent_sampler(0, side * side).next_2d()
+    position = shape.sample_position(0, place / mi.Float(across))
     si = dr.zeros(mi.SurfaceInteraction3f, side * side)
     si.p, si.n, si.uv, si.wi = position.p, position.n, position.uv, mi.Vector3f(0, 0, 1)
     radiance = download(finite_or_zero(emitter.eval(si))).reshape(side * side, -1)

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from vpl.core.parameters import matrix_of, numbers, parameters_of
+from vpl.core.parameters import fingerprint_without_camera, matrix_of, numbers, parameters_of
 from vpl.lights.emitters import read_emitters
 
 NAMES = ("point", "spot", "directional", "constant", "sphere", "lamp", "mesh")
@@ -73,3 +73,13 @@ def test_a_mesh_attribute_as_radiance_is_refused_by_name():
     scene = mi.load_dict({"type": "scene", "glowing": mesh})
     with pytest.raises(ValueError, match=r"glowing.*mesh attribute.*not supported"):
         read_emitters(scene)
+
+
+@pytest.mark.parametrize("far", [0.0, 1e4, 1e6])
+def test_a_small_move_far_from_the_origin_changes_the_fingerprint(far):
+    def scene(x):
+        ball = {"type": "sphere", "to_world": mi.ScalarTransform4f().translate([x, 0, 0])}
+        return mi.load_dict({"type": "scene", "ball": ball})
+
+    one, same, moved = (fingerprint_without_camera(scene(x)) for x in (far, far, far + 1e-6 * max(far, 1.0)))
+    assert one == same != moved

@@ -1,5 +1,7 @@
 """Area emitters on shapes with a wrong density in Mitsuba: turned or textured spheres, smooth meshes."""
 
+import itertools
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -7,8 +9,9 @@ import pytest
 from tests.support.marks import stress
 from tests.support.rendering import render
 from tests.support.rooms import smooth_octahedron
-from tests.support.scenes import closed_box
+from tests.support.scenes import closed_box, image
 from tests.support.statistics import assert_same_mean
+from vpl.lights.emitters import read_emitters
 
 # Plugins that find emitters in ways of their own, with light paths of two edges
 DIRECT = {
@@ -66,3 +69,14 @@ def test_a_mesh_with_vertex_normals_emits_to_the_side_of_its_shading_normals(met
         return render(scene, plugin, 256, seed, **more), render(scene, "direct", 256, seed, **bsdf_samples)
 
     assert_same_mean(pair, 8)
+
+
+@pytest.mark.parametrize("period", [16, 64])
+def test_the_power_of_a_regular_texture_is_found(period):
+    """A grid of samples as regular as the texture may meet dark texels alone."""
+    texels = np.zeros((1024, 1024, 3), np.float32)
+    for row, column in itertools.product(range(4), repeat=2):
+        texels[row::period, column::period] = 100.0
+    lamp = {"type": "rectangle", "emitter": {"type": "area", "radiance": image(texels)}}
+    (found,) = read_emitters(mi.load_dict({"type": "scene", "lamp": lamp})).area.radiance
+    np.testing.assert_allclose(found, texels.mean((0, 1)), rtol=0.1)
