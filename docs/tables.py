@@ -67,14 +67,12 @@ def sources(table):
 
 
 def origins(table):
-    """Last rows of a brief table: the equal error of each column; commits and vector width of its files."""
+    """Last rows of a brief table: the equal error of each column, and the commits of its files."""
     cells = []
     for column in table.columns:
         found = [result(name) for name in table.files[column.ratio.partition(".")[0]]]
-        commits = dict.fromkeys(f"`{one['commit']}`" for one in found)
-        widths = dict.fromkeys(f"{one['machine']['vector_width']:.0f}-wide" for one in found)
-        cells.append(", ".join([*commits, *widths]))
-    return [["equal error", *(column.measure for column in table.columns)], ["commit, vectors", *cells]]
+        cells.append(", ".join(dict.fromkeys(f"`{one['commit']}`" for one in found)))
+    return [["equal error", *(column.measure for column in table.columns)], ["commit", *cells]]
 
 
 def source(name):
