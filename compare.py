@@ -257,6 +257,8 @@ def run(options, command):
     command_line.set_variant(options.mode)
     settings = chosen_settings(options)
     check_scenes(options.scenes, options.reference)
+    if options.sampler:
+        command_line.check_sampler(options.sampler)
     if options.workers and options.reference.kind == "vpl":
         raise UsageError(
             "--reference vpl shares files between runs and is incompatible with --workers; choose another reference"

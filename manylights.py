@@ -10,10 +10,11 @@ Variants that the integrator does not support are refused.
 
 The first limit that is reached ends an image: --spp samples per pixel, --time seconds, or a relative standard error of
 at most --error in 95% of the pixels. The command prints the limit, and warns if an --error was not reached. With
---time, passes take about two seconds, or about ten if starting a pass is slow. The average of the passes is written
-about every ten seconds, at the end, and after Ctrl-C. The first pass has the seed --seed, pass k a hash of the seed and
-k. An EXR file has all channels, and metadata about the render; a PNG file is tone-mapped. With --denoise, FILE.exr is
-joined by FILE.denoised.exr, and a PNG file shows the denoised image.
+--time, passes take two to five seconds, or five times their start if that is longer; those of `manylights` take about
+ten. The average of the passes is written about every ten seconds, at the end, and after Ctrl-C. The first pass has the
+seed --seed, pass k a hash of the seed and k. An EXR file has all channels; a PNG file is tone-mapped; both have
+metadata about the render. With --denoise, FILE.exr is joined by FILE.denoised.exr, and a PNG file shows the denoised
+image.
 
 --workers renders passes on several processes or machines (docs/cluster.md). Several scenes, --frames with {frame} in
 the values of -D, and --sensor all make several images in turn; a failure is reported and does not stop the rest.

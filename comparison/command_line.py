@@ -104,12 +104,23 @@ def check_integrator(name):
     except RuntimeError as error:
         if "not found" not in str(error):
             return  # the integrator exists, and requires parameters
-        manager, folder = mi.PluginManager.instance(), Path(mi.__file__).parent / "plugins"
-        names = {file.stem for file in folder.iterdir()}
-        builtin = sorted(name for name in names if manager.plugin_type(name) == mi.ObjectType.Integrator)
+        builtin = ", ".join(_plugins_of_mitsuba(mi.ObjectType.Integrator))
         raise UsageError(
-            f"unknown integrator '{name}'; there are {', '.join(own_integrators())} and Mitsuba's {', '.join(builtin)}"
+            f"unknown integrator '{name}'; there are {', '.join(own_integrators())} and Mitsuba's {builtin}"
         ) from None
+
+
+def check_sampler(name):
+    """Raise UsageError with the list of samplers if none has the given name."""
+    known = _plugins_of_mitsuba(mi.ObjectType.Sampler)
+    if name not in known:
+        raise UsageError(f"unknown sampler '{name}'; there are {', '.join(known)}")
+
+
+def _plugins_of_mitsuba(kind):
+    """Return the sorted names of Mitsuba's plugins of an object type."""
+    manager, folder = mi.PluginManager.instance(), Path(mi.__file__).parent / "plugins"
+    return sorted(name for name in {file.stem for file in folder.iterdir()} if manager.plugin_type(name) == kind)
 
 
 def check_parameters(title, name, parameters):

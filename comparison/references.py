@@ -225,7 +225,9 @@ def main(arguments=None):
     parser.add_argument("--cache", type=Path, default=default_cache(), help="default: ~/.cache/manylights")
     parser.add_argument("--output", type=Path, required=True, help="EXR file")
     command_line.add_common_options(parser)
+    arguments = sys.argv[1:] if arguments is None else arguments
     options = parser.parse_args(arguments)
+    options.command = shlex.join(["python", "-m", "comparison.references", *arguments])
     kept = "the cache keeps the samples so far, and the same command goes on"
     return command_line.exit_status("references", lambda: _run(options), kept, options.verbose)
 
@@ -239,7 +241,7 @@ def _run(options):
         file.set_width(options.width)
     reference = path_traced(file, options.spp, options.cache)
     made = {key: value for key, value in reference.description.items() if key not in ("file", "generatedBy")}
-    made |= {"command": shlex.join(["python", "-m", "comparison.references", *sys.argv[1:]]), **command_line.versions()}
+    made |= {"command": options.command, **command_line.versions()}
     write(options.output, reference.image, reference.standard_error, made, half=True)
     return 0
 

@@ -81,7 +81,8 @@ def render(
 ) -> tuple[mi.TensorXf, Took]:
     """Render a scene in passes; return the image, a `mi.TensorXf` of shape (height, width, channels) as of `mi.render`,
     and the cost (`Took`). Without a limit of `time` the sizes of passes do not depend on the speed of the machine
-    (pass_sizes.py). With one, passes take two to five seconds, with `manylights` about ten, the last one up to twenty.
+    (pass_sizes.py). With one, passes take two to five seconds, or five times their start if that is longer; with
+    `manylights` about ten, the last one up to twenty.
 
     `scene`: a `mi.Scene`, or the path of a scene file. `integrator`: a `mi.Integrator` or the name of a plugin, by
     default the scene's. `sensor`: an index, or "all" for a list of (image, cost) over all sensors. The first limit that

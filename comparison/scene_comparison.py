@@ -28,6 +28,7 @@ class SceneComparison:
         self.path, self.settings, self.options = path, settings, options
         self._store, self._progress, self._runner = store, progress, runner
         self._reference, self.pictures = None, None
+        self._expected = set()  # runs and labels that were announced to a distributed runner
         self.result = {"scene": str(path), "name": short_name(path), "renders": []}
 
     def prepare(self):
@@ -49,6 +50,7 @@ class SceneComparison:
         for setting, seed in order(self.settings, self.options.seeds):
             job = self._job(setting, seed)
             if not (self.options.resume and self._store.find(job)):
+                self._expected.add((job.run, job.label))
                 self._runner.expect(job, SceneFile(self.path, dict(self.options.define)))
 
     def run(self):
@@ -158,12 +160,15 @@ class SceneComparison:
 
     def _render(self, setting, seed):
         job = self._job(setting, seed)
-        result = self._store.find(job) if self.options.resume else None
+        # An expected run may have been finished and saved since
+        looks = self.options.resume and (job.run, job.label) not in self._expected
+        result = self._store.find(job) if looks else None
         kept = result is not None
         self._progress.begin(self.path, setting)
         if not kept:
             result = self._runner.run(job, self._progress.tick)
-            self._keep(result)
+            if self._runner is worker:
+                self._keep(result)
         result |= {"setting": setting.name, "swept": setting.swept, "denoised": False}
         self._progress.end(kept)
         self.result["renders"].append(result)

@@ -112,9 +112,9 @@ class SceneFile:
     def set_sampler(self, name):
         """Replace the type of all samplers and keep their parameters; sensors without a sampler get one. Raises
         RuntimeError for an unknown plugin, ValueError for a plugin that is no sampler."""
-        self.changes.append(("set_sampler", (name,)))
         if not isinstance(mi.PluginManager.instance().create_object(mi.Properties(name)), mi.Sampler):
             raise ValueError(f"'{name}' is no sampler")
+        self.changes.append(("set_sampler", (name,)))
         for sampler in self._nodes(mi.ObjectType.Sampler):
             sampler.props.set_plugin_name(name)
         for sensor in self._nodes(mi.ObjectType.Sensor):

@@ -19,13 +19,14 @@ from .bands import fits_one_band, random_rays, render_in_bands
 from .gathering import CameraPass, GatheringIntegrator, add_statistics, whole_sum
 from .knobs import Depth, Fraction, Integer, Number, Words, knobs_of
 
-# Camera rays that estimate the mean radiance of an image rendered in bands
+# Camera rays that estimate the mean radiance of the surfaces that an image rendered in bands shows
 _LEVEL_RAYS = 4096
 
 
 @dataclass
 class Band:
-    """Band of rows: pixel layout, the image's mean radiance (``level``), and the band's ``time`` in seconds."""
+    """Band of rows: pixel layout, the mean radiance of the surfaces that are seen (``level``), and the band's ``time``
+    in seconds."""
 
     grid: PixelGrid
     level: float
@@ -44,8 +45,8 @@ class DirectLightIntegrator(GatheringIntegrator):
         ),
         Number(
             "dark_floor", DirectOptions.dark_floor,
-            "Smallest radiance in the error threshold, as a fraction of the image's mean: darker pixels reach about "
-            "the absolute error of a pixel with this radiance.",
+            "Smallest radiance in the error threshold, as a fraction of the mean over the surfaces that are seen: "
+            "darker pixels reach about the absolute error of a pixel with this radiance.",
             minimum=0,
         ),
         Integer(

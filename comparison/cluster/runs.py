@@ -24,8 +24,8 @@ class DistributedRuns:
 
     def __init__(self, pool):
         self._pool, self._waiting, self.save = pool, [], lambda result: None
-        # Lists for each run, as two labels may share a run
-        self._jobs, self._results = defaultdict(list), defaultdict(list)
+        # A list for each run, as two labels may share a run; results by run and label
+        self._jobs, self._results = defaultdict(list), {}
         pool.sources.append(self)
 
     def expect(self, job, scene_file):
@@ -38,10 +38,10 @@ class DistributedRuns:
     def run(self, job, tick=lambda: None):
         """Return the result of an expected job, as `comparison.worker.run` does, with the dict `machine`, which names
         the worker. Raises ClusterError without workers."""
-        while not self._results[job.run]:
+        while (job.run, job.label) not in self._results:
             self._pool.wait(TICK)
             tick()
-        return self._results[job.run].pop(0)
+        return self._results.pop((job.run, job.label))
 
     # --- For the pool ---
 
@@ -61,9 +61,9 @@ class DistributedRuns:
                 self.save(result)
         except OSError as error:
             result |= failure(error)
-        self._results[run].append(result)
+        self._results[run, job.label] = result
 
     def failed(self, run, error):
         """Take the error of a failed run."""
         job = self._jobs[run].pop(0)
-        self._results[run].append(vars(job) | {"load_average": 0.0, "error": str(error), "traceback": ""})
+        self._results[run, job.label] = vars(job) | {"load_average": 0.0, "error": str(error), "traceback": ""}

@@ -113,13 +113,15 @@ def test_every_sensor_gets_the_sampler(tmp_path):
         file.set_sampler("path")
 
 
-def test_all_images_have_the_sampler_of_the_option(tmp_path):
+def test_all_images_have_the_sampler_of_the_option(tmp_path, capsys):
     common = [CORNELL, "-i", "path", "-D", "resx=8", "-D", "resy=8", "--spp", "7", "-r", "path:16"]
     assert compare.main([*common, "--sampler", "multijitter", "-o", str(tmp_path)]) == 0
     (scene,) = json.loads((tmp_path / "results.json").read_text())["scenes"]
     # Mitsuba rounds the samples of this sampler
     assert scene["sampler"] == "multijitter" and scene["renders"][0]["spp"] == 8
-    assert compare.main([*common, "--sampler", "gaussian", "-o", str(tmp_path)]) == 1
+    for name in ("gaussian", "nosuch"):
+        assert compare.main([*common, "--sampler", name, "-o", str(tmp_path)]) == 2
+        assert f"unknown sampler '{name}'; there are independent, " in capsys.readouterr().err
 
 
 # --- Passes ---

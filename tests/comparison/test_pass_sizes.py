@@ -54,12 +54,14 @@ def test_passes_of_long_renders_take_about_five_seconds_and_repeat(start, each):
     assert 2 * seconds > LONG_PASS_SECONDS or usual * SQUARE // 16 == MAXIMUM_PASS_SAMPLES
 
 
-@pytest.mark.parametrize(("time", "most"), [(4, PASS_SECONDS), (12, 4.0)])
-def test_passes_of_short_renders_take_a_third_of_the_time_and_at_least_two_seconds(time, most):
+@pytest.mark.parametrize(("time", "wanted"), [(3, PASS_SECONDS), (12, 4.0), (60, LONG_PASS_SECONDS)])
+def test_passes_are_intended_to_take_a_third_of_the_time_within_limits(time, wanted):
+    sizes = TimedSizes(SQUARE // 16, time)
+    assert sizes._wanted() == wanted
     # The first pass takes three seconds more
     passes, _ = render(SQUARE // 16, 0.0, 0.02, time=time + 3)
-    longest = max(one.seconds for one in passes[1:])
-    assert most / 2 < longest <= 1.5 * most
+    # Sizes are powers of two
+    assert max(one.seconds for one in passes) < 2 * max(wanted, 3.2)
 
 
 def test_passes_that_take_long_to_start_are_longer():

@@ -64,6 +64,21 @@ def test_sizes_and_samples_are_in_no_kernel(name, compiled, lights_cost_nothing)
     assert new(spp=6) <= MITSUBAS
 
 
+@pytest.mark.parametrize("name", ["lightcuts", *stress("manylights", "mdlightcuts")])
+def test_depths_are_in_no_kernel(name, compiled, lights_cost_nothing):
+    scene = mi.load_dict(closed_box({"lamp": area_light()}, 32))
+    more = {} if name == "manylights" else {"vpl_count": 500}
+
+    def rendered(depth):
+        image = mi.render(scene, integrator=mi.load_dict({"type": name, "max_depth": depth, **more}), spp=4, seed=1)
+        assert np.isfinite(np.array(image)).all() and np.array(image).max() > 0
+        return compiled()
+
+    assert rendered(4) > 0
+    # Beyond the depths that 32 bits count, too
+    assert [rendered(depth) for depth in (5, 2**33)] == [0, 0]
+
+
 def test_sizes_and_samples_are_in_no_kernel_of_many_emitters(compiled):
     """With another number of points on them for every size."""
     lamps = {f"lamp{i}": area_light() | {"to_world": turned(0.1 * i - 4)} for i in range(80)}

@@ -26,14 +26,14 @@ class UniformEmitters:
         return mi.UInt32(0)
 
     def sample(self, si, cell, chosen, member, place, active) -> EmitterSample:
-        """See :meth:`EmitterSampler.sample`."""
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.sample`."""
         ds, weight = self._scene.sample_emitter_direction(si, place, False, active)
         far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         ray = dr.select(far, si.spawn_ray(ds.d), si.spawn_ray_to(ds.p))
         return EmitterSample(ds.d, finite_or_zero(mi.unpolarized_spectrum(weight)), ds.pdf, ds.delta, ray, self._group)
 
     def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
-        """See :meth:`EmitterSampler.met`."""
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.met`."""
         origin = dr.zeros(mi.Interaction3f)
         origin.p = vertex
         ds = mi.DirectionSample3f(self._scene, si, origin)
@@ -42,12 +42,12 @@ class UniformEmitters:
         return MetEmitter(finite_or_zero(mi.unpolarized_spectrum(emitted)) & active, density, self._group)
 
     def learn(self, position, normal, rays: int, seed: int) -> bool:
-        """See :meth:`EmitterSampler.learn`."""
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.learn`."""
         return False
 
     def forget(self) -> None:
-        """See :meth:`EmitterSampler.forget`."""
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.forget`."""
 
     def copy(self) -> UniformEmitters:
-        """See :meth:`EmitterSampler.copy`."""
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.copy`."""
         return self
