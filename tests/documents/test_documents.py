@@ -48,7 +48,9 @@ def test_the_citation_in_readme_agrees_with_the_citation_file_and_the_package():
     (entry,) = re.findall(r"```bibtex\n(.*?)```", readme, re.DOTALL)
     fields = dict(re.findall(r"^  (\w+) = \{+(.*?)\}+,?$", entry, re.MULTILINE))
     listed = dict(re.findall(r'^([\w-]+): "?(.+?)"?$', citation, re.MULTILINE))
-    assert entry.startswith("@software{manylights,") and set(fields) == {"title", "author", "version", "license"}
+    assert entry.startswith("@software{manylights,")
+    assert set(fields) == {"title", "author", "version", "year", "license"}
+    assert fields["year"] in (ROOT / "LICENSE").read_text()
     assert (fields["title"], fields["version"], fields["license"]) == (
         listed["title"], listed["version"], listed["license"],
     )  # fmt: skip
