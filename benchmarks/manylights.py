@@ -147,21 +147,27 @@ def product_of(name: str, width: int, seconds: float, passes: int, view: int) ->
 def timed(names, width: int, seconds: float, passes: int) -> dict:
     """Print variance × time of images of equal time, and the ratio."""
     print(f"timed, {width} wide, {passes} images of {seconds:g} s; variance × time, with samples of an image")
-    rows = {}
-    for name in names:
-        scene = load(name, width)
-        rivals = [Whole(name, scene, "path", sampler, width, seconds) for sampler in SAMPLERS]
-        # manylights stratifies the samples of this sampler
-        rivals.append(Timed(scene, "manylights", "independent", seconds))
-        measure_in_turn(rivals, passes)
-        scale = scale_of(name, [image for rival in rivals for image in rival.images], width)
-        row, columns = outcome(best_of(rivals, scale), scale)
-        for rival in rivals[: len(SAMPLERS)]:
-            row[rival.sampler] = {"product": float(rival.product(scale)), "samples": rival.samples}
-        print(f"{name:18s}" + "".join(f"{column:>22s}" for column in columns) + f"{row['speedup']:8.2f}", flush=True)
-        rows[name] = row
+    rows = {name: timed_of(name, width, seconds, passes) for name in names}
     print_mean(rows)
     return rows
+
+
+def timed_of(name: str, width: int, seconds: float, passes: int) -> dict:
+    """Print variance × time of images of equal time of a scene; returns the row.
+
+    A function of its own, whose end frees the scene: kernels hold the code of all scenes that are alive.
+    """
+    scene = load(name, width)
+    rivals = [Whole(name, scene, "path", sampler, width, seconds) for sampler in SAMPLERS]
+    # manylights stratifies the samples of this sampler
+    rivals.append(Timed(scene, "manylights", "independent", seconds))
+    measure_in_turn(rivals, passes)
+    scale = scale_of(name, [image for rival in rivals for image in rival.images], width)
+    row, columns = outcome(best_of(rivals, scale), scale)
+    for rival in rivals[: len(SAMPLERS)]:
+        row[rival.sampler] = {"product": float(rival.product(scale)), "samples": rival.samples}
+    print(f"{name:18s}" + "".join(f"{column:>22s}" for column in columns) + f"{row['speedup']:8.2f}", flush=True)
+    return row
 
 
 def with_references(names: list[str]) -> list[str]:
