@@ -165,9 +165,7 @@ def parse_scene(options):
     "replaced", the name of the scene's integrator if the default replaces it, otherwise None. Raises UsageError for a
     missing scene, folder, variant, integrator or sensor."""
     command_line.check_scene(options.scene)
-    folder = batch.output(options, 0).absolute().parent
-    if not folder.is_dir():
-        raise UsageError(f"no folder '{folder}' for the output")
+    command_line.check_output(batch.output(options, 0))
     command_line.set_variant(options.mode)
     file = SceneFile(options.scene, dict(options.define))
     own, name = file.integrator[0], chosen_integrator(options.integrator, file)

@@ -110,6 +110,13 @@ def check_integrator(name):
         ) from None
 
 
+def check_output(file):
+    """Raise UsageError if the folder of an output file does not exist."""
+    folder = file.absolute().parent
+    if not folder.is_dir():
+        raise UsageError(f"no folder '{folder}' for the output")
+
+
 def check_sampler(name):
     """Raise UsageError with the list of samplers if none has the given name."""
     known = _plugins_of_mitsuba(mi.ObjectType.Sampler)

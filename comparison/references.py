@@ -233,8 +233,7 @@ def main(arguments=None):
 
 
 def _run(options):
-    if not options.output.absolute().parent.is_dir():
-        raise command_line.UsageError(f"no folder '{options.output.absolute().parent}' for the output")
+    command_line.check_output(options.output)
     command_line.set_variant(options.mode)
     file = SceneFile(options.scene, dict(options.define))
     if options.width:

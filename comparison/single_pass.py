@@ -20,6 +20,7 @@ MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the 
 MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
 # Stages of `manylights` with times that grow with the samples, by the parts of a predicted cost: paths, lights, cuts
 PER_SAMPLE = (Stage.TRACED,), (Stage.LIGHTS, Stage.TREE), (Stage.CLUSTERS, Stage.CUTS)
+LEAST_SECONDS = 1e-9  # below the resolution of the clock
 
 
 def pass_seed(seed, index):
@@ -40,10 +41,6 @@ def largest_pass(pixels, in_parts=False):
     """Return the maximum samples per pixel of a pass, at least 1: up to `MAXIMUM_PASS_SAMPLES` samples over all pixels,
     or `MORE_IN_PARTS` times as many for a pass in parts."""
     return max(1, (MORE_IN_PARTS if in_parts else 1) * MAXIMUM_PASS_SAMPLES // pixels)
-
-
-# Below the resolution of the clock
-LEAST_SECONDS = 1e-9
 
 
 @dataclass
@@ -73,8 +70,8 @@ class Pass:
         """Expected seconds of a sample of passes of other sizes, a list of (ratio of the sizes, seconds over those in
         this pass) by size; None if the integrator does not predict costs.
 
-        The seconds of each part of the cost grow with the predicted cost. A part that this pass lacks, such as virtual
-        lights, is compared with its paths.
+        The seconds of each part of the cost grow with the predicted cost. Where this pass has no virtual lights, the
+        seconds of its paths tell those of lights and cuts.
         """
         costs = self.statistics.get("costs")
         if not costs:

@@ -98,8 +98,7 @@ def _run(options):
         results = json.loads((options.folder / "results.json").read_text())
     except FileNotFoundError:
         raise UsageError(f"no results.json in '{options.folder}'") from None
-    if not options.output.absolute().parent.is_dir():
-        raise UsageError(f"no folder '{options.output.absolute().parent}' for the output")
+    command_line.check_output(options.output)
     command_line.set_variant(results["variant"])
     strips = []
     for name in options.scene or [None]:

@@ -219,8 +219,8 @@ class TimedSizes(PassSizes):
     def _wanted(self):
         """Return the intended seconds of a pass."""
         line, rest = self._line(), LEAST_REST if self._in_parts else PASS_REST
-        usual = min(max(PASS_SHARE * self._time, PASS_SECONDS), LONG_PASS_SECONDS)
-        usual = PART_SECONDS if self._in_parts else usual
+        whole = min(max(PASS_SHARE * self._time, PASS_SECONDS), LONG_PASS_SECONDS)
+        usual = PART_SECONDS if self._in_parts else whole
         return max(usual, (1 + rest) * line[0]) if line else usual
 
     def _expected(self, size):

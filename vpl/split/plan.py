@@ -239,7 +239,7 @@ def choose(evidence: Evidence, options: list[Option], measures: bool = True) -> 
             option.measure()
             product, plan = priced(evidence, option)
         found.append((product, plan))
-    product, best = min(found, key=lambda priced: priced[0])
+    product, best = min(found, key=lambda one: one[0])
     remains = (best.variance + best.of_lights) / max(evidence.whole, _TINY)
     if product > most:
         costs = f"virtual lights would cost {best.cost - 1:.2g} times as much as the paths"
