@@ -88,35 +88,37 @@ class LayerSums:
 class Contributions:
     """Contributions found by paths.
 
-    ``radiance``: sum; ``drawn``: a contribution, drawn in proportion to absolute value; ``length``: edges of the path
-    of ``drawn``; ``group``: of its emitter, see :class:`vpl.lights.emitter_groups.EmitterGroups`; ``level``: sum of
-    absolute values; ``sums`` by layer, or None.
+    ``radiance``: sum; ``drawn``: a contribution, drawn in proportion to absolute value, or None; ``length``: edges of
+    the path of ``drawn``; ``group``: of its emitter, see :class:`vpl.lights.emitter_groups.EmitterGroups`; ``level``:
+    sum of absolute values; ``sums`` by layer, or None.
     """
 
     radiance: mi.UnpolarizedSpectrum
-    drawn: mi.UnpolarizedSpectrum
+    drawn: mi.UnpolarizedSpectrum | None
     length: mi.UInt32
     group: mi.UInt32
     level: mi.Float
     sums: LayerSums | None
 
     @classmethod
-    def none(cls, count: int, sums: LayerSums | None = None) -> Contributions:
-        """No contribution yet."""
+    def none(cls, count: int, sums: LayerSums | None = None, draws: bool = True) -> Contributions:
+        """No contribution yet; ``draws``: whether one is drawn."""
         radiance, drawn = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UnpolarizedSpectrum, count)
-        return cls(radiance, drawn, mi.UInt32(0), mi.UInt32(0), mi.Float(0), sums)
+        return cls(radiance, drawn if draws else None, mi.UInt32(0), mi.UInt32(0), mi.Float(0), sums)
 
     def add(self, contribution, length, group, sample, lane=None) -> None:
         """Add the contribution of paths with ``length`` edges from emitters in ``group``.
 
-        ``sample``: a uniform number; ``lane``: numbers of the camera rays, if there are layers.
+        ``sample``: a uniform number, if a contribution is drawn; ``lane``: numbers of the camera rays, if there are
+        layers.
         """
         self.radiance += contribution
-        level = dr.sum(dr.abs(contribution))
-        taken = sample * (self.level + level) < level
-        self.drawn = dr.select(taken, contribution, self.drawn)
-        self.length, self.group = dr.select(taken, length, self.length), dr.select(taken, group, self.group)
-        self.level += level
+        if self.drawn is not None:
+            level = dr.sum(dr.abs(contribution))
+            taken = sample * (self.level + level) < level
+            self.drawn = dr.select(taken, contribution, self.drawn)
+            self.length, self.group = dr.select(taken, length, self.length), dr.select(taken, group, self.group)
+            self.level += level
         if self.sums is not None:
             self.sums.add(contribution, lane, length, group)
 

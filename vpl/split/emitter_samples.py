@@ -127,7 +127,9 @@ def retained_fraction(view: View) -> float:
     dr.eval(rays.places)
     settings = view.settings(ViewLights())
     traced = rays.trace(view.scene, view.emitters, derived_seed(view.seed, Stream.STRATA), settings)
-    difference, radiance = (finite(x).reshape(-1, _GROUP) for x in (traced.difference, channel_mean(traced.radiance)))
+    difference, radiance = (
+        finite(x).reshape(-1, _GROUP) for x in (traced.noise.difference, channel_mean(traced.radiance))
+    )
     relative = difference / error_scale(radiance.mean(1), view.model)[:, None]
     together, alone = np.sum(relative, axis=1) ** 2, np.sum(relative**2, axis=1)
     kept = np.argsort(together + alone)[: len(alone) - view.model.left_out(len(alone))]

@@ -154,7 +154,7 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
 
 def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Callable[[], bool], clock: Clock):
     """(Radiance, valid, layers, statistics) of the camera rays, traced in parts of whole pixels of about equal size."""
-    settings = view.settings(lights)
+    view, settings = _for_paths(view, lights)
     gatherer = Gatherer.of(view, lights, decision) if lights.all else None
     radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
     sums = view.layers.sums(view.count)
@@ -194,6 +194,15 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
     kept = finite & shown
     layers = {name: sums.of(name, kept) for name in view.layers.names}
     return dr.select(kept, radiance, 0), valid & shown, layers, statistics | {"dropped": dropped}
+
+
+def _for_paths(view: View, lights: ViewLights) -> tuple[View, PathSettings]:
+    """(View, settings of paths): plain paths in large images without virtual lights."""
+    settings = view.settings(lights)
+    if lights.all or view.count < view.model.plain_from:
+        return view, settings
+    several = int(dr.max(view.direct_samples)[0]) > 1
+    return replace(view, emitters=view.emitters.simplest()), replace(settings, plain=True, several=several)
 
 
 def _traced_part(

@@ -15,7 +15,8 @@ F1 from next-event estimation at x1 and from the emission at the next vertex.
 
 The loop in :func:`trace_paths` has one section per term: hit, emission, subtraction, Russian roulette, gather vertex,
 next-event estimation, BSDF sampling.  The kernel also finds the irradiance of virtual lights, by paths without
-subtraction, and the surfaces for placing virtual lights.
+subtraction, and the surfaces for placing virtual lights.  *Plain* paths are those of images without virtual lights:
+their kernel has no sections for virtual lights and no records for decisions.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from .contributions import Contributions, LayerSums
 from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
 from .gather_vertices import Gathered, GatherVertices, SecondVertices
 from .lattice import Lattice
-from .path_state import FirstEdge, Gathering, Hit, Path, PathSettings, State, Traced, Vertex
+from .path_state import FirstEdge, Gathering, Hit, Noise, Path, PathSettings, State, Traced, Vertex
 from .roulette import residual_survival, throughput_survival
 
 
@@ -49,44 +50,33 @@ def trace_paths(
     ``lattice``: numbers for the choice of emitter, point, lobe and direction at each vertex; ``sampler``: the remaining
     random numbers; ``sums`` by layer, for camera rays.
     """
-    count = dr.width(first.throughput)
-    path, found, gathered = Path.of(first), Contributions.none(count, sums), Gathered.none(count)
-    lane, seen, difference, alone_excess = dr.arange(mi.UInt32, count), mi.Float(0), mi.Float(0), mi.Float(0)
+    count, records = dr.width(first.throughput), not settings.plain
+    path, found = Path.of(first, settings), Contributions.none(count, sums, draws=records)
+    gathered, noise = (Gathered.none(count), Noise.none(count)) if records else (None, None)
+    lane = dr.arange(mi.UInt32, count)
 
     while dr.hint(path.active, exclude=[first, lattice, settings, emitters, lane]):
         # ---------------------- Hit ----------------------
         hit = Hit.of(scene, path, settings)
 
         # ---------------------- Emission, by BSDF sampling ----------------------
-        met = emitters.met(path.vertex, path.cell, path.ray, hit.si, ~path.delta, path.active & ~hit.hidden)
-        mis = power_heuristic(path.density, met.density * mi.Float(path.emitter_samples))
-        single = power_heuristic(path.density, met.density)
-        arrived = _less_carried(path, met, settings) * met.radiance
-        emission = arrived * mis
-        alone_excess += channel_mean(arrived) * (single - mis)
-        found.add(emission, path.depth + 1, met.group, sampler.next_1d(), lane)
-        seen += dr.select(path.depth == 0, channel_mean(emission), 0)
+        _add_emission(path, hit, emitters, settings, sampler, found, noise, lane)
 
         # ---------------------- Subtraction: w β F1 F2 of x2 ----------------------
-        connects = _carry(path, hit, settings, found.radiance, gathered)
+        connects = _carry(path, hit, settings, found.radiance, gathered) if records else mi.Bool(False)
 
         # ---------------------- Russian roulette: residual and expected contribution ----------------------
         _end_at_vertex(path, hit, connects, settings, sampler.next_1d())
 
         # ---------------------- Gather vertex, with the weight β F1 ----------------------
-        gathers, weight = _gather(path, hit, settings, gathered, sampler.next_1d())
-        hit.goes_on &= settings.gathering != Gathering.PLACING
-        hit.smooth &= hit.goes_on
+        gathers, weight = _gather(path, hit, settings, gathered, _draw(sampler, settings)) if records else (None, None)
 
         # ---------------------- Next-event estimation, with a sample of the BSDF ----------------------
         path.scattered += dr.select(hit.smooth, 1, 0)
         samples = dr.select(hit.smooth & (path.scattered == 1), first.direct_samples, 1)
         cell = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side)
         vertex = Vertex(hit, gathers, weight, cell, samples, lattice.at(path.depth))
-        turned, bsdf_weight, of_vertex, more = _sample_emitters(
-            scene, emitters, path, vertex, settings, sampler, found, lane
-        )
-        difference, alone_excess = difference + of_vertex, alone_excess + more
+        turned, bsdf_weight = _sample_emitters(scene, emitters, path, vertex, settings, sampler, found, noise, lane)
 
         # ---------------------- Onward by the sample of the BSDF ----------------------
         survival = _turn(path, vertex, turned, bsdf_weight, emitters.traits)
@@ -96,53 +86,83 @@ def trace_paths(
         if dr.hint(settings.hide_emitters, mode="scalar"):
             _pass_hidden(path, hit, first)
 
-    gathered.finish()
-    traced = Traced(
-        found.radiance, found.one, found.length, found.group, seen, difference, alone_excess, path.valid, path.depth,
-        gathered,
-    )  # fmt: skip
+    traced = Traced(found.radiance, path.valid, path.depth)
+    if dr.hint(records, mode="scalar"):
+        gathered.finish()
+        traced = Traced(
+            found.radiance, path.valid, path.depth, found.one, found.length, found.group, noise, gathered
+        )  # fmt: skip
     dr.eval(traced)
     return traced
+
+
+def _add_emission(
+    path: Path, hit: Hit, emitters: EmitterSampler, settings: PathSettings, sampler, found: Contributions,
+    noise: Noise | None, lane,
+) -> None:  # fmt: skip
+    """Add the light of emitters that paths hit to ``found``."""
+    met = emitters.met(path.vertex, path.cell, path.ray, hit.si, ~path.delta, path.active & ~hit.hidden)
+    mis = power_heuristic(path.density, met.density * mi.Float(path.emitter_samples))
+    arrived = _less_carried(path, met, settings) * met.radiance
+    found.add(arrived * mis, path.depth + 1, met.group, _draw(sampler, settings), lane)
+    if noise is not None:
+        single = power_heuristic(path.density, met.density)
+        noise.add_emission(channel_mean(arrived), mis, single, path.depth == 0)
 
 
 @dr.syntax
 def _sample_emitters(
     scene, emitters: EmitterSampler, path: Path, vertex: Vertex, settings: PathSettings, sampler, found: Contributions,
-    lane,
+    noise: Noise | None, lane,
 ):  # fmt: skip
-    """Add the light of emitters by the samples at each vertex to ``found``.
-
-    Returns (sample of the BSDF; its weight; parts of the vertex in ``difference`` and in ``alone_excess`` of
-    :class:`vpl.split.path_state.Traced`, 0 for a single sample).
-    """
-    count, hit, samples = dr.width(lane), vertex.hit, vertex.samples
-    # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
-    scatters, share = path.active & ~hit.hidden & (hit.goes_on | ~path.valid), dr.rcp(mi.Float(samples))
+    """Add the light of emitters by the samples at each vertex to ``found``; returns a sample of the BSDF and its
+    weight."""
+    count, samples = dr.width(lane), vertex.samples
     turned, bsdf_weight = dr.zeros(mi.BSDFSample3f, count), dr.zeros(mi.Spectrum, count)
-    number, edges = dr.zeros(mi.UInt32, count), path.depth + 2
-    difference, alone_excess = dr.zeros(mi.Float, count), dr.zeros(mi.Float, count)
-    while dr.hint(
-        number < samples,
-        exclude=[scene, emitters, path, vertex, hit, samples, settings, lane, scatters, share, edges],
-    ):
-        chosen, place, lobe, turn = _numbers_of_sample(vertex.numbers, number)
-        sample = emitters.sample(hit.si, vertex.cell, chosen, sampler.next_1d(), place, hit.smooth)
-        # A single call for both: each call adds the code of every material to the kernel
-        toward = hit.si.to_local(sample.direction)
-        value, density, turned, bsdf_weight = emitters.traits.materials.call(
-            hit.bsdf, _evaluated_and_sampled, hit.si, toward, lobe, turn, active=scatters
+    number = dr.zeros(mi.UInt32, count)
+    if dr.hint(settings.several, mode="scalar"):
+        while dr.hint(number < samples, exclude=[scene, emitters, path, vertex, samples, settings, lane]):
+            turned, bsdf_weight = _sample_emitter(
+                scene, emitters, path, vertex, number, settings, sampler, found, noise, lane
+            )
+            number += 1
+    else:
+        turned, bsdf_weight = _sample_emitter(
+            scene, emitters, path, vertex, number, settings, sampler, found, noise, lane
         )
-        lit, beyond, single = _lit(path, vertex, sample, toward.z, value, density, share, settings, sampler)
-        arriving, crossings = sample.arriving(
-            scene, emitters.traits, settings.max_depth - edges, dr.max(dr.abs(beyond)) > 0
-        )
-        lit = dr.select(crossings > 0, beyond, lit) * arriving
-        found.add(lit, edges + crossings, sample.group, sampler.next_1d(), lane)
-        level = channel_mean(lit)
-        difference += dr.select(samples > 1, dr.select((number & 1) == 0, level, -level), 0)
-        alone_excess += dr.select(number == 0, level * single, 0) - level
-        number += 1
-    return turned, bsdf_weight, difference, alone_excess
+    return turned, bsdf_weight
+
+
+def _sample_emitter(
+    scene, emitters: EmitterSampler, path: Path, vertex: Vertex, number: mi.UInt32, settings: PathSettings, sampler,
+    found: Contributions, noise: Noise | None, lane,
+):  # fmt: skip
+    """Add the light of emitters by the sample ``number`` at each vertex to ``found``; returns a sample of the BSDF and
+    its weight."""
+    hit, edges = vertex.hit, path.depth + 2
+    # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
+    scatters, share = path.active & ~hit.hidden & (hit.goes_on | ~path.valid), dr.rcp(mi.Float(vertex.samples))
+    chosen, place, lobe, turn = _numbers_of_sample(vertex.numbers, number) if settings.several else vertex.numbers
+    sample = emitters.sample(hit.si, vertex.cell, chosen, sampler.next_1d(), place, hit.smooth)
+    # A single call for both: each call adds the code of every material to the kernel
+    toward = hit.si.to_local(sample.direction)
+    value, density, turned, bsdf_weight = emitters.traits.materials.call(
+        hit.bsdf, _evaluated_and_sampled, hit.si, toward, lobe, turn, active=scatters
+    )
+    lit, beyond, single = _lit(path, vertex, sample, toward.z, value, density, share, settings, sampler)
+    arriving, crossings = sample.arriving(
+        scene, emitters.traits, settings.max_depth - edges, dr.max(dr.abs(beyond)) > 0
+    )
+    lit = dr.select(crossings > 0, beyond, lit) * arriving
+    found.add(lit, edges + crossings, sample.group, _draw(sampler, settings), lane)
+    if noise is not None:
+        noise.add_sample(channel_mean(lit), number, vertex.samples, single)
+    return turned, bsdf_weight
+
+
+def _draw(sampler, settings: PathSettings) -> mi.Float | None:
+    """A uniform number for drawing a contribution, None for plain paths."""
+    return None if settings.plain else sampler.next_1d()
 
 
 def _evaluated_and_sampled(bsdf, si, toward, lobe, turn, active):
@@ -165,7 +185,7 @@ def _numbers_of_sample(numbers: tuple, number: mi.UInt32) -> tuple:
 
 def _less_carried(path: Path, met: MetEmitter, settings: PathSettings):
     """β for emission on the path, minus w β F1 where a virtual light represents the emitter."""
-    if met.nearness is None:
+    if met.nearness is None or settings.plain:
         return path.throughput
     w = emitter_share(settings.emitters_squared_c, met.nearness, path.cosine)
     carried = settings.emitters_carried & (path.state == State.CONNECTING)
@@ -198,8 +218,10 @@ def _carry(path: Path, hit: Hit, settings: PathSettings, radiance, gathered: Gat
 
 def _end_at_vertex(path: Path, hit: Hit, connects, settings: PathSettings, sample) -> None:
     """Russian roulette by the residual and by the expected contribution of the residual."""
-    reflected = path.throughput * hit.minorant
-    residual = residual_survival(reflected - path.carried, reflected, connects & hit.is_diffuse)
+    residual = mi.Float(1)
+    if not settings.plain:
+        reflected = path.throughput * hit.minorant
+        residual = residual_survival(reflected - path.carried, reflected, connects & hit.is_diffuse)
     # Only after the first surface that counts in alpha: a path may pass masks before
     judged = hit.smooth & (path.scattered > 0) & path.valid
     facing = hit.si.sh_frame.n * hit.side
@@ -207,12 +229,12 @@ def _end_at_vertex(path: Path, hit: Hit, connects, settings: PathSettings, sampl
     survival = dr.select(judged, expected, residual)
     hit.goes_on &= sample < survival
     hit.smooth &= hit.goes_on
-    path.throughput /= survival
-    path.carried /= survival
+    path.boost(survival)
 
 
 def _gather(path: Path, hit: Hit, settings: PathSettings, gathered: Gathered, sample):
-    """Record gather vertices: (mask, weight β F1 minus the part carried to the vertex by virtual lights)."""
+    """Record gather vertices: (mask, weight β F1 minus the part carried to the vertex by virtual lights).  Where
+    virtual lights are placed, paths end at these vertices."""
     si, seeks = hit.si, hit.smooth & (path.state == State.SEEKING)
     gathers = seeks | (hit.smooth & (settings.gathering == Gathering.EVERYWHERE))
     gathers &= agrees(si, hit.side) | (settings.gathering == Gathering.PLACING)
@@ -221,6 +243,8 @@ def _gather(path: Path, hit: Hit, settings: PathSettings, gathered: Gathered, sa
     gathers &= dr.all(dr.abs(weight) <= LARGEST_VALUE)
     weight = dr.select(gathers, weight, 0)
     gathered.add(GatherVertices(si.p, si.sh_frame.n * hit.side, si.n, weight, path.depth + 1), seeks, sample)
+    hit.goes_on &= settings.gathering != Gathering.PLACING
+    hit.smooth &= hit.goes_on
     return gathers, weight
 
 
@@ -235,10 +259,11 @@ def _lit(
     over the number of samples.
     """
     hit, weight = vertex.hit, vertex.weight
-    full = path.throughput * mi.unpolarized_spectrum(value)
-    cosine = dr.select(height * hit.side > 0, dr.abs(height), 0)
-    value = beyond = full - path.carried * cosine
-    if sample.nearness is not None:
+    value = beyond = full = path.throughput * mi.unpolarized_spectrum(value)
+    if not settings.plain:
+        cosine = dr.select(height * hit.side > 0, dr.abs(height), 0)
+        value = beyond = full - path.carried * cosine
+    if sample.nearness is not None and not settings.plain:
         w = emitter_share(settings.emitters_squared_c, sample.nearness, cosine)
         value = value - dr.select(settings.emitters_carried, weight * (w * cosine), 0)
         # Few shadow rays where the residual is small
@@ -259,23 +284,14 @@ def _turn(path: Path, vertex: Vertex, bs, bsdf_weight, traits: SceneTraits):
     A path that passes a null surface keeps the vertex and the density of its direction: next-event estimation passes
     null surfaces as well.
     """
-    hit, gathers = vertex.hit, vertex.gathers
+    hit = vertex.hit
     full = path.throughput * mi.unpolarized_spectrum(bsdf_weight)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     # Like `path`, by the sampled direction, even if the path ends
     null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     path.valid |= path.active & hit.si.is_valid() & ~hit.hidden & ~null
-    path.cosine, path.eta = dr.abs(bs.wo.z), path.eta * bs.eta
-    # A Lambertian BSDF of value 1, times the cosine, over the density of the direction
-    lambertian = ~delta & (bs.wo.z * hit.side > 0) & (bs.pdf > 0)
-    lambertian = dr.select(lambertian, path.cosine / bs.pdf, 0)
-    path.throughput = full - path.carried * lambertian
-    # At diffuse surfaces the residual is the same in all directions, and has ended paths before
-    judged = (dr.max(dr.abs(path.carried)) > 0) & ~hit.is_diffuse
-    survival = residual_survival(path.throughput, full, judged)
-    path.carried = vertex.weight * lambertian
-    onward = dr.select(gathers & ~delta, mi.UInt32(State.CONNECTING), mi.UInt32(State.PAST))
-    path.state = dr.select((path.state == State.SEEKING) & ~gathers, mi.UInt32(State.SEEKING), onward)
+    path.throughput, path.eta = full, path.eta * bs.eta
+    survival = mi.Float(1) if path.carried is None else _carry_on(path, vertex, bs, delta)
     path.ray = hit.si.spawn_ray(dr.select(hit.hidden, path.ray.d, hit.si.to_world(bs.wo)))
     turns = mi.Bool(True)
     if traits.null:
@@ -288,14 +304,32 @@ def _turn(path: Path, vertex: Vertex, bs, bsdf_weight, traits: SceneTraits):
     return survival
 
 
+def _carry_on(path: Path, vertex: Vertex, bs, delta):
+    """Subtract the light that virtual lights carry from the throughput, and carry the weight of gather vertices on;
+    returns the survival probability by the residual."""
+    hit, gathers, full = vertex.hit, vertex.gathers, path.throughput
+    path.cosine = dr.abs(bs.wo.z)
+    # A Lambertian BSDF of value 1, times the cosine, over the density of the direction
+    lambertian = ~delta & (bs.wo.z * hit.side > 0) & (bs.pdf > 0)
+    lambertian = dr.select(lambertian, path.cosine / bs.pdf, 0)
+    path.throughput = full - path.carried * lambertian
+    # At diffuse surfaces the residual is the same in all directions, and has ended paths before
+    judged = (dr.max(dr.abs(path.carried)) > 0) & ~hit.is_diffuse
+    path.carried = vertex.weight * lambertian
+    onward = dr.select(gathers & ~delta, mi.UInt32(State.CONNECTING), mi.UInt32(State.PAST))
+    path.state = dr.select((path.state == State.SEEKING) & ~gathers, mi.UInt32(State.SEEKING), onward)
+    return residual_survival(path.throughput, full, judged)
+
+
 def _end_at_direction(path: Path, hit: Hit, survival, settings: PathSettings, sample) -> None:
     """Russian roulette by ``survival``, the residual of the direction, and by the throughput, as in ``path``."""
     # Even if the BSDF is 0, the minorant may need subtraction
-    largest = dr.maximum(dr.max(dr.abs(path.throughput)), dr.max(dr.abs(path.carried)))
+    largest = dr.max(dr.abs(path.throughput))
+    if path.carried is not None:
+        largest = dr.maximum(largest, dr.max(dr.abs(path.carried)))
     survival *= throughput_survival(largest, path.eta, path.depth >= settings.rr_depth)
     path.active = hit.goes_on & (largest > 0) & (sample < survival)
-    path.throughput /= survival
-    path.carried /= survival
+    path.boost(survival)
 
 
 def _pass_hidden(path: Path, hit: Hit, first: FirstEdge) -> None:
@@ -304,4 +338,5 @@ def _pass_hidden(path: Path, hit: Hit, first: FirstEdge) -> None:
     path.active |= passes
     path.throughput = dr.select(passes, first.throughput, path.throughput)
     path.delta, path.eta = path.delta | passes, dr.select(passes, 1, path.eta)
-    path.state = dr.select(passes, mi.UInt32(State.SEEKING), path.state)
+    if path.state is not None:
+        path.state = dr.select(passes, mi.UInt32(State.SEEKING), path.state)

@@ -91,9 +91,10 @@ class Pilot:
     @classmethod
     def of(cls, traced: Traced, view: View, pixel: np.ndarray) -> Pilot:
         """The pilot of traced paths in the pixels ``pixel`` (n,) of a view."""
-        radiance, seen, difference = single_sample_radiance(traced), finite(traced.seen), finite(traced.difference)
+        radiance, noise = single_sample_radiance(traced), traced.noise
+        seen, difference = finite(noise.seen), finite(noise.difference)
         both = finite(channel_mean(traced.radiance))
-        alone = both + finite(traced.alone_excess)
+        alone = both + finite(noise.alone_excess)
         edges = download(traced.edges).astype(np.int64)
         arrivals, onward, indirect = _second_vertices(traced.gathered.second, both, edges)
         first, facing = _first_vertices(traced.gathered.first)
@@ -169,7 +170,7 @@ def single_sample_radiance(traced: Traced) -> np.ndarray:
     The traced radiance is the mean of that with either sample, with the weights of two samples beside those of the
     BSDF.
     """
-    return finite(channel_mean(traced.radiance) + traced.difference)
+    return finite(channel_mean(traced.radiance) + traced.noise.difference)
 
 
 def finite(values: mi.Float) -> np.ndarray:

@@ -58,7 +58,7 @@ def test_images_that_are_denoised_need_lights_that_remove_more_variance():
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
     none = np.zeros(10_000)
-    for share, pays in ((0.0, True), (2.0, False)):
+    for share, pays in ((0.0, True), (1.5, False)):
         traced = share * direct + indirect
         evidence = Evidence(traced, UNSEEN, share * direct + none, np.ones(10_000), 10**8, 64, False, MODEL)
         option = [Option(True, False, traced, indirect)]

@@ -101,6 +101,10 @@ class EmitterSampler(Protocol):
         """Return to the probabilities before :meth:`learn`."""
         raise NotImplementedError
 
+    def simplest(self) -> EmitterSampler:
+        """A sampler with the same probabilities, in the smallest kernel."""
+        raise NotImplementedError
+
     def copy(self) -> EmitterSampler:
         """A sampler of the same emitters that learns independently."""
         raise NotImplementedError

@@ -62,7 +62,8 @@ class CellChoice:
     """Probabilities of sources by spatial cell; before :meth:`learn`, the same everywhere.
 
     ``usual`` (n,) float64: probabilities where nothing is known, with sum 1; ``share``: fraction of the samples drawn
-    by ``usual`` in every cell; ``ignored``: indices of sources without learning.
+    by ``usual`` in every cell; ``ignored``: indices of sources without learning.  ``has_learned``: whether cells have
+    probabilities of their own.
     """
 
     def __init__(self, usual: np.ndarray, share: float, ignored: np.ndarray):
@@ -87,7 +88,7 @@ class CellChoice:
 
     def forget(self) -> None:
         """Return to the usual probabilities everywhere."""
-        self._cells = SpatialCells.none()
+        self._cells, self.has_learned = SpatialCells.none(), False
         # Twice, because Dr.Jit compiles different kernels for arrays of a single entry
         self._use(np.stack([self._usual, self._usual]))
 
@@ -115,6 +116,7 @@ class CellChoice:
             self._learns = dr.opaque(mi.Bool, False)
         power = arriving_power(looks, self.count, self._cells.neighbours())
         self._use(self._shares(download(power).reshape(-1, self.count)))
+        self.has_learned = True
         return True
 
     def _look(self, vertices: _VerticesOfCells, first: int, cells: int, seed: int, look: Callable):

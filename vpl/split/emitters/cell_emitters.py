@@ -48,6 +48,10 @@ class CellEmitters:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.forget`."""
         self.choice.forget()
 
+    def simplest(self):
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.simplest`."""
+        return self
+
     def copy(self):
         """See :meth:`vpl.split.emitters.base.EmitterSampler.copy`."""
         other = copy(self)

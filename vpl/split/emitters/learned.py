@@ -17,9 +17,10 @@ from ...core.registry import RegistryTable
 from ...direct.environment_regions import regions_of
 from ...lights.emitter_groups import EmitterGroups
 from ...points.camera_paths import scene_traits
-from .base import EmitterSample, MetEmitter
+from .base import EmitterSample, EmitterSampler, MetEmitter
 from .cell_choice import CellChoice
 from .cell_emitters import CellEmitters
+from .uniform import UniformEmitters
 
 # Regions of the environment: with 1024, learning takes three seconds (decisions.md); columns of the radiance table for
 # building regions
@@ -68,6 +69,11 @@ class LearnedEmitters(CellEmitters):
             # directions, because the environment's samples are better stratified
             ignored[self._environment_number] = True
         self.choice = CellChoice(alike, _USUAL_SHARE, np.flatnonzero(ignored))
+
+    def simplest(self) -> EmitterSampler:
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.simplest`."""
+        # Mitsuba lists several emitters in an order that differs between loads of a scene
+        return self if self._count > 1 or self.choice.has_learned else UniformEmitters(self._scene, self.groups)
 
     def _draw(self, si, source, member, place, active) -> EmitterSample:
         """Sample a direction to each source."""

@@ -48,6 +48,10 @@ class UniformEmitters:
     def forget(self) -> None:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.forget`."""
 
+    def simplest(self) -> UniformEmitters:
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.simplest`."""
+        return self
+
     def copy(self) -> UniformEmitters:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.copy`."""
         return self
