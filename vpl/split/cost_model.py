@@ -197,17 +197,23 @@ class CostModel:
 
     # ---------------------- Decisions ----------------------
     pays_below: float = _constant(
-        0.9,
+        1.0,
         "ratio",
-        "Lights are used where variance × cost with them, noise of lights included, is below this multiple of that "
-        "without: the cost of a plain path.",
-        "32 samples: arcade 0.80, glossy 0.84, kitchen 0.93, bistro_interior 0.98, dining_room 1.00",
+        "Lights are used where variance × cost with lights, their noise included, is below this multiple of that "
+        "without.",
+        "definition",
+    )
+    plain_cost: float = _constant(
+        0.85,
+        "paths",
+        "Cost of a plain path: one of a large image without virtual lights.",
+        "32 samples: arcade 0.80, glossy 0.84, foliage 0.90",
     )
     plain_from: float = _constant(
-        1 << 20,
-        "camera rays",
+        1 << 18,
+        "camera rays per material",
         "From so many on, images without virtual lights have the kernel of plain paths.",
-        "a million take 0.3 to 2 s, of which it spares up to a fifth; compiling it takes 0.3 to 3 s, once",
+        "spares 0.1 to 0.2 s of a million rays; compiling it takes 0.15 s for each material, once",
     )
     denoised_power: float = _constant(
         0.45,

@@ -199,7 +199,7 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
 def _for_paths(view: View, lights: ViewLights) -> tuple[View, PathSettings]:
     """(View, settings of paths): plain paths in large images without virtual lights."""
     settings = view.settings(lights)
-    if lights.all or view.count < view.model.plain_from:
+    if lights.all or view.count < view.fewest_plain:
         return view, settings
     several = int(dr.max(view.direct_samples)[0]) > 1
     return replace(view, emitters=view.emitters.simplest()), replace(settings, plain=True, several=several)

@@ -9,6 +9,7 @@ has a power of the variance: what a denoiser leaves is in part made at edges, wh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -101,7 +102,7 @@ class Evidence:
     ``radiance`` (n,) of the pilot's paths, in pairs; ``seen`` (n,): emission on their first edges; ``direct`` (n,):
     without ``seen`` and the part available to lights on surfaces; ``brightness`` (n,) of the image nearby;
     ``emitters``: whether lights may represent many emitters; ``known``: results of :meth:`relative`, which passes with
-    the same pilot share.
+    the same pilot share; ``fewest_plain``: number of paths from which they are plain without lights.
     """
 
     radiance: np.ndarray
@@ -113,6 +114,7 @@ class Evidence:
     emitters: bool
     model: CostModel
     known: dict = field(default_factory=dict, repr=False, compare=False)
+    fewest_plain: float = math.inf
 
     @cached_property
     def whole(self) -> float:
@@ -254,7 +256,9 @@ def without_lights(reason: str) -> Plan:
 
 def _most_to_pay(evidence: Evidence) -> float:
     """Largest price of lights that pay: a multiple of the price of paths alone."""
-    return evidence.model.pays_below * evidence.whole**evidence.model.denoised_power
+    model = evidence.model
+    cost = model.plain_cost if evidence.paths >= evidence.fewest_plain else 1.0
+    return model.pays_below * cost * evidence.whole**model.denoised_power
 
 
 def priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:

@@ -110,6 +110,11 @@ class View:
         """Mean number of camera rays of a pixel."""
         return self.rays.mean
 
+    @property
+    def fewest_plain(self) -> float:
+        """Number of camera rays from which paths are plain, if there are no virtual lights."""
+        return self.model.plain_from * len(self.emitters.traits.materials.bsdfs)
+
     def groups(self, most: int, size: int) -> np.ndarray:
         """Indices of at most ``most`` rays in groups of ``size`` neighbours, evenly over the image; at least one
         group."""

@@ -58,12 +58,24 @@ def test_images_that_are_denoised_need_lights_that_remove_more_variance():
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
     none = np.zeros(10_000)
-    for share, pays in ((0.0, True), (1.5, False)):
+    for share, pays in ((0.0, True), (2.0, False)):
         traced = share * direct + indirect
         evidence = Evidence(traced, UNSEEN, share * direct + none, np.ones(10_000), 10**8, 64, False, MODEL)
         option = [Option(True, False, traced, indirect)]
         assert choose(evidence, option).light_paths > 0
         assert (choose(replace(evidence, model=DENOISED), option).light_paths > 0) == pays
+
+
+def test_lights_pay_less_often_where_paths_without_them_are_plain():
+    """The same lights pay beside other paths, and not beside plain ones."""
+    rng = np.random.default_rng(0)
+    indirect, direct = rng.exponential(size=(2, 10_000))
+    none, traced = np.zeros(10_000), 2.0 * direct + indirect
+    evidence = Evidence(traced, UNSEEN, 2.0 * direct + none, np.ones(10_000), 10**8, 64, False, MODEL)
+    assert price(evidence, Option(True, False, traced, indirect)) == pytest.approx(0.92 * evidence.whole, rel=0.05)
+    for fewest, pays in ((10**8 + 1, True), (10**8, False)):
+        plan = choose(replace(evidence, fewest_plain=fewest), [Option(True, False, traced, indirect)])
+        assert plan.gathers == pays
 
 
 def test_edges_of_emitters_in_a_pixel_are_less_noise_the_more_samples_there_are():
