@@ -6,6 +6,8 @@ The only module of ``vpl`` and ``integrators`` that names parameters and buffers
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -50,3 +52,28 @@ def _vertices(mesh, name: str, size: int) -> np.ndarray | None:
     """A parameter with ``size`` numbers per vertex, (vertices, ``size``) float64; None for a mesh without it."""
     values = parameters_of(mesh, below=False).get(name)
     return None if values is None else download(values).astype(np.float64).reshape(-1, size)
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """Triangles of a shape, float32 and uint32, world units.
+
+    ``faces`` (triangles, 3): indices of vertices; ``positions`` (vertices, 3); ``normals`` (vertices, 3) or None;
+    ``coordinates`` (vertices, 2) of textures, or None; ``flipped``: whether the sides of the surface are exchanged.
+    """
+
+    faces: np.ndarray
+    positions: np.ndarray
+    normals: np.ndarray | None
+    coordinates: np.ndarray | None
+    flipped: bool
+
+
+def triangles_of(shape) -> Triangles | None:
+    """The triangles of a mesh, rectangles included; None for other shapes."""
+    if not shape.is_mesh():
+        return None
+    normals = download(shape.vertex_normals_buffer()).reshape(-1, 3) if shape.has_vertex_normals() else None
+    coordinates = download(shape.vertex_texcoords_buffer()).reshape(-1, 2) if shape.has_vertex_texcoords() else None
+    positions = download(shape.vertex_positions_buffer()).reshape(-1, 3)
+    return Triangles(faces_of(shape), positions, normals, coordinates, shape.has_flipped_normals())

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import add_at, channel_mean, download, finite_or_zero, ones, upload, upload_limit
+from ..core.interactions import Interactions
 from ..core.materials import Materials
 from ..core.morton import morton_order
 from ..core.registry import RegistryTable
@@ -37,7 +38,7 @@ class SceneTraits:
     registry indices of shapes with bump or normal maps; ``open_shapes``: registry indices of shapes that transmit light
     unscattered, and of instances of groups with such shapes; ``open_scene``: a scene of the open shapes alone,
     None if there are none, if a group has one, and on CUDA, where a kernel can trace rays in one scene only;
-    ``materials`` of all surfaces; ``nearest_hits``: whether a shadow ray searches its nearest hit, as a path does.  On
+    ``materials`` of all surfaces; ``interactions`` of rays with surfaces; ``nearest_hits``: whether a shadow ray searches its nearest hit, as a path does.  On
     spheres of more than some hundred units, Mitsuba's test for any hit reports the surface at the origin of a ray more
     often.
     """
@@ -51,6 +52,7 @@ class SceneTraits:
     open_shapes: tuple[int, ...]
     open_scene: mi.Scene | None
     materials: Materials
+    interactions: Interactions
     nearest_hits: bool = False
 
     def is_null(self, hit):
@@ -140,7 +142,9 @@ def scene_traits(scene) -> SceneTraits:
     if open_shapes and not open_groups and dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
         open_scene = mi.load_dict({"type": "scene", **{f"open_{index}": one for index, one in open_shapes.items()}})
     listed = *open_shapes, *open_instances
-    return SceneTraits(*lobes, transmissive, perturbed_shapes(shapes), listed, open_scene, Materials.of(shapes))
+    return SceneTraits(
+        *lobes, transmissive, perturbed_shapes(shapes), listed, open_scene, Materials.of(shapes), Interactions(scene)
+    )  # fmt: skip
 
 
 def refuse_media(scene) -> None:
@@ -200,7 +204,7 @@ def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughpu
     """
     max_depth, rr_depth = path_settings
     if skip is None:
-        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 1, active=active)
+        si = traits.interactions.meet(scene, ray, depth == 1, active)
     else:
         si = skip(scene, ray, True, active).compute_surface_interaction(ray, mi.RayFlags.All, active)
     hit = active & si.is_valid()

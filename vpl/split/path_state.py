@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..core.arrays import ones
 from ..core.materials import Materials
+from ..points.camera_paths import SceneTraits
 from ..transport.minorant import is_diffuse, minorant_of, side_of
 from .gather_vertices import Gathered
 from .local_c import LocalC
@@ -189,9 +190,9 @@ class Hit:
     smooth: mi.Bool
 
     @classmethod
-    def of(cls, scene, path: Path, settings: PathSettings) -> Hit:
+    def of(cls, scene, traits: SceneTraits, path: Path, settings: PathSettings) -> Hit:
         """Intersect the rays with the scene."""
-        si = scene.ray_intersect(path.ray, mi.RayFlags.All, coherent=path.depth == 0, active=path.active)
+        si = traits.interactions.meet(scene, path.ray, path.depth == 0, path.active)
         bsdf, hidden = si.bsdf(path.ray), mi.Bool(False)
         if settings.hide_emitters:
             from_camera = path.active & (path.depth == 0)

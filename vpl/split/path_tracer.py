@@ -57,7 +57,7 @@ def trace_paths(
 
     while dr.hint(path.active, exclude=[first, lattice, settings, emitters, lane]):
         # ---------------------- Hit ----------------------
-        hit = Hit.of(scene, path, settings)
+        hit = Hit.of(scene, emitters.traits, path, settings)
 
         # ---------------------- Emission, by BSDF sampling ----------------------
         _add_emission(path, hit, emitters, settings, sampler, found, noise, lane)
