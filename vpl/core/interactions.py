@@ -21,8 +21,8 @@ from .shapes import registered_shapes
 
 # Bits of a triangle: its corners have normals, they have coordinates of textures, its sides are exchanged
 _SMOOTH, _MAPPED, _FLIPPED = 1, 2, 4
-# A switch has code of its own for each shape, some 50 operations, and a call by pointer records all shapes of the scene,
-# a third of a millisecond each: the switch serves few shapes among many (decisions.md)
+# A switch has code of its own for each shape, some 50 operations, and a call by pointer records all shapes of the
+# scene, a third of a millisecond each: the switch serves few shapes among many (decisions.md)
 _SWITCHED, _SWITCHED_SHARE = 8, 0.1
 
 
@@ -50,15 +50,16 @@ class Interactions:
         self._faces, self._corners = _packed(meshes)
 
     def meet(self, scene, ray: mi.Ray3f, coherent: mi.Bool, active: mi.Bool) -> mi.SurfaceInteraction3f:
-        """The nearest surface on each ray, with all that ``RayFlags.All`` stands for; ``coherent``: whether neighbouring
-        rays are alike."""
+        """The nearest surface on each ray, with the fields of ``RayFlags.All``; ``coherent``: whether neighbouring rays
+        are alike."""
         hit = scene.ray_intersect_preliminary(ray, coherent, active)
         active = active & hit.is_valid()
         number = self._first.at(hit.shape, active)
         on_mesh = number > 0
-        si = self._on_triangle(hit, number - 1 + hit.prim_index, on_mesh)
+        other = dr.zeros(mi.SurfaceInteraction3f)
         if self._others:
-            si = dr.select(on_mesh, si, self._on_others(ray, hit, active & ~on_mesh))
+            other = self._on_others(ray, hit, active & ~on_mesh)
+        si = dr.select(on_mesh, self._on_triangle(hit, number - 1 + hit.prim_index, on_mesh), other)
         si.t = dr.select(active, si.t, dr.inf)
         si.time, si.wavelengths = ray.time, ray.wavelengths
         si.initialize_sh_frame()
@@ -88,7 +89,7 @@ class Interactions:
 
         a, b, c = (mi.Point3f(record.xyz) for record in places)
         along, across = b - a, c - a
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(triangle))
+        si = dr.zeros(mi.SurfaceInteraction3f)
         si.t, si.p, si.shape, si.prim_index = hit.t, between(a, b, c), hit.shape, hit.prim_index
         flat = mi.Normal3f(dr.normalize(dr.cross(along, across)))
         facing = mi.Normal3f(dr.normalize(between(*(mi.Normal3f(record.xyz) for record in facings))))

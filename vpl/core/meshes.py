@@ -70,8 +70,8 @@ class Triangles:
 
 
 def triangles_of(shape) -> Triangles | None:
-    """The triangles of a mesh, rectangles included; None for other shapes."""
-    if not shape.is_mesh():
+    """The triangles of a mesh, rectangles included; None for other shapes, and for ellipsoids made of triangles."""
+    if not shape.is_mesh() or shape.is_ellipsoids():
         return None
     normals = download(shape.vertex_normals_buffer()).reshape(-1, 3) if shape.has_vertex_normals() else None
     coordinates = download(shape.vertex_texcoords_buffer()).reshape(-1, 2) if shape.has_vertex_texcoords() else None

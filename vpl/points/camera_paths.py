@@ -38,9 +38,9 @@ class SceneTraits:
     registry indices of shapes with bump or normal maps; ``open_shapes``: registry indices of shapes that transmit light
     unscattered, and of instances of groups with such shapes; ``open_scene``: a scene of the open shapes alone,
     None if there are none, if a group has one, and on CUDA, where a kernel can trace rays in one scene only;
-    ``materials`` of all surfaces; ``interactions`` of rays with surfaces; ``nearest_hits``: whether a shadow ray searches its nearest hit, as a path does.  On
-    spheres of more than some hundred units, Mitsuba's test for any hit reports the surface at the origin of a ray more
-    often.
+    ``materials`` of all surfaces; ``interactions`` of rays with surfaces; ``nearest_hits``: whether a shadow ray
+    searches its nearest hit, as a path does.  On spheres of more than some hundred units, Mitsuba's test for any hit
+    reports the surface at the origin of a ray more often.
     """
 
     delta: bool

@@ -53,8 +53,8 @@ class CameraRays:
         lattice: Lattice | None = None,
     ) -> Traced:  # fmt: skip
         """Trace paths from the camera; ``sums`` by layer; ``lattice``: None for one of these rays alone."""
-        edge = FirstEdge.plain if settings.plain else FirstEdge.of_camera
-        edge = edge(self.ray, self.importance, self.active, self.direct_samples)
+        of_rays = FirstEdge.plain if settings.plain else FirstEdge.of_camera
+        edge = of_rays(self.ray, self.importance, self.active, self.direct_samples)
         if lattice is None:
             lattice = Lattice(self.places, self.sizes, derived_seed(seed, 0), cells=self.cells)
         sampler = independent_sampler(derived_seed(seed, 1), dr.width(self.places.pixel))

@@ -88,23 +88,25 @@ class LayerSums:
 class Contributions:
     """Contributions found by paths.
 
-    ``radiance``: sum; ``drawn``: a contribution, drawn in proportion to absolute value, or None; ``length``: edges of
-    the path of ``drawn``; ``group``: of its emitter, see :class:`vpl.lights.emitter_groups.EmitterGroups`; ``level``:
-    sum of absolute values; ``sums`` by layer, or None.
+    ``radiance``: sum; ``drawn``: a contribution, drawn in proportion to absolute value; ``length``: edges of the path
+    of ``drawn``; ``group``: of its emitter, see :class:`vpl.lights.emitter_groups.EmitterGroups`; ``level``: sum of
+    absolute values; ``sums`` by layer, or None.  All but ``radiance`` and ``sums`` are None if none is drawn.
     """
 
     radiance: mi.UnpolarizedSpectrum
     drawn: mi.UnpolarizedSpectrum | None
-    length: mi.UInt32
-    group: mi.UInt32
-    level: mi.Float
+    length: mi.UInt32 | None
+    group: mi.UInt32 | None
+    level: mi.Float | None
     sums: LayerSums | None
 
     @classmethod
     def none(cls, count: int, sums: LayerSums | None = None, draws: bool = True) -> Contributions:
         """No contribution yet; ``draws``: whether one is drawn."""
-        radiance, drawn = dr.zeros(mi.UnpolarizedSpectrum, count), dr.zeros(mi.UnpolarizedSpectrum, count)
-        return cls(radiance, drawn if draws else None, mi.UInt32(0), mi.UInt32(0), mi.Float(0), sums)
+        radiance = dr.zeros(mi.UnpolarizedSpectrum, count)
+        if not draws:
+            return cls(radiance, None, None, None, None, sums)
+        return cls(radiance, mi.UnpolarizedSpectrum(radiance), mi.UInt32(0), mi.UInt32(0), mi.Float(0), sums)
 
     def add(self, contribution, length, group, sample, lane=None) -> None:
         """Add the contribution of paths with ``length`` edges from emitters in ``group``.

@@ -5,8 +5,8 @@ A pilot measures relative variances.  The constants predict cost and remaining v
 every machine.  ``benchmarks/cost_model.py`` halves and doubles each constant and prints the effect on variance × time.
 :func:`table` lists the constants.
 
-Costs are in units of one camera path without virtual lights.  A relative variance is the variance of one path over the
-squared brightness of the pixel.
+Costs are in units of one camera path without virtual lights that is not plain.  A relative variance is the variance of
+one path over the squared brightness of the pixel.
 """
 
 from __future__ import annotations
@@ -212,8 +212,9 @@ class CostModel:
     plain_from: float = _constant(
         1 << 18,
         "camera rays per material",
-        "From so many on, images without virtual lights have the kernel of plain paths.",
-        "spares 0.1 to 0.2 s of a million rays; compiling it takes 0.15 s for each material, once",
+        "From so many on, the paths of an image without virtual lights are plain.",
+        "spares 0.1 to 0.2 s of a million rays; compiling the kernel, once, takes 0.15 s for each material: as long as "
+        "three to six images spare",
     )
     denoised_power: float = _constant(
         0.45,
@@ -226,7 +227,7 @@ class CostModel:
         0.7,
         "exponent",
         "The same power where the number of emitter samples is chosen. Direct light is noise that a denoiser removes.",
-        "denoised error of images of 10 s (decisions.md)",
+        "between 0.45 and 1: images of 10 s, denoised error over that with one sample (decisions.md)",
     )
     emitter_samples_from: float = _constant(
         64,

@@ -154,7 +154,8 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
 
 def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Callable[[], bool], clock: Clock):
     """(Radiance, valid, layers, statistics) of the camera rays, traced in parts of whole pixels of about equal size."""
-    view, settings = _for_paths(view, lights)
+    is_plain = not lights.all and view.count >= view.plain_from
+    view, settings = _for_paths(view, lights, is_plain)
     gatherer = Gatherer.of(view, lights, decision) if lights.all else None
     radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)
     sums = view.layers.sums(view.count)
@@ -193,13 +194,13 @@ def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Ca
     shown = view.rules.max_depth > 0
     kept = finite & shown
     layers = {name: sums.of(name, kept) for name in view.layers.names}
-    return dr.select(kept, radiance, 0), valid & shown, layers, statistics | {"dropped": dropped}
+    return dr.select(kept, radiance, 0), valid & shown, layers, statistics | {"dropped": dropped, "plain": is_plain}
 
 
-def _for_paths(view: View, lights: ViewLights) -> tuple[View, PathSettings]:
-    """(View, settings of paths): plain paths in large images without virtual lights."""
+def _for_paths(view: View, lights: ViewLights, is_plain: bool) -> tuple[View, PathSettings]:
+    """(View, settings of paths); ``is_plain``: whether the paths are plain."""
     settings = view.settings(lights)
-    if lights.all or view.count < view.fewest_plain:
+    if not is_plain:
         return view, settings
     several = int(dr.max(view.direct_samples)[0]) > 1
     return replace(view, emitters=view.emitters.simplest()), replace(settings, plain=True, several=several)

@@ -43,9 +43,9 @@ class PathSettings:
     ``emitters_carried``: whether virtual lights represent emitters, with ``emitters_squared_c``; ``outgoing``: for
     Russian roulette; ``with_minorant``: materials with a minorant; ``hide_emitters``: a Python bool.
 
-    Two more Python bools make smaller kernels.  ``plain``: whether paths find only their radiance: virtual lights carry
-    nothing, and there are no records for decisions and lights.  ``several``: whether first scattering vertices may have
-    several emitter samples.
+    Two more Python bools make smaller kernels.  ``plain``: whether paths find only radiance and alpha: virtual lights
+    carry nothing, and there are no records for decisions and lights.  ``several``: whether first scattering vertices
+    may have several emitter samples.
     """
 
     max_depth: mi.UInt32
@@ -66,7 +66,7 @@ class Edge:
     """Edges of paths, one per lane.
 
     ``vertex``: origin; ``ray``; ``throughput``: β; ``density`` of the direction, 1 / sr; ``delta``: whether the
-    direction has no density; ``state``: a :class:`State`; ``cell`` of the origin, see
+    direction has no density; ``state``: a :class:`State`, None for plain paths; ``cell`` of the origin, see
     :class:`vpl.split.emitters.base.EmitterSampler`; ``emitter_samples``: their number at the origin;
     ``importance``: see :meth:`vpl.split.roulette.OutgoingRadiance.survival`; ``active``.
     """
@@ -76,7 +76,7 @@ class Edge:
     throughput: mi.UnpolarizedSpectrum
     density: mi.Float
     delta: mi.Bool
-    state: mi.UInt32
+    state: mi.UInt32 | None
     cell: mi.UInt32
     emitter_samples: mi.UInt32
     importance: mi.Float
@@ -93,10 +93,10 @@ class FirstEdge(Edge):
     def plain(cls, ray, importance, active, direct_samples) -> FirstEdge:
         """Camera rays of plain paths, whose kernel computes them: evaluated, they take a tenth of the time of a path
         in simple scenes."""
-        one, none = dr.ones(mi.UnpolarizedSpectrum, dr.width(ray.d)), mi.UInt32(0)
+        one = dr.ones(mi.UnpolarizedSpectrum, dr.width(ray.d))
         return cls(
-            mi.Point3f(ray.o), ray, one, mi.Float(1), mi.Bool(True), none, none, mi.UInt32(1), importance, active,
-            direct_samples,
+            mi.Point3f(ray.o), ray, one, mi.Float(1), mi.Bool(True), None, mi.UInt32(0), mi.UInt32(1), importance,
+            active, direct_samples,
         )  # fmt: skip
 
     @classmethod
@@ -141,8 +141,8 @@ class Path(Edge):
     """Paths on their current edges.
 
     ``depth``: edges before; ``eta``: as in ``path``; ``scattered``: number of scattering vertices; ``valid``: whether
-    the path met a surface counted in the film's alpha; ``carried``: β F1 before x2, w β F1 F2 at x2; ``cosine``: cosθ1.
-    Plain paths have neither of the last two, nor a ``state``.
+    the path met a surface counted in the film's alpha; ``carried``: β F1 before x2, w β F1 F2 at x2; ``cosine``: cosθ1;
+    the last two are None for plain paths.
     """
 
     depth: mi.UInt32
@@ -156,15 +156,13 @@ class Path(Edge):
     def of(cls, first: FirstEdge, settings: PathSettings) -> Path:
         """Paths on the first edges: copies, because the loop changes the arrays."""
         own = (getattr(first, field.name) for field in fields(Edge))
-        copies = (type(value)(value) for value in own)
+        copies = (None if value is None else type(value)(value) for value in own)
         path = cls(*copies, mi.UInt32(0), mi.Float(1), mi.UInt32(0), mi.Bool(False))
-        if settings.plain:
-            path.state = None
-        else:
+        if not settings.plain:
             path.carried, path.cosine = dr.zeros(mi.UnpolarizedSpectrum, dr.width(first.throughput)), mi.Float(1)
         return path
 
-    def boost(self, survival: mi.Float) -> None:
+    def divide_by(self, survival: mi.Float) -> None:
         """Divide the weights of paths by the probability of their survival."""
         self.throughput /= survival
         if self.carried is not None:
@@ -257,8 +255,8 @@ class Noise:
     def add_sample(self, level, number, samples, single) -> None:
         """Add the contribution ``level`` of the emitter sample ``number`` of so many ``samples`` at a vertex;
         ``single``: its weight as a single sample over that as one of several."""
-        several = dr.select((number & 1) == 0, level, -level)
-        self.difference += dr.select(samples > 1, several, 0)
+        signed = dr.select((number & 1) == 0, level, -level)
+        self.difference += dr.select(samples > 1, signed, 0)
         self.alone_excess += dr.select(number == 0, level * single, 0) - level
 
 

@@ -15,8 +15,8 @@ F1 from next-event estimation at x1 and from the emission at the next vertex.
 
 The loop in :func:`trace_paths` has one section per term: hit, emission, subtraction, Russian roulette, gather vertex,
 next-event estimation, BSDF sampling.  The kernel also finds the irradiance of virtual lights, by paths without
-subtraction, and the surfaces for placing virtual lights.  *Plain* paths are those of images without virtual lights:
-their kernel has no sections for virtual lights and no records for decisions.
+subtraction, and the surfaces for placing virtual lights.  *Plain* paths are those of large images without virtual
+lights: their kernel has no sections for virtual lights and no records for decisions.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def trace_paths(
 
         # ---------------------- Next-event estimation, with a sample of the BSDF ----------------------
         path.scattered += dr.select(hit.smooth, 1, 0)
-        samples = dr.select(hit.smooth & (path.scattered == 1), first.direct_samples, 1)
+        several = hit.smooth & (path.scattered == 1) & settings.several
+        samples = dr.select(several, first.direct_samples, 1)
         cell = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side)
         vertex = Vertex(hit, gathers, weight, cell, samples, lattice.at(path.depth))
         turned, bsdf_weight = _sample_emitters(scene, emitters, path, vertex, settings, sampler, found, noise, lane)
@@ -229,7 +230,7 @@ def _end_at_vertex(path: Path, hit: Hit, connects, settings: PathSettings, sampl
     survival = dr.select(judged, expected, residual)
     hit.goes_on &= sample < survival
     hit.smooth &= hit.goes_on
-    path.boost(survival)
+    path.divide_by(survival)
 
 
 def _gather(path: Path, hit: Hit, settings: PathSettings, gathered: Gathered, sample):
@@ -291,7 +292,7 @@ def _turn(path: Path, vertex: Vertex, bs, bsdf_weight, traits: SceneTraits):
     null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     path.valid |= path.active & hit.si.is_valid() & ~hit.hidden & ~null
     path.throughput, path.eta = full, path.eta * bs.eta
-    survival = mi.Float(1) if path.carried is None else _carry_on(path, vertex, bs, delta)
+    survival = mi.Float(1) if path.carried is None else _turn_carried(path, vertex, bs, delta)
     path.ray = hit.si.spawn_ray(dr.select(hit.hidden, path.ray.d, hit.si.to_world(bs.wo)))
     turns = mi.Bool(True)
     if traits.null:
@@ -304,7 +305,7 @@ def _turn(path: Path, vertex: Vertex, bs, bsdf_weight, traits: SceneTraits):
     return survival
 
 
-def _carry_on(path: Path, vertex: Vertex, bs, delta):
+def _turn_carried(path: Path, vertex: Vertex, bs, delta):
     """Subtract the light that virtual lights carry from the throughput, and carry the weight of gather vertices on;
     returns the survival probability by the residual."""
     hit, gathers, full = vertex.hit, vertex.gathers, path.throughput
@@ -323,13 +324,13 @@ def _carry_on(path: Path, vertex: Vertex, bs, delta):
 
 def _end_at_direction(path: Path, hit: Hit, survival, settings: PathSettings, sample) -> None:
     """Russian roulette by ``survival``, the residual of the direction, and by the throughput, as in ``path``."""
-    # Even if the BSDF is 0, the minorant may need subtraction
     largest = dr.max(dr.abs(path.throughput))
     if path.carried is not None:
+        # Even if the BSDF is 0, the minorant may need subtraction
         largest = dr.maximum(largest, dr.max(dr.abs(path.carried)))
     survival *= throughput_survival(largest, path.eta, path.depth >= settings.rr_depth)
     path.active = hit.goes_on & (largest > 0) & (sample < survival)
-    path.boost(survival)
+    path.divide_by(survival)
 
 
 def _pass_hidden(path: Path, hit: Hit, first: FirstEdge) -> None:

@@ -102,7 +102,7 @@ class Evidence:
     ``radiance`` (n,) of the pilot's paths, in pairs; ``seen`` (n,): emission on their first edges; ``direct`` (n,):
     without ``seen`` and the part available to lights on surfaces; ``brightness`` (n,) of the image nearby;
     ``emitters``: whether lights may represent many emitters; ``known``: results of :meth:`relative`, which passes with
-    the same pilot share; ``fewest_plain``: number of paths from which they are plain without lights.
+    the same pilot share; ``plain_from``: the paths of an image without lights are plain from this number on.
     """
 
     radiance: np.ndarray
@@ -114,7 +114,12 @@ class Evidence:
     emitters: bool
     model: CostModel
     known: dict = field(default_factory=dict, repr=False, compare=False)
-    fewest_plain: float = math.inf
+    plain_from: float = math.inf
+
+    @property
+    def cost_alone(self) -> float:
+        """Cost of a path without virtual lights."""
+        return self.model.plain_cost if self.paths >= self.plain_from else 1.0
 
     @cached_property
     def whole(self) -> float:
@@ -209,6 +214,8 @@ class Decision:
             paths = round(evidence.paths * samples / evidence.samples)
             evidence = replace(evidence, paths=paths, samples=samples)
             plan = choose(evidence, self.options, measures=False)
+        if not plan.gathers:
+            return self._emitter_samples(evidence, plan).cost - (1 - evidence.cost_alone), 0.0, 0.0
         cuts = evidence.model.ray_cost * plan.rays / samples
         return self._emitter_samples(evidence, plan).cost - (plan.cost - 1), plan.cost - 1 - cuts, cuts
 
@@ -256,9 +263,7 @@ def without_lights(reason: str) -> Plan:
 
 def _most_to_pay(evidence: Evidence) -> float:
     """Largest price of lights that pay: a multiple of the price of paths alone."""
-    model = evidence.model
-    cost = model.plain_cost if evidence.paths >= evidence.fewest_plain else 1.0
-    return model.pays_below * cost * evidence.whole**model.denoised_power
+    return evidence.model.pays_below * evidence.cost_alone * evidence.whole**evidence.model.denoised_power
 
 
 def priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:

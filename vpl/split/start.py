@@ -124,7 +124,7 @@ def evidence_of(view: View, start: Start) -> Evidence:
     pilot, emitters = start.pilot, _may_carry_emitters(view)
     return Evidence(
         pilot.radiance, pilot.seen, pilot.direct, pilot.brightness, view.count, view.samples, emitters, view.model,
-        start.known, view.fewest_plain,
+        start.known, view.plain_from,
     )  # fmt: skip
 
 

@@ -111,8 +111,8 @@ class View:
         return self.rays.mean
 
     @property
-    def fewest_plain(self) -> float:
-        """Number of camera rays from which paths are plain, if there are no virtual lights."""
+    def plain_from(self) -> float:
+        """Number of camera rays from which paths without virtual lights are plain."""
         return self.model.plain_from * len(self.emitters.traits.materials.bsdfs)
 
     def groups(self, most: int, size: int) -> np.ndarray:

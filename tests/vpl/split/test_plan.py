@@ -74,8 +74,19 @@ def test_lights_pay_less_often_where_paths_without_them_are_plain():
     evidence = Evidence(traced, UNSEEN, 2.0 * direct + none, np.ones(10_000), 10**8, 64, False, MODEL)
     assert price(evidence, Option(True, False, traced, indirect)) == pytest.approx(0.92 * evidence.whole, rel=0.05)
     for fewest, pays in ((10**8 + 1, True), (10**8, False)):
-        plan = choose(replace(evidence, fewest_plain=fewest), [Option(True, False, traced, indirect)])
+        plan = choose(replace(evidence, plain_from=fewest), [Option(True, False, traced, indirect)])
         assert plan.gathers == pays
+
+
+def test_a_pass_of_plain_paths_is_predicted_to_cost_less():
+    """The costs of passes of 8 and 64 samples, of which the larger one has plain paths."""
+    none = np.zeros(1000)
+    evidence = Evidence(none + 1, none, none + 1, none + 1, 8000, 8, False, MODEL, plain_from=64_000)
+    effect = EmitterSamples(0.0, np.zeros(1), np.zeros(1), none, 1.0, MODEL)
+    effects = {False: effect, True: effect}
+    decision = Decision(None, evidence, choose(evidence, []), [], effects)
+    assert decision.costs(8) == pytest.approx((1.0, 0.0, 0.0))
+    assert decision.costs(64) == pytest.approx((MODEL.plain_cost, 0.0, 0.0))
 
 
 def test_edges_of_emitters_in_a_pixel_are_less_noise_the_more_samples_there_are():

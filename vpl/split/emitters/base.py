@@ -102,7 +102,7 @@ class EmitterSampler(Protocol):
         raise NotImplementedError
 
     def simplest(self) -> EmitterSampler:
-        """A sampler with the same probabilities, in the smallest kernel."""
+        """This sampler, or one with the same probabilities and a smaller kernel."""
         raise NotImplementedError
 
     def copy(self) -> EmitterSampler:

@@ -8,6 +8,8 @@ samples the window.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -73,7 +75,11 @@ class LearnedEmitters(CellEmitters):
     def simplest(self) -> EmitterSampler:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.simplest`."""
         # Mitsuba lists several emitters in an order that differs between loads of a scene
-        return self if self._count > 1 or self.choice.has_learned else UniformEmitters(self._scene, self.groups)
+        return self if self._count > 1 or self.choice.has_learned else self._uniform
+
+    @cached_property
+    def _uniform(self) -> UniformEmitters:
+        return UniformEmitters(self._scene, self.groups, self.traits)
 
     def _draw(self, si, source, member, place, active) -> EmitterSample:
         """Sample a direction to each source."""

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ...core.arrays import finite_or_zero
 from ...lights.emitter_groups import EmitterGroups
-from ...points.camera_paths import scene_traits
+from ...points.camera_paths import SceneTraits, scene_traits
 from .base import EmitterSample, MetEmitter
 
 
@@ -16,8 +16,8 @@ class UniformEmitters:
 
     lights, learns_sky = None, False
 
-    def __init__(self, scene, groups: EmitterGroups | None = None):
-        self._scene, self.groups, self.traits = scene, groups, scene_traits(scene)
+    def __init__(self, scene, groups: EmitterGroups | None = None, traits: SceneTraits | None = None):
+        self._scene, self.groups, self.traits = scene, groups, traits or scene_traits(scene)
         emitters = scene.emitters()
         self._group = dr.opaque(mi.UInt32, groups.number(emitters[0]) if groups and emitters else 0)
 
@@ -37,7 +37,8 @@ class UniformEmitters:
         origin = dr.zeros(mi.Interaction3f)
         origin.p = vertex
         ds = mi.DirectionSample3f(self._scene, si, origin)
-        density = self._scene.pdf_emitter_direction(origin, ds, active & has_density)
+        # Mitsuba's density of a black environment is NaN
+        density = finite_or_zero(self._scene.pdf_emitter_direction(origin, ds, active & has_density))
         emitted = si.emitter(self._scene, active).eval(si, active)
         return MetEmitter(finite_or_zero(mi.unpolarized_spectrum(emitted)) & active, density, self._group)
 
