@@ -69,10 +69,13 @@ class Triangles:
     flipped: bool
 
 
-def triangles_of(shape) -> Triangles | None:
-    """The triangles of a mesh, rectangles included; None for other shapes, and for ellipsoids made of triangles."""
-    if not shape.is_mesh() or shape.is_ellipsoids():
-        return None
+def has_triangles(shape) -> bool:
+    """Whether rays hit a shape as triangles: meshes and rectangles, but no ellipsoids made of triangles."""
+    return shape.is_mesh() and not shape.is_ellipsoids()
+
+
+def triangles_of(shape) -> Triangles:
+    """The triangles of a shape that has them."""
     normals = download(shape.vertex_normals_buffer()).reshape(-1, 3) if shape.has_vertex_normals() else None
     coordinates = download(shape.vertex_texcoords_buffer()).reshape(-1, 2) if shape.has_vertex_texcoords() else None
     positions = download(shape.vertex_positions_buffer()).reshape(-1, 3)

@@ -11,7 +11,7 @@ from .arrays import download
 from .parameters import children_of
 
 # Class name of instances of shape groups
-_INSTANCE = "Instance"
+INSTANCE = "Instance"
 
 
 def registered_shapes(scene) -> list:
@@ -40,7 +40,7 @@ class SceneShapes:
     def of(cls, scene) -> SceneShapes:
         """Mitsuba 3.9.1 accepts groups as children of a scene only, and lists them nowhere else."""
         own = registered_shapes(scene)
-        instances = [row for row in own if row[1].class_name() == _INSTANCE]
+        instances = [row for row in own if row[1].class_name() == INSTANCE]
         if not instances:
             return cls(own, [])
         groups = [shape for shape in children_of(scene, mi.Shape) if shape.class_name().startswith("ShapeGroup")]
@@ -53,7 +53,7 @@ class SceneShapes:
         """(Registry index, shape) of every shape that surface interactions have: those of groups instead of
         instances."""
         nested = [row for group in self.groups for row in group.shapes]
-        return [row for row in self.own if row[1].class_name() != _INSTANCE] + nested
+        return [row for row in self.own if row[1].class_name() != INSTANCE] + nested
 
 
 def _children(group) -> list:

@@ -174,7 +174,7 @@ def _bsdf_sample(context: PassContext, site: _Site, random):
     pdf = source_pdf * _probability_of(context, site, rank, going)
     radiance *= power_heuristic(site.bsdf_samples * bsdf_pdf, site.samples * pdf)
     if context.max_depth is not None:
-        beyond = hit.compute_surface_interaction(ray, mi.RayFlags.All, going)
+        beyond = context.traits.interactions.at(hit, ray, going)
         radiance += emission_beyond_delta(
             context.scene, context.sources.emitters, context.traits, beyond, surface.depth + 1, context.max_depth,
             random, going,

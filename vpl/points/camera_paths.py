@@ -32,7 +32,7 @@ _CURVE_BITS = 10
 
 @dataclass(frozen=True)
 class SceneTraits:
-    """Capabilities of a scene's surfaces: kernels omit code for absent ones.
+    """Capabilities of a scene's surfaces, as kernels omit code for absent ones, and their geometry.
 
     ``delta``, ``null``, ``smooth``, ``glossy``, ``transmissive``: whether any BSDF has such a lobe; ``perturbed``:
     registry indices of shapes with bump or normal maps; ``open_shapes``: registry indices of shapes that transmit light
@@ -206,7 +206,7 @@ def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughpu
     if skip is None:
         si = traits.interactions.meet(scene, ray, depth == 1, active)
     else:
-        si = skip(scene, ray, True, active).compute_surface_interaction(ray, mi.RayFlags.All, active)
+        si = traits.interactions.at(skip(scene, ray, True, active), ray, active)
     hit = active & si.is_valid()
     emission = dr.zeros(mi.UnpolarizedSpectrum, dr.width(ray.d))
     if skip is None:

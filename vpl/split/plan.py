@@ -189,7 +189,7 @@ class Decision:
         effect, variance = self.effects[plan.emitters], _remaining(evidence, plan)
         direct = min(evidence.relative(evidence.direct), variance / evidence.retained)
         variance += max(effect.retained(evidence.samples) - evidence.retained, 0) * direct
-        return effect.best(variance, plan.cost, evidence.samples)
+        return effect.best(variance, plan.cost if plan.gathers else evidence.cost_alone, evidence.samples)
 
     @property
     def variance(self) -> float:
@@ -214,10 +214,11 @@ class Decision:
             paths = round(evidence.paths * samples / evidence.samples)
             evidence = replace(evidence, paths=paths, samples=samples)
             plan = choose(evidence, self.options, measures=False)
+        chosen = self._emitter_samples(evidence, plan)
         if not plan.gathers:
-            return self._emitter_samples(evidence, plan).cost - (1 - evidence.cost_alone), 0.0, 0.0
+            return chosen.cost, 0.0, 0.0
         cuts = evidence.model.ray_cost * plan.rays / samples
-        return self._emitter_samples(evidence, plan).cost - (plan.cost - 1), plan.cost - 1 - cuts, cuts
+        return chosen.cost - (plan.cost - 1), plan.cost - 1 - cuts, cuts
 
     def precision(self, samples: int) -> float:
         """Expected inverse of the relative variance of a pixel with ``samples``; ``samples`` for a black image.

@@ -113,7 +113,7 @@ class View:
     @property
     def plain_from(self) -> float:
         """Number of camera rays from which paths without virtual lights are plain."""
-        return self.model.plain_from * len(self.emitters.traits.materials.bsdfs)
+        return self.model.plain_per_material * len(self.emitters.traits.materials.bsdfs)
 
     def groups(self, most: int, size: int) -> np.ndarray:
         """Indices of at most ``most`` rays in groups of ``size`` neighbours, evenly over the image; at least one

@@ -94,7 +94,7 @@ def _through_null_surfaces(scene, traits, ray, most, active):
         # Surfaces are usually opaque: only the remaining surfaces need a full intersection record
         crossed = active & hit.is_valid() & (left > 0) & traits.is_null(hit)
         passed = dr.select(active & hit.is_valid() & ~crossed, 0, passed)
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, crossed)
+        si = traits.interactions.at(hit, ray, crossed)
         passed = dr.select(crossed, passed * traits.transmission(si, crossed), passed)
         active = crossed & dr.any(passed > 0)
         left -= dr.select(crossed, mi.UInt32(1), 0)

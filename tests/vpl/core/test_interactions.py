@@ -59,6 +59,9 @@ OTHERS = {
     "cylinder and disk": lambda: {
         "tube": {"type": "cylinder", "radius": 0.4}, "disk": {"type": "disk", "to_world": transform(3)}
     },
+    "grid of distances": lambda: {
+        "grid": {"type": "sdfgrid", "grid": mi.TensorXf(np.linspace(-1, 1, 64).reshape(4, 4, 4, 1))},
+    },
     "instances": lambda: {
         "group": {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.5}, "plate": {"type": "rectangle"}},
         **{f"copy{k}": {"type": "instance", "to_world": transform(k), "of": {"type": "ref", "id": "group"}}
@@ -78,6 +81,8 @@ def rays():
 
 def assert_equal_interactions(scene, ray, active):
     """All fields are those of Mitsuba, but for rays that hit a triangle nearly edge-on; some of Mitsuba's are NaN."""
+    numbers = [*("t", "time", "p", "n", "uv", "prim_index", "wi"), *("dp_du", "dp_dv", "dn_du", "dn_dv", "duv_dx"),
+               *("duv_dy", "sh_frame.s", "sh_frame.t", "sh_frame.n")]  # fmt: skip
     expected = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
     found = Interactions(scene).meet(scene, ray, mi.Bool(False), active)
     hit = download(expected.is_valid())
@@ -86,7 +91,7 @@ def assert_equal_interactions(scene, ray, active):
     for name in ("shape", "instance"):
         pointers = (dr.reinterpret_array(mi.UInt32, getattr(si, name)) for si in (found, expected))
         np.testing.assert_array_equal(*(np.broadcast_to(download(x), hit.shape) for x in pointers))
-    for name in ("t", "time", "p", "n", "uv", "prim_index", "wi", "dp_du", "dp_dv", "sh_frame.s", "sh_frame.n"):
+    for name in numbers:
         values = []
         for value in (found, expected):
             for part in name.split("."):
@@ -119,7 +124,7 @@ def test_a_scene_of_nothing():
     assert not download(found.is_valid()).any() and (np.array(found.p) == 0).all()
 
 
-def test_meshes_are_those_of_the_time_when_the_object_is_made():
+def test_an_edited_scene():
     scene = mi.load_dict({"type": "scene", "plate": {"type": "rectangle"}})
     parameters = mi.traverse(scene)
     parameters["plate.to_world"] = mi.ScalarTransform4f().rotate([0, 1, 0], 50).scale(1.5)
@@ -127,12 +132,24 @@ def test_meshes_are_those_of_the_time_when_the_object_is_made():
     assert_equal_interactions(scene, *rays())
 
 
-def test_few_other_shapes_among_many_meshes_are_switched():
-    """A call by pointer would record the meshes as well."""
-    plates = {f"plate{k}": {"type": "rectangle"} for k in range(100)}
-    balls = {f"ball{k}": {"type": "sphere"} for k in range(10)}
-    for more, switches in ((plates, True), ({}, False)):
-        assert Interactions(mi.load_dict({"type": "scene", **balls, **more}))._switches == switches
+def test_places_in_the_registry_and_numbers_of_equal_shapes_add_no_code():
+    """Spheres and instances name themselves by their index in Mitsuba's registry."""
+
+    def operations(before, balls):
+        others = [mi.load_dict({"type": "sphere"}) for _ in range(before)]
+        spheres = {f"ball{k}": {"type": "sphere", "center": [0.1 * k, 0, 0]} for k in range(balls)}
+        scene = mi.load_dict({"type": "scene", **spheres, **MESHES["several"]()})
+        ray, active = rays()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            dr.eval(Interactions(scene).meet(scene, ray, mi.Bool(False), active))
+            kernels = [one for one in dr.kernel_history() if one["type"] == dr.KernelType.JIT]
+        assert len(others) == before
+        longest = max(kernels, key=lambda one: one["operation_count"])
+        return longest["operation_count"], longest["hash"]
+
+    assert operations(0, 3) == operations(5, 3)
+    assert operations(0, 10)[0] < operations(0, 3)[0] + 7 * 20
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/scenes")

@@ -2,6 +2,7 @@
 
 from unittest import mock
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -15,8 +16,8 @@ from vpl.split.emitters import emitter_sampler
 from vpl.split.emitters.tree_emitters import TreeEmitters
 from vpl.split.emitters.uniform import UniformEmitters
 
-# Plain paths in images of any size, and in none
-PLAIN, RECORDING = {"plain_from": 0}, {"plain_from": 1e30}
+# Plain paths in images of any size, at the usual cost, and in none
+PLAIN, RECORDING = {"plain_per_material": 0, "plain_cost": 1.0}, {"plain_per_material": 1e30}
 
 
 def below(sky):
@@ -47,12 +48,27 @@ def rendered(scene, constants, most=1, seed=3, spp=16, **parameters):
         return render(scene, plugin, spp=spp, seed=seed), plugin.statistics
 
 
+def traced_settings(scene, constants, **given):
+    """The image, its statistics, and the settings of its paths, the same for all of its parts."""
+    settings, real = [], estimator.trace_camera_rays
+
+    def spy(view, lane, these, *stream, **more):
+        settings.append(these)
+        return real(view, lane, these, *stream, **more)
+
+    with mock.patch.object(estimator, "trace_camera_rays", spy):
+        pixels, statistics = rendered(scene, constants, **given)
+    assert len({(one.plain, one.several) for one in settings}) == 1
+    return pixels, statistics, settings[0]
+
+
 def assert_same_paths(scene, **given):
     """Plain and other paths are the same, but for paths that rounding lets miss an edge."""
     # Contributions are drawn by other numbers, so that plain paths, which draw none, have the numbers of other paths
     with mock.patch.object(path_tracer, "_draw", lambda sampler, settings: mi.Float(0.5)):
-        (plain, one), (other, two) = (rendered(scene, constants, **given) for constants in (PLAIN, RECORDING))
-    assert one["plain"] and not two["plain"] and one["dropped"] == 0
+        (plain, one, few), (other, _, many) = (traced_settings(scene, x, **given) for x in (PLAIN, RECORDING))
+    assert few.plain and one["plain"] and not many.plain and one["dropped"] == 0
+    assert few.several == (float(one["emitter_samples"]) > 1)
     assert plain.shape == other.shape and other[..., :3].mean() > 0
     equal = np.isclose(plain, other, rtol=1e-3, atol=1e-5 * np.abs(other).max()).all(-1)
     assert equal.mean() > 0.97 and np.allclose(plain.mean((0, 1)), other.mean((0, 1)), rtol=0.01)
@@ -63,12 +79,10 @@ def assert_same_paths(scene, **given):
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 def test_plain_paths_are_the_paths_of_other_images(scene, most):
     statistics = assert_same_paths(mi.load_dict(with_alpha(scene())), most=most)
-    assert most > 1 or statistics["emitter_samples"] == "1"
-
-
-def test_vertices_of_plain_paths_may_have_several_emitter_samples():
-    statistics = assert_same_paths(mi.load_dict(with_alpha(many_kinds())), most=4)
-    assert float(statistics["emitter_samples"]) > 1.5
+    if most == 1:
+        assert statistics["emitter_samples"] == "1"
+    elif scene is many_kinds:
+        assert float(statistics["emitter_samples"]) > 1.5
 
 
 @pytest.mark.parametrize("hide_emitters", [False, True])
@@ -114,21 +128,34 @@ def test_paths_are_plain_from_a_number_of_rays_for_each_material():
     materials = len(emitter_sampler(scene, 1000).traits.materials.bsdfs)
     assert materials > 2
     for rays, plain in ((16 * 16 * 16 / materials, True), (16 * 16 * 16 / materials + 1, False)):
-        assert rendered(scene, {"plain_from": rays})[1]["plain"] == plain
+        assert rendered(scene, {"plain_per_material": rays})[1]["plain"] == plain
     assert not rendered(scene, {})[1]["plain"]
 
 
-def test_single_samples_have_a_kernel_of_their_own():
-    scene, several = mi.load_dict(closed_box({"lamp": area_light()}, 16)), []
-    real = estimator.trace_camera_rays
+def operations(plugin, scene):
+    """Number of operations of the longest kernel of the paths of an image."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        render(scene, plugin, spp=16)
+        kernels = [one for one in dr.kernel_history() if one["type"] == dr.KernelType.JIT]
+    return max(one["operation_count"] for one in kernels if one["size"] == 32 * 32 * 16)
 
-    def spy(view, lane, settings, *stream, **more):
-        several.append(settings.several)
-        return real(view, lane, settings, *stream, **more)
 
-    with mock.patch.object(estimator, "trace_camera_rays", spy):
-        rendered(scene, PLAIN, most=1)
-    assert several and not any(several)
+def test_kernels_of_plain_paths_are_smaller_most_of_all_with_single_samples():
+    """Enough emitters for several samples."""
+    scene, counts = mi.load_dict(many_kinds()), []
+    for constants, most in ((PLAIN, 1), (PLAIN, 4), (RECORDING, 4)):
+        with plugin_with_model(most_emitter_samples=most, **constants):
+            counts.append(operations(mi.load_dict({"type": "manylights", "virtual_lights": False}), scene))
+    assert counts[0] < counts[1] < 0.9 * counts[2]
+
+
+def test_a_black_sky_alone():
+    """Mitsuba's density of its directions is NaN."""
+    black = mi.Bitmap(np.zeros((4, 8, 3), np.float32))
+    scene = mi.load_dict(below({"sky": {"type": "envmap", "bitmap": black}}))
+    pixels, statistics, settings = traced_settings(scene, PLAIN)
+    assert settings.plain and statistics["dropped"] == 0 and not pixels.any()
 
 
 def test_the_simplest_sampler_is_that_of_mitsuba_if_nothing_was_learned_about_a_single_emitter():

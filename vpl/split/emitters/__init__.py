@@ -28,8 +28,7 @@ def emitter_sampler(scene, rays: int, groups: EmitterGroups | None = None) -> Em
     """The sampler that suits a scene, with about ``rays`` rays to learn by; ``groups`` of its emitters, or None.
 
     :class:`TreeEmitters` for 64 emitters or more, if arrays can hold every emitter; :class:`UniformEmitters` for a
-    single emitter with a position, and for plain paths if nothing was learned about a single environment;
-    :class:`LearnedEmitters` otherwise.
+    single emitter with a position; :class:`LearnedEmitters` otherwise.
     """
     count = len(scene.emitters())
     if count > 1 or scene.environment() is not None:

@@ -12,7 +12,8 @@ from .base import EmitterSample, MetEmitter
 
 
 class UniformEmitters:
-    """Mitsuba's own choice, of at most one emitter.  There is nothing to learn."""
+    """Mitsuba's own choice, of at most one emitter: one with a position, or an environment about which nothing was
+    learned."""
 
     lights, learns_sky = None, False
 
