@@ -2,8 +2,8 @@
 
 Mitsuba computes the surface interaction of a ray by a call of the shape that the ray hits.  Dr.Jit records such a call
 for every shape in memory, and kernels pass its arguments and results through memory.  Here one piece of code serves all
-triangles.  Against Mitsuba's call, kernels of paths take 0.83 to 0.97 of the time, and a scene of 880 rectangles is
-recorded in 0.1 s instead of 0.33 s (decisions.md).
+triangles.  Against Mitsuba's call, kernels of paths take 0.86 to 0.96 of the time, and the loop of paths among 880
+rectangles is recorded in 0.13 s instead of 0.34 s (decisions.md).
 """
 
 from __future__ import annotations
