@@ -15,12 +15,15 @@ import mitsuba as mi
 import numpy as np
 
 from .arrays import upload
-from .meshes import has_triangles, triangles_of
+from .meshes import is_hit_as_triangles, triangles_of
 from .registry import RegistryTable
 from .shapes import INSTANCE, registered_shapes
 
 # Bits of a triangle: its corners have normals, they have coordinates of textures, its sides are exchanged
 _SMOOTH, _MAPPED, _FLIPPED = 1, 2, 4
+# Shapes of a switch, at most. Python records a case in 1.4 times the time that Mitsuba's call by pointer takes for a
+# shape (20 000 spheres), and does not record the meshes, nor shapes of other scenes
+_MOST_SWITCHED = 1000
 
 
 class Interactions:
@@ -30,10 +33,11 @@ class Interactions:
     must not change while the object is used.
     """
 
-    def __init__(self, scene):
-        shapes = registered_shapes(scene)
-        meshes = [(index, shape) for index, shape in shapes if has_triangles(shape)]
-        others = [(index, shape) for index, shape in shapes if not has_triangles(shape)]
+    def __init__(self, scene, shapes: list | None = None):
+        """``shapes``: :func:`vpl.core.shapes.registered_shapes` of the scene, if known."""
+        self._scene, shapes = scene, registered_shapes(scene) if shapes is None else shapes
+        meshes = [(index, shape) for index, shape in shapes if is_hit_as_triangles(shape)]
+        others = [(index, shape) for index, shape in shapes if not is_hit_as_triangles(shape)]
         self._others = [shape for _, shape in others]
         self._other = RegistryTable([index for index, _ in others], range(1, len(others) + 1))
         # The number of the first triangle of each mesh, from 1 on
@@ -41,10 +45,10 @@ class Interactions:
         self._triangle = RegistryTable([index for index, _ in meshes], firsts)
         self._faces, self._vertices = _packed([mesh for _, mesh in meshes])
 
-    def meet(self, scene, ray: mi.Ray3f, coherent: mi.Bool, active: mi.Bool) -> mi.SurfaceInteraction3f:
+    def meet(self, ray: mi.Ray3f, active: mi.Bool, coherent: mi.Bool = False) -> mi.SurfaceInteraction3f:
         """The nearest surface on each ray, with the fields of ``RayFlags.All``; ``coherent``: whether neighbouring rays
         are alike."""
-        return self.at(scene.ray_intersect_preliminary(ray, coherent, active), ray, active)
+        return self.at(self._scene.ray_intersect_preliminary(ray, coherent, active), ray, active)
 
     def at(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """The surfaces that rays ``hit``."""
@@ -61,6 +65,8 @@ class Interactions:
 
     def _on_others(self, ray, hit, active) -> mi.SurfaceInteraction3f:
         """Interactions with shapes that are no meshes, and with instances of shape groups."""
+        if len(self._others) > _MOST_SWITCHED:
+            return hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
         # Mitsuba tells the instance of a group, and on the CPU not the shape in the group
         is_instance = hit.instance != None  # noqa: E711
         number = self._other.at(dr.select(is_instance, hit.instance, hit.shape), active)

@@ -69,13 +69,13 @@ class Triangles:
     flipped: bool
 
 
-def has_triangles(shape) -> bool:
+def is_hit_as_triangles(shape) -> bool:
     """Whether rays hit a shape as triangles: meshes and rectangles, but no ellipsoids made of triangles."""
     return shape.is_mesh() and not shape.is_ellipsoids()
 
 
 def triangles_of(shape) -> Triangles:
-    """The triangles of a shape that has them."""
+    """The triangles that rays hit."""
     normals = download(shape.vertex_normals_buffer()).reshape(-1, 3) if shape.has_vertex_normals() else None
     coordinates = download(shape.vertex_texcoords_buffer()).reshape(-1, 2) if shape.has_vertex_texcoords() else None
     positions = download(shape.vertex_positions_buffer()).reshape(-1, 3)

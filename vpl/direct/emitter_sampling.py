@@ -83,7 +83,7 @@ class ExtendedEmitters:
 def _scattered_emission(scene, extended: ExtendedEmitters, traits, si, sample, depth, max_depth, sampler, active):
     """Emitted radiance along a BSDF sample, MIS-weighted; beyond delta surfaces the weight is 1."""
     direction = si.to_world(sample.wo)
-    hit = traits.interactions.meet(scene, si.spawn_ray(direction), mi.Bool(False), active)
+    hit = traits.interactions.meet(si.spawn_ray(direction), active)
     weight = power_heuristic(sample.pdf, extended.density(si, hit, direction, active))
     radiance = emitted_towards(extended.emitters, hit, active) * weight
     if traits.delta:
@@ -107,7 +107,7 @@ def emission_beyond_delta(scene, emitters: Emitters, traits, hit, depth, max_dep
         onward, share = hit.bsdf().sample(mi.BSDFContext(), hit, sampler.next_1d(going), sampler.next_2d(going), going)
         going &= mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
         factor *= mi.unpolarized_spectrum(share)
-        hit = traits.interactions.meet(scene, hit.spawn_ray(hit.to_world(onward.wo)), mi.Bool(False), going)
+        hit = traits.interactions.meet(hit.spawn_ray(hit.to_world(onward.wo)), going)
         radiance += dr.select(going, factor * emitted_towards(emitters, hit, going), 0)
         depth += 1
         going &= hit.is_valid() & (depth < max_depth) & (dr.max(factor) > 0)

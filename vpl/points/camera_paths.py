@@ -123,7 +123,7 @@ class CameraPaths:
 
 
 def scene_traits(scene) -> SceneTraits:
-    """Union of the flags of a scene's BSDFs."""
+    """The traits of a scene as it is now."""
     flags, open_shapes, shapes = 0, {}, SceneShapes.of(scene)
     for index, shape in shapes.of_hits:
         found = int(shape.bsdf().flags())
@@ -143,7 +143,8 @@ def scene_traits(scene) -> SceneTraits:
         open_scene = mi.load_dict({"type": "scene", **{f"open_{index}": one for index, one in open_shapes.items()}})
     listed = *open_shapes, *open_instances
     return SceneTraits(
-        *lobes, transmissive, perturbed_shapes(shapes), listed, open_scene, Materials.of(shapes), Interactions(scene)
+        *lobes, transmissive, perturbed_shapes(shapes), listed, open_scene, Materials.of(shapes),
+        Interactions(scene, shapes.own),
     )  # fmt: skip
 
 
@@ -204,7 +205,7 @@ def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughpu
     """
     max_depth, rr_depth = path_settings
     if skip is None:
-        si = traits.interactions.meet(scene, ray, depth == 1, active)
+        si = traits.interactions.meet(ray, active, depth == 1)
     else:
         si = traits.interactions.at(skip(scene, ray, True, active), ray, active)
     hit = active & si.is_valid()

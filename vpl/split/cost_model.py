@@ -190,6 +190,12 @@ class CostModel:
         "Cost of a further emitter sample at the first scattering vertex of a path.",
         "bistro_interior 0.14, living_room 0.15, dining_room 0.11, kitchen and staircase2 0.09",
     )
+    plain_cost: float = _constant(
+        0.9,
+        "paths",
+        "Cost of a plain path: one of a large image without virtual lights.",
+        "0.80 arcade to 1.00 dining_room, seven scenes (decisions.md)",
+    )
     vertex_cost: float = _constant(0.8, "paths", "Cost of a gather vertex: its clusters and its cuts.", "hall, kitchen")
     first_edges: float = _constant(
         4.0, "edges", "Cost of a path up to its second vertex, in later edges.", _SENSITIVITY
@@ -203,18 +209,12 @@ class CostModel:
         "without.",
         "definition",
     )
-    plain_cost: float = _constant(
-        0.9,
-        "paths",
-        "Cost of a plain path: one of a large image without virtual lights.",
-        "0.80 arcade to 1.00 dining_room, seven scenes (decisions.md)",
-    )
     plain_per_material: float = _constant(
         1 << 18,
         "camera rays per material",
         "From so many on, the paths of an image without virtual lights are plain.",
-        "spares 0.1 to 0.2 s of a million rays; compiling the kernel, once, takes 0.15 s for each material: as long as "
-        "three to six images spare",
+        "saves 0.1 to 0.2 s for a million rays; compiling the kernel takes 0.15 s for each material, once, as much as "
+        "three to six images save",
     )
     denoised_power: float = _constant(
         0.45,

@@ -86,7 +86,7 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
 def decide(view: View, start: Start) -> Decision:
     """Compare the kinds of virtual lights for a view of a certain size."""
     evidence = evidence_of(view, start)
-    plan = without_lights(start.refusal) if start.refusal else choose(evidence, start.options)
+    plan = without_lights(start.refusal, evidence) if start.refusal else choose(evidence, start.options)
     return Decision(start.pilot, evidence, plan, start.options, start.effects)
 
 
@@ -154,7 +154,7 @@ def _surface_lights(view: View, decision: Decision, kept: KeptLights | None, clo
 
 def render_image(view: View, lights: ViewLights, decision: Decision, stopped: Callable[[], bool], clock: Clock):
     """(Radiance, valid, layers, statistics) of the camera rays, traced in parts of whole pixels of about equal size."""
-    is_plain = not lights.all and view.count >= view.plain_from
+    is_plain = not lights.all and decision.evidence.plain_alone
     view, settings = _for_paths(view, lights, is_plain)
     gatherer = Gatherer.of(view, lights, decision) if lights.all else None
     radiance, valid = dr.zeros(mi.UnpolarizedSpectrum, view.count), dr.zeros(mi.Bool, view.count)

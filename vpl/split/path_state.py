@@ -43,9 +43,9 @@ class PathSettings:
     ``emitters_carried``: whether virtual lights represent emitters, with ``emitters_squared_c``; ``outgoing``: for
     Russian roulette; ``with_minorant``: materials with a minorant; ``hide_emitters``: a Python bool.
 
-    Two more Python bools make smaller kernels.  ``plain``: whether paths find only radiance and alpha: virtual lights
-    carry nothing, and there are no records for decisions and lights.  ``several``: whether first scattering vertices
-    may have several emitter samples.
+    Two more Python bools; ``plain`` and not ``several`` make smaller kernels.  ``plain``: whether paths find only
+    radiance and alpha: virtual lights carry nothing, and there are no records for decisions and lights.  ``several``:
+    whether first scattering vertices may have several emitter samples.
     """
 
     max_depth: mi.UInt32
@@ -91,8 +91,7 @@ class FirstEdge(Edge):
 
     @classmethod
     def plain(cls, ray, importance, active, direct_samples) -> FirstEdge:
-        """Camera rays of plain paths, whose kernel computes them: evaluated, they take a tenth of the time of a path
-        in simple scenes."""
+        """Camera rays of plain paths, not evaluated, which would take up to a tenth of the time of their paths."""
         one = dr.ones(mi.UnpolarizedSpectrum, dr.width(ray.d))
         return cls(
             mi.Point3f(ray.o), ray, one, mi.Float(1), mi.Bool(True), None, mi.UInt32(0), mi.UInt32(1), importance,
@@ -188,9 +187,9 @@ class Hit:
     smooth: mi.Bool
 
     @classmethod
-    def of(cls, scene, traits: SceneTraits, path: Path, settings: PathSettings) -> Hit:
+    def of(cls, traits: SceneTraits, path: Path, settings: PathSettings) -> Hit:
         """Intersect the rays with the scene."""
-        si = traits.interactions.meet(scene, path.ray, path.depth == 0, path.active)
+        si = traits.interactions.meet(path.ray, path.active, path.depth == 0)
         bsdf, hidden = si.bsdf(path.ray), mi.Bool(False)
         if settings.hide_emitters:
             from_camera = path.active & (path.depth == 0)

@@ -57,7 +57,7 @@ def trace_paths(
 
     while dr.hint(path.active, exclude=[first, lattice, settings, emitters, lane]):
         # ---------------------- Hit ----------------------
-        hit = Hit.of(scene, emitters.traits, path, settings)
+        hit = Hit.of(emitters.traits, path, settings)
 
         # ---------------------- Emission, by BSDF sampling ----------------------
         _add_emission(path, hit, emitters, settings, sampler, found, noise, lane)
@@ -162,7 +162,7 @@ def _sample_emitter(
 
 
 def _draw(sampler, settings: PathSettings) -> mi.Float | None:
-    """A uniform number for drawing a contribution, None for plain paths."""
+    """A uniform number for drawing a contribution or a vertex, None for plain paths, which draw none."""
     return None if settings.plain else sampler.next_1d()
 
 

@@ -34,7 +34,7 @@ class Plan:
     lights represent emitters; ``error``: largest expected one of a pair, as a fraction of the pixel; ``vertices``: lit
     vertices per pixel; ``variance``: remaining relative variance of a camera path; ``of_lights``: variance of the
     lights on surfaces and of the choice of lit vertices, in the same unit; ``cost`` of a path with its share of lights
-    and cuts, over that of a path alone; ``rays``: shadow rays of a pixel's cuts; ``reason`` in words.
+    and cuts; ``rays``: shadow rays of a pixel's cuts; ``reason`` in words.
     """
 
     light_paths: int
@@ -117,9 +117,14 @@ class Evidence:
     plain_from: float = math.inf
 
     @property
+    def plain_alone(self) -> bool:
+        """Whether the paths are plain if there are no virtual lights."""
+        return self.paths >= self.plain_from
+
+    @property
     def cost_alone(self) -> float:
         """Cost of a path without virtual lights."""
-        return self.model.plain_cost if self.paths >= self.plain_from else 1.0
+        return self.model.plain_cost if self.plain_alone else 1.0
 
     @cached_property
     def whole(self) -> float:
@@ -189,7 +194,7 @@ class Decision:
         effect, variance = self.effects[plan.emitters], _remaining(evidence, plan)
         direct = min(evidence.relative(evidence.direct), variance / evidence.retained)
         variance += max(effect.retained(evidence.samples) - evidence.retained, 0) * direct
-        return effect.best(variance, plan.cost if plan.gathers else evidence.cost_alone, evidence.samples)
+        return effect.best(variance, plan.cost, evidence.samples)
 
     @property
     def variance(self) -> float:
@@ -214,11 +219,11 @@ class Decision:
             paths = round(evidence.paths * samples / evidence.samples)
             evidence = replace(evidence, paths=paths, samples=samples)
             plan = choose(evidence, self.options, measures=False)
-        chosen = self._emitter_samples(evidence, plan)
+        paths = self._emitter_samples(evidence, plan).cost
         if not plan.gathers:
-            return chosen.cost, 0.0, 0.0
+            return paths, 0.0, 0.0
         cuts = evidence.model.ray_cost * plan.rays / samples
-        return chosen.cost - (plan.cost - 1), plan.cost - 1 - cuts, cuts
+        return paths - (plan.cost - 1), plan.cost - 1 - cuts, cuts
 
     def precision(self, samples: int) -> float:
         """Expected inverse of the relative variance of a pixel with ``samples``; ``samples`` for a black image.
@@ -242,7 +247,7 @@ def choose(evidence: Evidence, options: list[Option], measures: bool = True) -> 
     are independent of the options that were measured for other passes.
     """
     if not options:
-        return without_lights("no light comes by way of surfaces that virtual lights could stand for")
+        return without_lights("no light comes by way of surfaces that virtual lights could stand for", evidence)
     most, found = _most_to_pay(evidence), []
     for product, plan, option in sorted(((*priced(evidence, x), x) for x in options), key=lambda one: one[0]):
         if measures and option.to_measure and product <= min([most, *(other for other, _ in found)]):
@@ -253,13 +258,13 @@ def choose(evidence: Evidence, options: list[Option], measures: bool = True) -> 
     remains = (best.variance + best.of_lights) / max(evidence.whole, _TINY)
     if product > most:
         costs = f"virtual lights would cost {best.cost - 1:.2g} times as much as the paths"
-        return without_lights(f"{costs} and leave {remains:.0%} of the variance")
+        return without_lights(f"{costs} and leave {remains:.0%} of the variance", evidence)
     return replace(best, reason=f"virtual lights remove {1 - remains:.0%} of the variance")
 
 
-def without_lights(reason: str) -> Plan:
+def without_lights(reason: str, evidence: Evidence) -> Plan:
     """The plan of an image without virtual lights."""
-    return Plan(0, False, 0.0, 0, 0.0, 0.0, 1.0, 0.0, reason)
+    return Plan(0, False, 0.0, 0, 0.0, 0.0, evidence.cost_alone, 0.0, reason)
 
 
 def _most_to_pay(evidence: Evidence) -> float:

@@ -70,8 +70,8 @@ def test_lights_pay_less_often_where_paths_without_them_are_plain():
     """The same lights pay beside other paths, and not beside plain ones."""
     rng = np.random.default_rng(0)
     indirect, direct = rng.exponential(size=(2, 10_000))
-    none, traced = np.zeros(10_000), 2.0 * direct + indirect
-    evidence = Evidence(traced, UNSEEN, 2.0 * direct + none, np.ones(10_000), 10**8, 64, False, MODEL)
+    traced = 2.0 * direct + indirect
+    evidence = Evidence(traced, UNSEEN, 2.0 * direct, np.ones(10_000), 10**8, 64, False, MODEL)
     assert price(evidence, Option(True, False, traced, indirect)) == pytest.approx(0.92 * evidence.whole, rel=0.05)
     for plain_from, pays in ((10**8 + 1, True), (10**8, False)):
         plan = choose(replace(evidence, plain_from=plain_from), [Option(True, False, traced, indirect)])
