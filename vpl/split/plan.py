@@ -269,7 +269,8 @@ def without_lights(reason: str, evidence: Evidence) -> Plan:
 
 def _most_to_pay(evidence: Evidence) -> float:
     """Largest price of lights that pay: a multiple of the price of paths alone."""
-    return evidence.model.pays_below * evidence.cost_alone * evidence.whole**evidence.model.denoised_power
+    # Even if paths alone are plain: lights remove more variance than predicted (decisions.md)
+    return evidence.model.pays_below * evidence.whole**evidence.model.denoised_power
 
 
 def priced(evidence: Evidence, option: Option) -> tuple[float, Plan]:

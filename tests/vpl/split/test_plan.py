@@ -66,18 +66,6 @@ def test_images_that_are_denoised_need_lights_that_remove_more_variance():
         assert (choose(replace(evidence, model=DENOISED), option).light_paths > 0) == pays
 
 
-def test_lights_pay_less_often_where_paths_without_them_are_plain():
-    """The same lights pay beside other paths, and not beside plain ones."""
-    rng = np.random.default_rng(0)
-    indirect, direct = rng.exponential(size=(2, 10_000))
-    traced = 2.0 * direct + indirect
-    evidence = Evidence(traced, UNSEEN, 2.0 * direct, np.ones(10_000), 10**8, 64, False, MODEL)
-    assert price(evidence, Option(True, False, traced, indirect)) == pytest.approx(0.92 * evidence.whole, rel=0.05)
-    for plain_from, pays in ((10**8 + 1, True), (10**8, False)):
-        plan = choose(replace(evidence, plain_from=plain_from), [Option(True, False, traced, indirect)])
-        assert plan.gathers == pays
-
-
 def test_a_pass_of_plain_paths_is_predicted_to_cost_less():
     """The costs of passes of 8 and 64 samples, of which the larger one has plain paths."""
     none = np.zeros(1000)
