@@ -23,7 +23,7 @@ def is_triangle_mesh(shape) -> bool:
 
 def faces_of(mesh) -> np.ndarray:
     """Indices of the vertices of each triangle, (triangles, 3) uint32."""
-    return download(mesh.faces_buffer()).reshape(-1, 3)
+    return _rows(mesh.faces_buffer(), 3)
 
 
 def positions_of(mesh) -> np.ndarray | None:
@@ -51,7 +51,12 @@ def corners_of(mesh, triangle: mi.UInt32) -> list[mi.Point3f]:
 def _vertices(mesh, name: str, size: int) -> np.ndarray | None:
     """A parameter with ``size`` numbers per vertex, (vertices, ``size``) float64; None for a mesh without it."""
     values = parameters_of(mesh, below=False).get(name)
-    return None if values is None else download(values).astype(np.float64).reshape(-1, size)
+    return None if values is None else _rows(values, size).astype(np.float64)
+
+
+def _rows(values, size: int) -> np.ndarray:
+    """Numbers on the device as rows, (n, ``size``)."""
+    return download(values).reshape(-1, size)
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,7 @@ def is_hit_as_triangles(shape) -> bool:
 
 def triangles_of(shape) -> Triangles:
     """The triangles that rays hit."""
-    normals = download(shape.vertex_normals_buffer()).reshape(-1, 3) if shape.has_vertex_normals() else None
-    coordinates = download(shape.vertex_texcoords_buffer()).reshape(-1, 2) if shape.has_vertex_texcoords() else None
-    positions = download(shape.vertex_positions_buffer()).reshape(-1, 3)
+    normals = _rows(shape.vertex_normals_buffer(), 3) if shape.has_vertex_normals() else None
+    coordinates = _rows(shape.vertex_texcoords_buffer(), 2) if shape.has_vertex_texcoords() else None
+    positions = _rows(shape.vertex_positions_buffer(), 3)
     return Triangles(faces_of(shape), positions, normals, coordinates, shape.has_flipped_normals())

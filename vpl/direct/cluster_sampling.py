@@ -176,8 +176,7 @@ def _bsdf_sample(context: PassContext, site: _Site, random):
     if context.max_depth is not None:
         beyond = context.traits.interactions.at(hit, ray, going)
         radiance += emission_beyond_delta(
-            context.scene, context.sources.emitters, context.traits, beyond, surface.depth + 1, context.max_depth,
-            random, going,
+            context.sources.emitters, context.traits, beyond, surface.depth + 1, context.max_depth, random, going,
         )  # fmt: skip
     return finite_or_zero(weight * radiance) & going
 

@@ -80,21 +80,20 @@ class ExtendedEmitters:
         return density
 
 
-def _scattered_emission(scene, extended: ExtendedEmitters, traits, si, sample, depth, max_depth, sampler, active):
+def _scattered_emission(extended: ExtendedEmitters, traits, si, sample, depth, max_depth, sampler, active):
     """Emitted radiance along a BSDF sample, MIS-weighted; beyond delta surfaces the weight is 1."""
     direction = si.to_world(sample.wo)
     hit = traits.interactions.meet(si.spawn_ray(direction), active)
     weight = power_heuristic(sample.pdf, extended.density(si, hit, direction, active))
     radiance = emitted_towards(extended.emitters, hit, active) * weight
     if traits.delta:
-        radiance += emission_beyond_delta(
-            scene, extended.emitters, traits, hit, mi.UInt32(depth) + 1, max_depth, sampler, active
-        )
+        edges = mi.UInt32(depth) + 1
+        radiance += emission_beyond_delta(extended.emitters, traits, hit, edges, max_depth, sampler, active)
     return finite_or_zero(radiance)
 
 
 @dr.syntax
-def emission_beyond_delta(scene, emitters: Emitters, traits, hit, depth, max_depth, sampler, active):
+def emission_beyond_delta(emitters: Emitters, traits, hit, depth, max_depth, sampler, active):
     """Emitted radiance that a ray finds through mirrors, glass and masks.
 
     ``hit``: first surface of the ray; ``depth``: edges from the camera to ``hit``.
@@ -103,7 +102,7 @@ def emission_beyond_delta(scene, emitters: Emitters, traits, hit, depth, max_dep
     radiance = dr.zeros(mi.UnpolarizedSpectrum, dr.width(hit.p))
     factor = dr.full(mi.UnpolarizedSpectrum, 1, dr.width(hit.p))
     going = active & hit.is_valid() & (depth < max_depth)
-    while dr.hint(going, exclude=[scene, emitters, traits, max_depth]):
+    while dr.hint(going, exclude=[emitters, traits, max_depth]):
         onward, share = hit.bsdf().sample(mi.BSDFContext(), hit, sampler.next_1d(going), sampler.next_2d(going), going)
         going &= mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
         factor *= mi.unpolarized_spectrum(share)
@@ -158,7 +157,7 @@ def direct_light(
         choice, *sample = to_directions.at(first + k)
         sample, value = bsdf.sample(context, si, choice, mi.Point2f(*sample))
         smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Smooth) & dr.any(mi.unpolarized_spectrum(value) > 0)
-        found = _scattered_emission(scene, extended, traits, si, sample, points.depth, limit, sampler, smooth)
+        found = _scattered_emission(extended, traits, si, sample, points.depth, limit, sampler, smooth)
         radiance += dr.select(smooth, finite_or_zero(mi.unpolarized_spectrum(value) * found), 0)
         k += 1
     radiance /= mi.Float(total)

@@ -35,6 +35,7 @@ The lights and the decisions:
 
 - ``pilot``: a few whole paths, the relative variance, the brightness of the image nearby, the sampler of the lines
 - ``cost_model``: every constant of the decisions, with unit and evidence
+- ``cost_table``: the constants as a table
 - ``plan``: whether lights pay, the number of lights, and the fineness of the clusters
 - ``arrival_octree``: boxes around the arrivals of camera paths
 - ``line_sampling``, ``line_density``: random lines through the boxes, and their density on surfaces

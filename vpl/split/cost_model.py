@@ -3,7 +3,7 @@
 A pilot measures relative variances.  The constants predict cost and remaining variance (:mod:`vpl.split.plan`,
 :mod:`vpl.split.roulette`).  Predictions use counts and never the clock, so the same seed makes the same decisions on
 every machine.  ``benchmarks/cost_model.py`` halves and doubles each constant and prints the effect on variance × time.
-:func:`table` lists the constants.
+:mod:`vpl.split.cost_table` lists the constants.
 
 Costs are in units of one camera path without virtual lights that is not plain.  A relative variance is the variance of
 one path over the squared brightness of the pixel.
@@ -213,8 +213,7 @@ class CostModel:
         1 << 18,
         "camera rays per material",
         "From so many on, the paths of an image without virtual lights are plain.",
-        "saves 0.1 to 0.2 s for a million rays; compiling the kernel takes 0.15 s for each material, once, as much as "
-        "three to six images save",
+        "saves 0.1 to 0.2 s for a million rays; the kernel compiles in 0.15 s per material: pays after 3 to 6 images",
     )
     denoised_power: float = _constant(
         0.45,
@@ -349,14 +348,3 @@ class CostModel:
             if not least <= value <= most:
                 limit = f"at least {least:g}" if most == math.inf else f"from {least:g} to {most:g}"
                 raise ValueError(f"{one.name} must be {limit}, got {value!r}")
-
-
-def table() -> str:
-    """The constants as a Markdown table: name, value, unit, meaning, evidence."""
-    lines = ["| constant | value | unit | meaning | evidence |", "|---|---|---|---|---|"]
-    for one in fields(CostModel):
-        about = one.metadata
-        lines.append(
-            f"| `{one.name}` | {one.default:.6g} | {about['unit']} | {about['meaning']} | {about['evidence']} |"
-        )
-    return "\n".join(lines)

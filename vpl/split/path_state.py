@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +11,7 @@ from ..core.arrays import ones
 from ..core.materials import Materials
 from ..points.camera_paths import SceneTraits
 from ..transport.minorant import is_diffuse, minorant_of, side_of
+from .contributions import Contributions
 from .gather_vertices import Gathered
 from .local_c import LocalC
 from .roulette import OutgoingRadiance
@@ -91,7 +92,7 @@ class FirstEdge(Edge):
 
     @classmethod
     def plain(cls, ray, importance, active, direct_samples) -> FirstEdge:
-        """Camera rays of plain paths, not evaluated, which would take up to a tenth of the time of their paths."""
+        """Camera rays of plain paths, not evaluated.  Evaluating them takes up to a tenth of the time of the paths."""
         one = dr.ones(mi.UnpolarizedSpectrum, dr.width(ray.d))
         return cls(
             mi.Point3f(ray.o), ray, one, mi.Float(1), mi.Bool(True), None, mi.UInt32(0), mi.UInt32(1), importance,
@@ -216,7 +217,8 @@ class Vertex:
     """Vertices where paths scatter.
 
     ``hit``; ``gathers``, ``weight``: mask and weights of gather vertices, None in plain paths; ``cell`` of the emitter
-    sampler; ``samples``: number of emitter samples; ``numbers`` of the lattice.
+    sampler; ``samples``: number of emitter samples; ``share`` of a sample in their light; ``numbers`` of the lattice;
+    ``scatters``: whether a sample of the BSDF is needed.
     """
 
     hit: Hit
@@ -224,7 +226,9 @@ class Vertex:
     weight: mi.UnpolarizedSpectrum | None
     cell: mi.UInt32
     samples: mi.UInt32
+    share: mi.Float
     numbers: tuple
+    scatters: mi.Bool
 
 
 @dataclass
@@ -252,8 +256,8 @@ class Noise:
         self.alone_excess += arrived * (single - mis)
 
     def add_sample(self, level, number, samples, single) -> None:
-        """Add the contribution ``level`` of the emitter sample ``number`` of so many ``samples`` at a vertex;
-        ``single``: its weight as a single sample over that as one of several."""
+        """Add the contribution ``level`` of an emitter sample, which has a ``number`` among the ``samples`` of its
+        vertex.  ``single``: weight of an only sample over the weight of this one."""
         signed = dr.select((number & 1) == 0, level, -level)
         self.difference += dr.select(samples > 1, signed, 0)
         self.alone_excess += dr.select(number == 0, level * single, 0) - level
@@ -276,3 +280,12 @@ class Traced:
     group: mi.UInt32 | None = None
     noise: Noise | None = None
     gathered: Gathered | None = None
+
+    @classmethod
+    def of(cls, path: Path, found: Contributions, noise: Noise | None, gathered: Gathered | None) -> Traced:
+        """The records of ended paths; without ``gathered``, those of plain paths."""
+        result = cls(found.radiance, path.valid, path.depth)
+        if gathered is None:
+            return result
+        gathered.finish()
+        return replace(result, drawn=found.one, length=found.length, group=found.group, noise=noise, gathered=gathered)

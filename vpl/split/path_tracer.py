@@ -76,7 +76,10 @@ def trace_paths(
         several = hit.smooth & (path.scattered == 1) & settings.several
         samples = dr.select(several, first.direct_samples, 1)
         cell = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side)
-        vertex = Vertex(hit, gathers, weight, cell, samples, lattice.at(path.depth))
+        # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
+        scatters = path.active & ~hit.hidden & (hit.goes_on | ~path.valid)
+        share = dr.rcp(mi.Float(samples))
+        vertex = Vertex(hit, gathers, weight, cell, samples, share, lattice.at(path.depth), scatters)
         turned, bsdf_weight = _sample_emitters(scene, emitters, path, vertex, settings, sampler, found, noise, lane)
 
         # ---------------------- Onward by the sample of the BSDF ----------------------
@@ -87,12 +90,7 @@ def trace_paths(
         if dr.hint(settings.hide_emitters, mode="scalar"):
             _pass_hidden(path, hit, first)
 
-    traced = Traced(found.radiance, path.valid, path.depth)
-    if dr.hint(records, mode="scalar"):
-        gathered.finish()
-        traced = Traced(
-            found.radiance, path.valid, path.depth, found.one, found.length, found.group, noise, gathered
-        )  # fmt: skip
+    traced = Traced.of(path, found, noise, gathered)
     dr.eval(traced)
     return traced
 
@@ -141,16 +139,14 @@ def _sample_emitter(
     """Add the light of emitters by the sample ``number`` at each vertex to ``found``; returns a sample of the BSDF and
     its weight."""
     hit, edges = vertex.hit, path.depth + 2
-    # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
-    scatters, share = path.active & ~hit.hidden & (hit.goes_on | ~path.valid), dr.rcp(mi.Float(vertex.samples))
     chosen, place, lobe, turn = _numbers_of_sample(vertex.numbers, number) if settings.several else vertex.numbers
     sample = emitters.sample(hit.si, vertex.cell, chosen, sampler.next_1d(), place, hit.smooth)
     # A single call for both: each call adds the code of every material to the kernel
     toward = hit.si.to_local(sample.direction)
     value, density, turned, bsdf_weight = emitters.traits.materials.call(
-        hit.bsdf, _evaluated_and_sampled, hit.si, toward, lobe, turn, active=scatters
+        hit.bsdf, _evaluated_and_sampled, hit.si, toward, lobe, turn, active=vertex.scatters
     )
-    lit, beyond, single = _lit(path, vertex, sample, toward.z, value, density, share, settings, sampler)
+    lit, beyond, single = _lit(path, vertex, sample, toward.z, value, density, settings, sampler)
     arriving, crossings = sample.arriving(
         scene, emitters.traits, settings.max_depth - edges, dr.max(dr.abs(beyond)) > 0
     )
@@ -250,27 +246,26 @@ def _gather(path: Path, hit: Hit, settings: PathSettings, gathered: Gathered, sa
 
 
 def _lit(
-    path: Path, vertex: Vertex, sample: EmitterSample, height, value, density, share, settings: PathSettings, sampler
+    path: Path, vertex: Vertex, sample: EmitterSample, height, value, density, settings: PathSettings, sampler
 ):  # fmt: skip
     """Three factors.  Of the light of the sampled emitters: β f, minus the parts carried by virtual lights.  Of light
     that passes null surfaces, which virtual lights that represent emitters do not carry: the same without these parts.
     Of the weight of a sample: from one of several to a single sample.
 
-    ``height``: cosine of the direction; ``value``, ``density``: of the BSDF; ``share`` of the sample in the light, one
-    over the number of samples.
+    ``height``: cosine of the direction; ``value``, ``density``: of the BSDF.
     """
-    hit, weight = vertex.hit, vertex.weight
+    hit, share = vertex.hit, vertex.share
     value = beyond = full = path.throughput * mi.unpolarized_spectrum(value)
     if not settings.plain:
         cosine = dr.select(height * hit.side > 0, dr.abs(height), 0)
         value = beyond = full - path.carried * cosine
-    if sample.nearness is not None and not settings.plain:
-        w = emitter_share(settings.emitters_squared_c, sample.nearness, cosine)
-        value = value - dr.select(settings.emitters_carried, weight * (w * cosine), 0)
-        # Few shadow rays where the residual is small
-        survival = residual_survival(value, full, settings.emitters_carried)
-        survives = sampler.next_1d() < survival
-        value, beyond = (dr.select(survives, one / survival, 0) for one in (value, beyond))
+        if sample.nearness is not None:
+            w = emitter_share(settings.emitters_squared_c, sample.nearness, cosine)
+            value = value - dr.select(settings.emitters_carried, vertex.weight * (w * cosine), 0)
+            # Few shadow rays where the residual is small
+            survival = residual_survival(value, full, settings.emitters_carried)
+            survives = sampler.next_1d() < survival
+            value, beyond = (dr.select(survives, one / survival, 0) for one in (value, beyond))
     mis, single = (power_heuristic(sample.density, density * number) for number in (share, 1))
     mis, single = (dr.select(sample.is_point, 1, one) for one in (mis, single))
     mis = dr.select(hit.smooth & (sample.density > 0), share * mis, 0)

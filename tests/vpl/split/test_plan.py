@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from vpl.split import plan
-from vpl.split.cost_model import CostModel, table
+from vpl.split.cost_model import CostModel
+from vpl.split.cost_table import table
 from vpl.split.emitter_samples import EmitterSamples
 from vpl.split.plan import Decision, Evidence, Option, choose, priced
 
