@@ -10,6 +10,8 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from .interruption import interruptions_kept
+
 
 class UsageError(Exception):
     """Invalid use of the command, with a message for the user. Exit status 2."""
@@ -208,7 +210,8 @@ def exit_status(program, run, interrupted, verbose):
     `run`: returns the status; `interrupted`: message about the state after Ctrl-C; `verbose`: raise exceptions.
     """
     try:
-        return run()
+        with interruptions_kept():
+            return run()
     except KeyboardInterrupt:
         print(f"\n{program}: interrupted; {interrupted}", file=sys.stderr)
         return 130

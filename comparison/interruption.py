@@ -4,10 +4,39 @@ import os
 import signal
 import sys
 import threading
+from contextlib import contextmanager
 
 import mitsuba as mi
 
 PATIENCE = 4.0  # seconds
+
+
+@contextmanager
+def interruptions_kept():
+    """Within the block, an exception after Ctrl-C becomes KeyboardInterrupt: Mitsuba and Dr.Jit replace exceptions that
+    pass through them, and an error while a scene is loaded does not name its cause.
+
+    Only the main thread receives Ctrl-C; in another thread, and where Ctrl-C is ignored, the block has no effect.
+    """
+    before, heard = signal.getsignal(signal.SIGINT), False
+    if not callable(before) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def hear(*arguments):
+        nonlocal heard
+        heard = True
+        before(*arguments)
+
+    signal.signal(signal.SIGINT, hear)
+    try:
+        yield
+    except Exception as error:
+        if heard:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 class Interruption:

@@ -8,7 +8,7 @@ import numpy as np
 
 from . import batch, command_line, images, machine
 from .checkpoint import Checkpoint, file_of
-from .interruption import Deadline
+from .interruption import Deadline, interruptions_kept
 from .occasional import OccasionalWriter
 from .progress import ImageBar
 from .render import render
@@ -80,12 +80,13 @@ class Image:
 
     def run(self):
         """Render and write; return the exit status."""
-        if not self._remote:
-            self._scene.get()
         output = Output(self.path, self._options.exposure, self._checkpoint)
-        output.metadata = self._described | {"load_seconds": self._scene.seconds, **command_line.versions()}
         try:
-            image, took = self._render(output)
+            with interruptions_kept():
+                if not self._remote:
+                    self._scene.get()
+                output.metadata = self._described | {"load_seconds": self._scene.seconds, **command_line.versions()}
+                image, took = self._render(output)
         except KeyboardInterrupt:
             return output.end_early()
         if self._remote:

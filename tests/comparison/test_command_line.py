@@ -370,5 +370,31 @@ def test_interruption_reaches_a_process(tmp_path):
         assert any("The integrator is manylights" in line for line in iter(rendering.stdout.readline, ""))
         rendering.send_signal(signal.SIGINT)
         _, said = rendering.communicate(timeout=PATIENCE)
-    assert rendering.returncode == 130 and "interrupted" in said
+    assert rendering.returncode == 130 and "interrupted" in said, said
     assert all(file.name == "a.exr" for file in tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("moment", ["__init__", "render", "sample"])
+@pytest.mark.parametrize("more", [[], ["-v"]], ids=["quiet", "verbose"])
+def test_interruption_within_the_integrator(tmp_path, moment, more):
+    """Mitsuba replaces KeyboardInterrupt while it loads a scene, and after a second Ctrl-C in a pass."""
+    script = f"""
+import signal, sys
+import mitsuba as mi
+import manylights
+mi.set_variant({mi.variant()!r})
+from comparison.scene_files import SceneFile
+from integrators.gathering import GatheringIntegrator
+load, method = SceneFile.load, GatheringIntegrator.{moment}
+def interrupted(*given, **named):
+    signal.raise_signal(signal.SIGINT)
+    return method(*given, **named)
+def begin(*given):
+    GatheringIntegrator.{moment} = interrupted
+    return load(*given)
+SceneFile.load = begin
+sys.exit(manylights.main({[CORNELL, *TINY, "-o", str(tmp_path / "a.exr"), "--spp", "4", *more]!r}))
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == 130 and "nothing was written" in done.stderr, done.stderr
+    assert not list(tmp_path.iterdir())
