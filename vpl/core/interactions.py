@@ -1,4 +1,4 @@
-"""Where rays meet surfaces: triangles of all meshes in one array, other shapes by Mitsuba.
+"""Where rays meet surfaces: triangles of all meshes in one array, also inside instances, other shapes by Mitsuba.
 
 Mitsuba computes the surface interaction of a ray by a call of the shape that the ray hits.  Dr.Jit records such a call
 for every shape in memory, and kernels pass its arguments and results through memory.  Here one piece of code serves all
@@ -15,9 +15,10 @@ import mitsuba as mi
 import numpy as np
 
 from .arrays import upload
+from .instances import TriangleInstances
 from .meshes import is_hit_as_triangles, triangles_of
 from .registry import RegistryTable
-from .shapes import INSTANCE, registered_shapes
+from .shapes import INSTANCE, SceneShapes
 
 # Bits of a triangle: its corners have normals, they have coordinates of textures, its sides are exchanged
 _SMOOTH, _MAPPED, _FLIPPED = 1, 2, 4
@@ -33,11 +34,13 @@ class Interactions:
     must not change while the object is used.
     """
 
-    def __init__(self, scene, shapes: list | None = None):
-        """``shapes``: :func:`vpl.core.shapes.registered_shapes` of the scene, if known."""
-        self._scene, shapes = scene, registered_shapes(scene) if shapes is None else shapes
-        meshes = [(index, shape) for index, shape in shapes if is_hit_as_triangles(shape)]
-        others = [(index, shape) for index, shape in shapes if not is_hit_as_triangles(shape)]
+    def __init__(self, scene, shapes: SceneShapes | None = None):
+        """``shapes`` of the scene, if known."""
+        self._scene, shapes = scene, shapes or SceneShapes.of(scene)
+        self._instances = TriangleInstances(shapes.groups)
+        placed = {index for index, _ in self._instances.instances}
+        meshes = [(index, shape) for index, shape in shapes.own if is_hit_as_triangles(shape)] + self._instances.shapes
+        others = [row for row in shapes.own if not (is_hit_as_triangles(row[1]) or row[0] in placed)]
         self._others = [shape for _, shape in others]
         self._other = RegistryTable([index for index, _ in others], range(1, len(others) + 1))
         # The number of the first triangle of each mesh, from 1 on
@@ -53,10 +56,17 @@ class Interactions:
     def at(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """The surfaces that rays ``hit``."""
         active = active & hit.is_valid()
-        number = self._triangle.at(hit.shape, active)
+        instance = self._instances.number(hit, active) if self._instances.instances else None
+        shape = hit.shape if instance is None else self._instances.shape(hit, instance)
+        number = self._triangle.at(shape, active)
         on_mesh = number > 0
         other = self._on_others(ray, hit, active & ~on_mesh) if self._others else dr.zeros(mi.SurfaceInteraction3f)
-        si = dr.select(on_mesh, self._on_triangle(hit, number - 1 + hit.prim_index, on_mesh), other)
+        on_triangle = self._on_triangle(hit, number - 1 + hit.prim_index, on_mesh)
+        on_triangle.shape = shape
+        if instance is not None:
+            self._instances.place(on_triangle, instance, on_mesh)
+            on_triangle.instance = hit.instance
+        si = dr.select(on_mesh, on_triangle, other)
         si.t = dr.select(active, si.t, dr.inf)
         si.time, si.wavelengths = ray.time, ray.wavelengths
         si.initialize_sh_frame()
@@ -64,7 +74,7 @@ class Interactions:
         return si
 
     def _on_others(self, ray, hit, active) -> mi.SurfaceInteraction3f:
-        """Interactions with shapes that are no meshes, and with instances of shape groups."""
+        """Interactions with shapes that are no meshes, and with instances of groups that have such shapes."""
         if len(self._others) > _MOST_SWITCHED:
             return hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
         # Mitsuba tells the instance of a group, and on the CPU not the shape in the group
@@ -90,7 +100,7 @@ class Interactions:
         a, b, c = (mi.Point3f(record.xyz) for record in positions)
         along, across = b - a, c - a
         si = dr.zeros(mi.SurfaceInteraction3f)
-        si.t, si.p, si.shape, si.prim_index = hit.t, between(a, b, c), hit.shape, hit.prim_index
+        si.t, si.p, si.prim_index = hit.t, between(a, b, c), hit.prim_index
         flat = mi.Normal3f(dr.normalize(dr.cross(along, across)))
         facing = mi.Normal3f(dr.normalize(between(*(mi.Normal3f(record.xyz) for record in normals))))
         facing = dr.select(smooth, facing, flat)

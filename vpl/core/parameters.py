@@ -51,10 +51,12 @@ def children_of(node, kind: type) -> list:
     return [value for _, value, _ in _members(node) if isinstance(value, kind)]
 
 
-def matrix_of(transform, columns: Sequence[int] = range(4)) -> np.ndarray:
-    """Matrix of a transformation of one lane, or some of its columns, (4, columns) float64."""
+def matrix_of(transform, columns: Sequence[int] = range(4), of_normals: bool = False) -> np.ndarray:
+    """Matrix of a transformation of one lane, or some of its columns, (4, columns) float64; ``of_normals``: the matrix
+    that Mitsuba transforms normals by."""
     # Reading a number takes a microsecond, which counts for thousands of emitters
-    rows = ([row[column] for column in columns] for row in transform.matrix)
+    matrix = transform.inverse_transpose if of_normals else transform.matrix
+    rows = ([row[column] for column in columns] for row in matrix)
     return np.array([[x[0] if dr.is_jit_v(x) else x for x in row] for row in rows], np.float64)
 
 

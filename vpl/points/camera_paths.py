@@ -144,7 +144,7 @@ def scene_traits(scene) -> SceneTraits:
     listed = *open_shapes, *open_instances
     return SceneTraits(
         *lobes, transmissive, perturbed_shapes(shapes), listed, open_scene, Materials.of(shapes),
-        Interactions(scene, shapes.own),
+        Interactions(scene, shapes),
     )  # fmt: skip
 
 

@@ -36,6 +36,7 @@ def mesh(name, flip=False, normals=True, coordinates=True, seed=0, shift=0.0):
 
 
 def transform(seed):
+    # The axis has not the length 1: Mitsuba then takes normals of instances that are not perpendicular to surfaces
     turn = mi.ScalarTransform4f().rotate([1, 2, 3], 40.0 * seed)
     return mi.ScalarTransform4f().translate([0.2 * seed, -0.1, 0.3]) @ turn @ mi.ScalarTransform4f().scale([1, 0.5, 2])
 
@@ -59,6 +60,19 @@ OTHERS = {
     },
     "cylinder and disk": lambda: {
         "tube": {"type": "cylinder", "radius": 0.4}, "disk": {"type": "disk", "to_world": transform(3)}
+    },
+    "instances of triangles and of others": lambda: {
+        "first": {"type": "shapegroup", "plate": {"type": "rectangle"}, "mesh": mesh("inside", flip=True),
+                  "cube": {"type": "cube", "to_world": transform(2)}},
+        "second": {"type": "shapegroup", "mesh": mesh("bare", normals=False, coordinates=False, seed=2)},
+        "mixed": {"type": "shapegroup", "mesh": mesh("other", seed=3), "ball": {"type": "sphere", "radius": 0.5}},
+        **{f"copy{k}": {"type": "instance", "to_world": transform(k), "of": {"type": "ref", "id": of}}
+           for k, of in enumerate(["first", "second", "mixed", "first"])},
+    },
+    "mirrored instance": lambda: {
+        "group": {"type": "shapegroup", "mesh": mesh("inside"), "plate": {"type": "rectangle"}},
+        "copy": {"type": "instance", "to_world": transform(1) @ mi.ScalarTransform4f().scale([1, -1, 0.5]),
+                 "of": {"type": "ref", "id": "group"}},
     },
     "ellipsoids": lambda: {
         "drops": {
@@ -148,10 +162,17 @@ def test_an_edited_scene():
 def test_places_in_the_registry_and_numbers_of_equal_shapes_add_no_code():
     """Spheres and instances name themselves by their index in Mitsuba's registry."""
 
-    def operations(before, balls):
+    def operations(before, number, kind="ball"):
         others = [mi.load_dict({"type": "sphere"}) for _ in range(before)]
-        spheres = {f"ball{k}": {"type": "sphere", "center": [0.1 * k, 0, 0]} for k in range(balls)}
-        scene = mi.load_dict({"type": "scene", **spheres, **MESHES["several"]()})
+        if kind == "ball":
+            shapes = {f"ball{k}": {"type": "sphere", "center": [0.1 * k, 0, 0]} for k in range(number)}
+        else:
+            shapes = {
+                f"copy{k}": {"type": "instance", "to_world": transform(k), "of": {"type": "ref", "id": "group"}}
+                for k in range(number)
+            }
+            shapes = {"group": {"type": "shapegroup", "mesh": mesh("inside")}, **shapes}
+        scene = mi.load_dict({"type": "scene", **shapes, **MESHES["several"]()})
         ray, active = rays()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
@@ -163,6 +184,7 @@ def test_places_in_the_registry_and_numbers_of_equal_shapes_add_no_code():
 
     assert operations(0, 3) == operations(5, 3)
     assert operations(0, 10)[0] == operations(0, 3)[0]
+    assert operations(0, 2, "instance") == operations(5, 9, "instance")
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/scenes")
