@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import channel_mean, download, finite_or_zero, upload
+from ..core.morton import interleave, morton_order
 from ..core.parameters import fingerprint, parameters_of
 from ..core.sampling import RowChoice, independent_sampler
 from .environment_strata import cones, stratify
@@ -64,8 +65,11 @@ class EnvironmentRegions:
         block = max(1, width // _STRATA_WIDTH)
         sums = [a.reshape(height // block, block, width // block, block).sum((1, 3)) for a in (light, solid_angle)]
         coarse = stratify(sums[0] / sums[1], count)
-        self.axis, self.cone_cos = cones(coarse)
-        self.count = len(self.axis)
+        axis, cosine = cones(coarse)
+        # Neighbours have successive numbers, so that well spread numbers draw regions and cells spread over the sky
+        order = morton_order(axis)
+        self.axis, self.cone_cos, self.count = axis[order], cosine[order], len(order)
+        coarse = np.argsort(order)[coarse]
         labels = np.repeat(np.repeat(coarse, block, 0), block, 1).ravel()
         self.irradiance = np.bincount(labels, light.ravel(), self.count)
         self._tabulate(labels, light.ravel(), solid_angle.ravel(), width, height)
@@ -77,7 +81,9 @@ class EnvironmentRegions:
         share = np.where(total > 0, light / np.where(total > 0, total, 1), 0)
         share = (1 - _EVEN_SHARE) * share + _EVEN_SHARE * solid_angle / angle[labels]
         share[total == 0] = (solid_angle / angle[labels])[total == 0]
-        order = np.argsort(labels, kind="stable")
+        row, column = np.divmod(np.arange(width * height), width)
+        along_curve = interleave(np.stack([column, row, np.zeros_like(row)], 1))
+        order = np.lexsort((along_curve, labels))
         self._choice = RowChoice(share[order], np.bincount(labels, minlength=self.count))
         share[order] = self._choice.pmf
         cells = np.zeros(self._choice.place[-1] + 1, np.int64)

@@ -109,8 +109,10 @@ class LearnedEmitters(CellEmitters):
 
     def sample(self, si, cell, chosen, member, place, active) -> EmitterSample:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.sample`."""
-        source, probability, _ = self.choice.draw(cell, chosen, active)
-        sample = self._draw(si, source, member, place, active)
+        source, probability, rest = self.choice.draw(cell, chosen, active)
+        # Well spread numbers for the choice of a region and of a cell in it, like `chosen`, with the bits that it lacks
+        rest = dr.minimum(rest + member * (2.0**-24 / probability), dr.one_minus_epsilon(mi.Float))
+        sample = self._draw(si, source, rest, place, active)
         if not self._regions:
             return sample.chosen_with(probability)
         # The environment and its regions may draw the same direction: the density is the sum of both densities
