@@ -16,6 +16,7 @@
 - ``meshes``: triangles of meshes, by the names that Mitsuba gives them
 - ``shapes``: shapes of a scene and of its shape groups, by their index in Mitsuba's registry
 - ``interactions``: where rays meet surfaces
+- ``instances``: instances of shape groups of triangles
 - ``registry``: table from shapes, emitters or materials to numbers
 - ``materials``: calls of the materials of a scene's surfaces, without the code of other materials
 - ``exclusive``: objects for use by one thread at a time

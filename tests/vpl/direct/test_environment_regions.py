@@ -92,6 +92,25 @@ def test_regions_share_out_all_light(name):
     assert np.allclose(light.sum(0), expected, rtol=5e-3, atol=5 * expected_error.max())
 
 
+@pytest.mark.parametrize("name", SKIES)
+def test_successive_regions_and_cells_are_neighbours(name):
+    """So that well spread numbers draw directions that are spread over the sky."""
+    regions = EnvironmentRegions(environment(SKIES[name]()), 100)
+    if regions.count > 10:
+        rng = np.random.default_rng(0)
+        successive, random = (
+            np.einsum("ij,ij->i", axis[:-1], axis[1:]).mean() for axis in (regions.axis, rng.permutation(regions.axis))
+        )
+        assert 1 - successive < 0.6 * (1 - random)
+    numbers = np.tile((np.arange(64) + 0.5) / 64, regions.count)
+    index = upload(mi.UInt32, np.repeat(np.arange(regions.count), 64))
+    place = mi.Point2f(0.5)
+    unit = download(regions.sample(index, upload(mi.Float, numbers), place, mi.Bool(True))[0]).reshape(-1, 64, 3)
+    successive = np.linalg.norm(np.diff(unit, axis=1), axis=2).mean()
+    random = np.linalg.norm(np.diff(unit[:, np.random.default_rng(1).permutation(64)], axis=1), axis=2).mean()
+    assert successive < 0.6 * random
+
+
 def test_regions_of_a_constant_environment_fill_the_sphere():
     regions = EnvironmentRegions(environment(SKIES["constant"]()), 50)
     assert regions.count == 50

@@ -90,6 +90,56 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(emitter, learns):
     assert same.mean() > 0.98
 
 
+def test_well_spread_numbers_draw_directions_that_are_spread_over_the_sky():
+    box = closed_box(EMITTERS["envmap"]())
+    del box["ceiling"]
+    emitters, position, normal = learned(mi.load_dict(box))
+    count, rng = 4096, np.random.default_rng(0)
+    si = interactions(np.repeat(position[:1], count, 0), np.repeat(normal[:1], count, 0))
+    cell = emitters.cell(si.p, si.n)
+    assert np.array(cell)[0] > 0
+
+    def irregularity(chosen):
+        """Mean squared difference of the numbers of samples in parts of the sky for two sets of numbers."""
+        counts = []
+        for numbers in chosen:
+            rest = (upload(mi.Float, rng.random(count)) for _ in range(3))
+            member, place = next(rest), mi.Point2f(*rest)
+            unit = download(
+                emitters.sample(si, cell, upload(mi.Float, numbers), member, place, mi.Bool(True)).direction
+            )
+            around = np.arctan2(unit[:, 1], unit[:, 0]) / (2 * np.pi) + 0.5
+            parts = np.minimum((unit[:, 2] + 1) * 8, 15).astype(int) * 16 + np.minimum(around * 16, 15).astype(int)
+            counts.append(np.bincount(parts, minlength=256))
+        return np.mean(np.square(counts[0] - counts[1]))
+
+    spread = irregularity([(np.arange(count) + rng.random()) / count for _ in range(2)])
+    assert spread < 0.5 * irregularity([rng.random(count) for _ in range(2)])
+
+
+def test_rare_sources_draw_all_of_their_cells():
+    """A number that draws a source of little probability has few bits left for the cell."""
+    box = closed_box(EMITTERS["constant"]())
+    del box["ceiling"]
+    emitters, position, normal = learned(mi.load_dict(box))
+    regions, first = emitters._regions.count, emitters._count
+    share = np.zeros(first + regions)
+    share[first], share[first + 1] = 2.0**-23, 1 - 2.0**-23
+    emitters.choice._use(np.stack([share, share]))
+    count = 4096
+    si = interactions(np.repeat(position[:1], count, 0), np.repeat(normal[:1], count, 0))
+    # All numbers that draw the first region
+    number = upload(mi.Float, np.resize(np.arange(0, emitters.choice.pmf[1, first], 2.0**-24), count))
+    member, *place = (upload(mi.Float, np.random.default_rng(k).random(count)) for k in range(3))
+    sample = emitters.sample(si, mi.UInt32(1), number, member, mi.Point2f(*place), mi.Bool(True))
+    unit = download(sample.direction)
+    region, _ = emitters._regions.find(sample.direction, mi.Bool(True))
+    assert (download(region) == 0).mean() > 0.99
+    index = mi.UInt32(np.zeros(count, np.uint32))
+    expected = emitters._regions.sample(index, member, mi.Point2f(*place), mi.Bool(True))[0]
+    np.testing.assert_allclose(unit.std(0), download(expected).std(0), rtol=0.1)
+
+
 @pytest.mark.parametrize("emitter", ["constant", "envmap", "sunsky", "rectangle"])
 def test_rows_of_probabilities_are_positive_for_every_emitter_and_sum_to_one(emitter):
     """An environment is drawn by itself, too, beside its regions."""
