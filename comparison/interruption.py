@@ -11,32 +11,25 @@ import mitsuba as mi
 PATIENCE = 4.0  # seconds
 
 
+def is_interruption(error):
+    """Return whether an exception is KeyboardInterrupt or replaced it: Mitsuba and Dr.Jit replace exceptions that pass
+    through them. The new exception has the old one as its cause, or names it in its message."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt) or KeyboardInterrupt.__name__ in str(error):
+            return True
+        error = error.__cause__
+    return False
+
+
 @contextmanager
 def interruptions_kept():
-    """Within the block, an exception after Ctrl-C becomes KeyboardInterrupt: Mitsuba and Dr.Jit replace exceptions that
-    pass through them, and an error while a scene is loaded does not name its cause.
-
-    Only the main thread receives Ctrl-C; in another thread, and where Ctrl-C is ignored, the block has no effect.
-    """
-    before, heard = signal.getsignal(signal.SIGINT), False
-    if not callable(before) or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def hear(*arguments):
-        nonlocal heard
-        heard = True
-        before(*arguments)
-
-    signal.signal(signal.SIGINT, hear)
+    """Within the block, exceptions that replaced KeyboardInterrupt become KeyboardInterrupt again."""
     try:
         yield
     except Exception as error:
-        if heard:
+        if is_interruption(error):
             raise KeyboardInterrupt from error
         raise
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 class Interruption:

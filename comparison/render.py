@@ -23,7 +23,7 @@ from .denoising import Denoiser, for_denoising, quality_of
 from .ending import Ending
 from .features import Layers, channels_of, features_of
 from .fine_film import usual_parts
-from .interruption import Interruption
+from .interruption import Interruption, is_interruption
 from .rendering import Progressive
 from .scene_files import SceneFile
 from .timed_sizes import sizes_of
@@ -275,8 +275,7 @@ class _Render:
             # Mitsuba and Dr.Jit replace exceptions that they pass on
             if self._raised is not None:
                 raise self._raised from None
-            replaced = interruption.asked and isinstance(error, Exception)
-            if not (replaced or isinstance(error, KeyboardInterrupt)):
+            if not is_interruption(error):
                 raise
 
     def _listener(self):

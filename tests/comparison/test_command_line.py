@@ -375,9 +375,10 @@ def test_interruption_reaches_a_process(tmp_path):
 
 
 @pytest.mark.parametrize("moment", ["__init__", "render", "sample"])
-@pytest.mark.parametrize("more", [[], ["-v"]], ids=["quiet", "verbose"])
+@pytest.mark.parametrize("more", [["-v"], [str(ROOT / "scenes" / "glossy.xml")]], ids=["verbose", "two scenes"])
 def test_interruption_within_the_integrator(tmp_path, moment, more):
     """Mitsuba replaces KeyboardInterrupt while it loads a scene, and after a second Ctrl-C in a pass."""
+    output = tmp_path / "a.exr" if more == ["-v"] else tmp_path
     script = f"""
 import signal, sys
 import mitsuba as mi
@@ -393,8 +394,38 @@ def begin(*given):
     GatheringIntegrator.{moment} = interrupted
     return load(*given)
 SceneFile.load = begin
-sys.exit(manylights.main({[CORNELL, *TINY, "-o", str(tmp_path / "a.exr"), "--spp", "4", *more]!r}))
+sys.exit(manylights.main({[CORNELL, *more, *TINY, "-o", str(output), "--spp", "4"]!r}))
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
-    assert done.returncode == 130 and "nothing was written" in done.stderr, done.stderr
+    said = "interrupted before the first pass was finished; nothing was written"
+    assert done.returncode == 130 and done.stderr.count(said) == 1, done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def raising(error, cause=None, cleaning=None):
+    """Return a function that raises an error, with a cause, or `cleaning` in the clean-up after the error."""
+
+    def run():
+        try:
+            raise error from cause
+        finally:
+            if cleaning:
+                raise cleaning
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("run", "status"),
+    [
+        (raising(KeyboardInterrupt()), 130),
+        (raising(RuntimeError("while loading: Traceback: KeyboardInterrupt: ")), 130),
+        (raising(RuntimeError("custom operation"), KeyboardInterrupt()), 130),
+        (raising(RuntimeError("custom operation"), ValueError()), 1),
+        (raising(KeyboardInterrupt(), cleaning=OSError(28, "No space left")), 1),
+    ],
+    ids=["itself", "in a message", "as a cause", "another cause", "an error in the clean-up"],
+)
+def test_status_after_an_interruption(run, status, capsys):
+    assert command_line.exit_status("name", run, "all is well", False) == status
+    assert ("interrupted; all is well" in capsys.readouterr().err) == (status == 130)

@@ -29,7 +29,7 @@ class TriangleInstances:
     """
 
     def __init__(self, groups: list[ShapeGroup]):
-        groups = [one for one in groups if all(is_hit_as_triangles(shape) for _, shape in one.shapes)]
+        groups = [one for one in groups if one.instances and all(is_hit_as_triangles(shape) for _, shape in one.shapes)]
         self.shapes = [row for group in groups for row in group.shapes]
         self.instances = [row for group in groups for row in group.instances]
         # The place of a group's first shape among all of them, for each instance
@@ -47,11 +47,11 @@ class TriangleInstances:
         self._transforms = upload(mi.Float, transforms)
 
     def number(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.UInt32:
-        """Number of the instance that rays ``hit``, from 1 on; 0 elsewhere."""
+        """Numbers of the instances that rays meet, from 1 on; 0 for other surfaces."""
         return self._number.at(hit.instance, active)
 
     def shape(self, hit: mi.PreliminaryIntersection3f, number: mi.UInt32) -> mi.ShapePtr:
-        """The shape that rays ``hit``, in the instance with a ``number`` the shape of its group."""
+        """The shapes that rays meet; where ``number`` is that of an instance, the shape of its group."""
         if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
             return hit.shape
         # Mitsuba tells the place of the shape in its group

@@ -81,9 +81,10 @@ class EnvironmentRegions:
         share = np.where(total > 0, light / np.where(total > 0, total, 1), 0)
         share = (1 - _EVEN_SHARE) * share + _EVEN_SHARE * solid_angle / angle[labels]
         share[total == 0] = (solid_angle / angle[labels])[total == 0]
-        row, column = np.divmod(np.arange(width * height), width)
-        along_curve = interleave(np.stack([column, row, np.zeros_like(row)], 1))
-        order = np.lexsort((along_curve, labels))
+        columns, rows = (
+            interleave(np.arange(size)[:, None] * np.eye(3)[axis]) for axis, size in enumerate((width, height))
+        )
+        order = np.lexsort(((rows[:, None] | columns).ravel(), labels))
         self._choice = RowChoice(share[order], np.bincount(labels, minlength=self.count))
         share[order] = self._choice.pmf
         cells = np.zeros(self._choice.place[-1] + 1, np.int64)

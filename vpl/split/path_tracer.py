@@ -172,8 +172,9 @@ def _numbers_of_sample(numbers: tuple, number: mi.UInt32) -> tuple:
     once."""
 
     def shifted(value, step):
-        moved = value + mi.Float(number) * step
-        return dr.minimum(moved - dr.floor(moved), dr.one_minus_epsilon(mi.Float))
+        # Multiples of 2^-24, which wrap around without rounding
+        bits = mi.UInt32(value * 2.0**24) + number * mi.UInt32(round(step * 2**24))
+        return mi.Float(bits & (2**24 - 1)) * 2.0**-24
 
     # The last step is almost one half
     (chosen, place, lobe, turn), (*of_place, half) = numbers, SPREAD_STEPS

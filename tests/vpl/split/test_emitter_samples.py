@@ -19,6 +19,7 @@ from tests.support.statistics import assert_same_mean
 from vpl.split import start
 from vpl.split.cost_model import CostModel
 from vpl.split.emitter_samples import EmitterSamples
+from vpl.split.path_tracer import _numbers_of_sample
 from vpl.split.pilot import Pilot, relative_variance
 
 MODEL = CostModel().without_denoiser()
@@ -118,6 +119,20 @@ def test_images_that_are_denoised_take_fewer_samples():
     assert multiples[1] < multiples[0]
 
 
+@pytest.mark.parametrize("number", [0, 1, 9, 15])
+def test_numbers_of_a_sample_keep_their_last_bit_and_are_spread(number):
+    """Both multiples of 2^-24 and of 2^-23 choose with exact probabilities, see `LearnedEmitters.sample`."""
+    first = mi.Float(np.arange(2**12) * 2.0**-12 + 2.0**-24), mi.Point2f([0, 1 - 2.0**-24], [2.0**-24, 0.5])
+    numbers = _numbers_of_sample((first[0], first[1], 0.25, 0.5), mi.UInt32(number))
+    moved = [np.array(x, np.float64).ravel() * 2**24 for x in numbers[:2]]
+    for values in moved:
+        assert (values == values.round()).all() and (values >= 0).all() and (values < 2**24).all()
+    # All of them by the same amount, with the last bit
+    steps = np.round((moved[0] - np.array(first[0], np.float64) * 2**24) % 2**24)
+    assert (steps == steps[0]).all() and (steps[0] == 0) == (number == 0)
+    assert numbers[2:] == (0.25, 0.5)
+
+
 # ---------------------- Images ----------------------
 
 
@@ -176,7 +191,8 @@ def test_bsdf_samples_have_the_weight_of_the_other_samples(kind, four_samples):
     def pair(seed):
         return render(scene, "manylights", 64, seed, **more), render(scene, oracle, 256, seed, **more)
 
-    assert_same_mean(pair, 10, 0.008)
+    # Of 10 seeds, the spread is too large, and 40 more would follow
+    assert_same_mean(pair, 20, 0.008)
 
 
 def test_layers_sum_to_the_image(four_samples):

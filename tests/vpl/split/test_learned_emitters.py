@@ -117,7 +117,8 @@ def test_well_spread_numbers_draw_directions_that_are_spread_over_the_sky():
     assert spread < 0.5 * irregularity([rng.random(count) for _ in range(2)])
 
 
-def test_rare_sources_draw_all_of_their_cells():
+@pytest.mark.parametrize("step", [2.0**-23, 2.0**-24])
+def test_rare_sources_draw_all_of_their_cells(step):
     """A number that draws a source of little probability has few bits left for the cell."""
     box = closed_box(EMITTERS["constant"]())
     del box["ceiling"]
@@ -129,7 +130,7 @@ def test_rare_sources_draw_all_of_their_cells():
     count = 4096
     si = interactions(np.repeat(position[:1], count, 0), np.repeat(normal[:1], count, 0))
     # All numbers that draw the first region
-    number = upload(mi.Float, np.resize(np.arange(0, emitters.choice.pmf[1, first], 2.0**-24), count))
+    number = upload(mi.Float, np.resize(np.arange(0, emitters.choice.pmf[1, first], step), count))
     member, *place = (upload(mi.Float, np.random.default_rng(k).random(count)) for k in range(3))
     sample = emitters.sample(si, mi.UInt32(1), number, member, mi.Point2f(*place), mi.Bool(True))
     unit = download(sample.direction)

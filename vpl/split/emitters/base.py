@@ -85,7 +85,7 @@ class EmitterSampler(Protocol):
         """Sample a direction to an emitter for each vertex ``si``.
 
         ``chosen``, ``member``, ``place``: uniform numbers for the choice of a source, a part of the source, and a point
-        on the part.
+        on the part.  ``chosen``, a multiple of 2^-23 or 2^-24, may choose the part as well.
         """
         raise NotImplementedError
 

@@ -110,8 +110,10 @@ class LearnedEmitters(CellEmitters):
     def sample(self, si, cell, chosen, member, place, active) -> EmitterSample:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.sample`."""
         source, probability, rest = self.choice.draw(cell, chosen, active)
-        # Well spread numbers for the choice of a region and of a cell in it, like `chosen`, with the bits that it lacks
-        rest = dr.minimum(rest + member * (2.0**-24 / probability), dr.one_minus_epsilon(mi.Float))
+        # The rest of `chosen` draws the cell of a region, so that well spread numbers spread cells, too. `member` fills
+        # the gaps: `chosen` is a multiple of 2^-23 or 2^-24
+        rest += member * (2.0**-23 / probability)
+        rest = dr.minimum(rest - dr.floor(rest), dr.one_minus_epsilon(mi.Float))
         sample = self._draw(si, source, rest, place, active)
         if not self._regions:
             return sample.chosen_with(probability)
