@@ -59,7 +59,7 @@ def recovery_columns(*sampled):
 TABLES = {
     "overview": Table(
         {
-            "manylights": ("manylights_timed10_before", "manylights_timed10"),
+            "manylights": ("manylights_timed10",),
             "denoised": ("manylights_denoised10",),
             "path": ("lightcuts_path",),
             "samples": ("baselines_samples",),
@@ -129,9 +129,9 @@ TABLES = {
         (Column("ratio", ratio="speedup"), Column("over `independent`", ratio="independent_speedup")),
     ),
     "views": Table({"": ("manylights_views",)}, (Column("ratio", ratio="speedup"),), first="scene, view"),
-    "own": Table({"": ("manylights_own",)}, (Column("ratio", ratio="speedup"),)),
+    "own": Table({"": ("manylights_own_before", "manylights_own")}, (Column("ratio", ratio="speedup"),)),
     "timed10": Table(
-        {"": ("manylights_timed10_before", "manylights_timed10")},
+        {"": ("manylights_timed10",)},
         (
             Column("`path`: samples", "{path[samples]:.0f}"),
             Column("`manylights`: samples", "{manylights[samples]:.0f}"),
