@@ -58,7 +58,6 @@ from comparison.command_line import UsageError, parameter, positive
 from comparison.denoising import QUALITIES, for_denoising, import_oidn
 from comparison.features import FEATURES
 from comparison.images import check_extension, write
-from comparison.interruption import is_interruption
 from comparison.one_image import INTERRUPTED, Failed, Image, LazyScene
 from comparison.render import Took, render
 from comparison.scene_files import SceneFile
@@ -219,7 +218,7 @@ def run(options):
             try:
                 found = image.run()
             except Exception as error:
-                if not several or is_interruption(error):
+                if not several:
                     raise
                 if options.verbose:
                     traceback.print_exc()

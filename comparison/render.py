@@ -250,27 +250,28 @@ class _Render:
                 self._checkpoint.leave()
 
     def _run(self, sizes, interruption):
+
+        def interrupted():
+            return interruption.asked or self.progressive.should_stop()
+
         self._ending.mark(self.progressive.spp, self._elapsed())
         while self._ended_by is None:
             size = sizes.next(self.progressive.passes, self._elapsed())
             if isinstance(size, str):
                 self._ended_by = size
                 return
-            one = self._pass(size, interruption, sizes.is_probe)
+            one = self._pass(size, interrupted, sizes.is_probe)
             if one is not None:
                 self._look()
-            if one is None or self._stopped(interruption):
+            if one is None or interrupted():
                 self._ended_by = "time" if self.progressive.is_late() else "interruption"
 
-    def _stopped(self, interruption):
-        return interruption.asked or self.progressive.should_stop()
-
-    def _pass(self, size, interruption, is_probe):
+    def _pass(self, size, interrupted, is_probe):
         """Render a pass and return it, None after an interruption."""
         try:
             with listening(self._listener()) if self._progress else nullcontext():
                 # Ctrl-C also stops Mitsuba, so that the pass may be unfinished
-                return self.progressive.render(size, accept=lambda: not self._stopped(interruption), is_probe=is_probe)
+                return self.progressive.render(size, accept=lambda: not interrupted(), is_probe=is_probe)
         except BaseException as error:
             # Mitsuba and Dr.Jit replace exceptions that they pass on
             if self._raised is not None:

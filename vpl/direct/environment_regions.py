@@ -81,8 +81,9 @@ class EnvironmentRegions:
         share = np.where(total > 0, light / np.where(total > 0, total, 1), 0)
         share = (1 - _EVEN_SHARE) * share + _EVEN_SHARE * solid_angle / angle[labels]
         share[total == 0] = (solid_angle / angle[labels])[total == 0]
-        columns, rows = (
-            interleave(np.arange(size)[:, None] * np.eye(3)[axis]) for axis, size in enumerate((width, height))
+        # Codes along a Morton curve, whose third axis is not used
+        rows, columns = (
+            interleave(np.outer(np.arange(n), axis)) for n, axis in ((height, (0, 1, 0)), (width, (1, 0, 0)))
         )
         order = np.lexsort(((rows[:, None] | columns).ravel(), labels))
         self._choice = RowChoice(share[order], np.bincount(labels, minlength=self.count))

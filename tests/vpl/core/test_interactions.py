@@ -41,6 +41,14 @@ def transform(seed):
     return mi.ScalarTransform4f().translate([0.2 * seed, -0.1, 0.3]) @ turn @ mi.ScalarTransform4f().scale([1, 0.5, 2])
 
 
+def copies(*groups):
+    """An instance of each of the ``groups``, in different places."""
+    return {
+        f"copy{k}": {"type": "instance", "to_world": transform(k), "of": {"type": "ref", "id": group}}
+        for k, group in enumerate(groups)
+    }
+
+
 MESHES = {
     "bare": lambda: {"mesh": mesh("bare", normals=False, coordinates=False)},
     "with normals": lambda: {"mesh": mesh("smooth", coordinates=False)},
@@ -67,8 +75,7 @@ OTHERS = {
         "second": {"type": "shapegroup", "mesh": mesh("bare", normals=False, coordinates=False, seed=2)},
         "unused": {"type": "shapegroup", "mesh": mesh("unused", seed=4)},
         "mixed": {"type": "shapegroup", "mesh": mesh("other", seed=3), "ball": {"type": "sphere", "radius": 0.5}},
-        **{f"copy{k}": {"type": "instance", "to_world": transform(k), "of": {"type": "ref", "id": of}}
-           for k, of in enumerate(["first", "second", "mixed", "first"])},
+        **copies("first", "second", "mixed", "first"),
     },
     "mirrored instance": lambda: {
         "group": {"type": "shapegroup", "mesh": mesh("inside"), "plate": {"type": "rectangle"}},
@@ -86,8 +93,7 @@ OTHERS = {
     },
     "instances": lambda: {
         "group": {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.5}, "plate": {"type": "rectangle"}},
-        **{f"copy{k}": {"type": "instance", "to_world": transform(k), "of": {"type": "ref", "id": "group"}}
-           for k in range(2)},
+        **copies("group", "group"),
     },
 }  # fmt: skip
 
@@ -173,16 +179,14 @@ def test_an_edited_instance():
 def test_places_in_the_registry_and_numbers_of_equal_shapes_add_no_code():
     """Spheres and instances name themselves by their index in Mitsuba's registry."""
 
-    def operations(before, number, kind="ball"):
+    def balls(number):
+        return {f"ball{k}": {"type": "sphere", "center": [0.1 * k, 0, 0]} for k in range(number)}
+
+    def instances(number):
+        return {"group": {"type": "shapegroup", "mesh": mesh("inside")}, **copies(*["group"] * number)}
+
+    def operations(before, shapes):
         others = [mi.load_dict({"type": "sphere"}) for _ in range(before)]
-        if kind == "ball":
-            shapes = {f"ball{k}": {"type": "sphere", "center": [0.1 * k, 0, 0]} for k in range(number)}
-        else:
-            shapes = {
-                f"copy{k}": {"type": "instance", "to_world": transform(k), "of": {"type": "ref", "id": "group"}}
-                for k in range(number)
-            }
-            shapes = {"group": {"type": "shapegroup", "mesh": mesh("inside")}, **shapes}
         scene = mi.load_dict({"type": "scene", **shapes, **MESHES["several"]()})
         ray, active = rays()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -193,9 +197,9 @@ def test_places_in_the_registry_and_numbers_of_equal_shapes_add_no_code():
         longest = max(kernels, key=lambda one: one["operation_count"])
         return longest["operation_count"], longest["hash"]
 
-    assert operations(0, 3) == operations(5, 3)
-    assert operations(0, 10)[0] == operations(0, 3)[0]
-    assert operations(0, 1, "instance") == operations(5, 9, "instance")
+    assert operations(0, balls(3)) == operations(5, balls(3))
+    assert operations(0, balls(10))[0] == operations(0, balls(3))[0]
+    assert operations(0, instances(1)) == operations(5, instances(9))
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/scenes")
