@@ -55,7 +55,7 @@ def render_in_bands(integrator, scene, sensor, seed: int, samples: int, trace) -
     width, height = int(crop[0]) + 2 * border, int(crop[1]) + 2 * border
     rows = rows_of_a_band(film, samples)
     for number, first in enumerate(range(0, height, rows)):
-        if integrator.should_stop():
+        if integrator.stopped():
             break
         count = min(rows, height - first)
         sampler = sensor.sampler().clone()

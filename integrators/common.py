@@ -17,6 +17,7 @@ from vpl.direct.sources import Sources
 from vpl.lights.light_set import LightOptions, LightSet, prepare_lights
 from vpl.points.bsdf_proxies import probe_materials
 from vpl.points.camera_paths import PixelGrid
+from vpl.points.path_limits import PathLimits
 from vpl.points.surfaces import Batch, make_batches
 from vpl.transport.evaluation import Transport, mean_radiance
 
@@ -184,18 +185,19 @@ class ManyLightIntegrator(GatheringIntegrator):
     def _nee(self, scene, camera: CameraPass, grid):
         """Direct light of emitters with an extent, by a fixed number of samples: (radiance, shadow rays)."""
         return direct_light(
-            scene, ExtendedEmitters(scene, camera.emitters), camera.traits, camera.paths.points, self.max_depth,
-            self.emitter_samples, grid.samples, derived_seed(camera.seed, 30),
+            scene, ExtendedEmitters(scene, camera.emitters), camera.traits, camera.paths.points,
+            PathLimits.of(self.max_depth, self.rr_depth), self.emitter_samples, grid.samples,
+            derived_seed(camera.seed, 30),
         )  # fmt: skip
 
     def _adaptive(self, scene, camera: CameraPass, grid):
         """Direct light of emitters with an extent, by adaptive sampling: (radiance, shadow rays)."""
         # Point, spot and directional emitters are virtual lights already
         sources = Sources(scene, camera.emitters.extended_only())
-        options = DirectOptions(error=self.direct_error)
+        options = DirectOptions(error=self.direct_error, rr_depth=self.rr_depth)
         found = light_directly(
             scene, camera.traits, sources, camera.paths.points, grid, self.max_depth, options,
-            derived_seed(camera.seed, 30), self.should_stop,
+            derived_seed(camera.seed, 30), self.stopped,
         )  # fmt: skip
         return found.radiance, whole_sum(found.shadow_rays)
 
@@ -204,7 +206,7 @@ class ManyLightIntegrator(GatheringIntegrator):
         prepared = self._prepare(scene, sampler, camera)
         radiance, totals = prepared.direct, {}
         for job in prepared.jobs:
-            if self.should_stop():
+            if self.stopped():
                 break
             part = self.shade(job)
             add_at(radiance, part.radiance, job.batch.index)
@@ -231,7 +233,7 @@ class ManyLightIntegrator(GatheringIntegrator):
             ray = dr.gather(mi.UInt32, points.ray, batch.index)
             weight = dr.gather(type(points.weight), points.weight, batch.index)
             share = batch.count / points.count
-            jobs.append(ShadeJob(transport, batch, direct, 0.0, share, stream, ray, weight, grid, self.should_stop))
+            jobs.append(ShadeJob(transport, batch, direct, 0.0, share, stream, ray, weight, grid, self.stopped))
             if self.needs_trees:
                 level = mean_radiance(transport, batch, derived_seed(seed, 32, number))
                 mean += (level + float(download(direct).mean(dtype="float64"))) * share

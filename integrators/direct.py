@@ -81,7 +81,7 @@ class DirectLightIntegrator(GatheringIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        self._in_base, self._band = False, None
+        self._in_base, self._band, self._is_black = False, None, False
 
     def options(self) -> DirectOptions:
         """Options of :func:`vpl.direct.adaptive.light_directly`, from the knobs of the same names."""
@@ -99,9 +99,26 @@ class DirectLightIntegrator(GatheringIntegrator):
                 return super()._render(scene, sensor, seed, spp, develop, evaluate)
             finally:
                 self._in_base = False
+        self._clear_stop(scene)
         with dr.suspend_grad():
             self._render_bands(scene, sensor, int(mi.UInt32(seed)[0]), samples)
         return sensor.film().develop() if develop else mi.TensorXf()
+
+    def _clear_stop(self, scene) -> None:
+        """Begin the time of ``timeout``, and forget that an earlier render was cancelled.  Only Mitsuba's ``render``
+        does that: here for a black image of one pixel."""
+        film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+        self._is_black = True
+        try:
+            super()._render(scene, mi.load_dict({"type": "perspective", "film": film}), 0, 1, False, True)
+        finally:
+            self._is_black = False
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        """See :meth:`integrators.gathering.GatheringIntegrator.sample`."""
+        if self._is_black:
+            return mi.Spectrum(0), mi.Bool(False), [mi.Float(0)] * len(self.aovs)
+        return super().sample(scene, sampler, ray, medium, active)
 
     def _render_bands(self, scene, sensor, seed: int, samples: int) -> None:
         """Render the bands with a common mean radiance and a common time limit."""
@@ -148,7 +165,7 @@ class DirectLightIntegrator(GatheringIntegrator):
             options, level = replace(options, time=self._band.time), self._band.level
         found = light_directly(
             scene, camera.traits, sources, points, self.pixel_grid(scene, sampler), self.max_depth, options,
-            derived_seed(camera.seed, 30), self.should_stop, level,
+            derived_seed(camera.seed, 30), self.stopped, level,
         )  # fmt: skip
         camera.clock.stop()
         counts = {"sources": sources.count, "shadow_rays": whole_sum(found.shadow_rays)}

@@ -126,6 +126,13 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         refuse_media(scene)
         bounding_sphere(scene)
 
+    def stopped(self) -> bool:
+        """Whether this render was cancelled, or has taken the time of ``timeout``.
+
+        Never below a wrapper: Mitsuba asks the wrapper, and this integrator keeps the answer of its last own render.
+        """
+        return self._sensor is not None and self.should_stop()
+
     def _refuse_recording(self):
         """Raise RuntimeError while ``dr.freeze`` records."""
         if dr.flag(dr.JitFlag.FreezingScope):

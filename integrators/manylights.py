@@ -284,7 +284,7 @@ class ManyLightsIntegrator(PassRenderer):
             return dr.zeros(mi.Spectrum, view.count), dr.zeros(mi.Bool, view.count), none
         kept = self._kept if self.keep_lights else None
         before = start.measured
-        found = estimate(view, start, kept, self.should_stop, clock)
+        found = estimate(view, start, kept, self.stopped, clock)
         # Later passes share the pilot and its measurements
         self.statistics = found.statistics | {"pilots": int(known is None), "measured": start.measured - before}
         # Mitsuba's passes of `samples_per_pass` have the same size in larger renders

@@ -218,6 +218,23 @@ def test_alpha_is_that_of_path_with_and_without_an_environment():
         assert np.allclose(*alphas, atol=0.3) and np.allclose(alphas[0].mean(), alphas[1].mean(), atol=0.02)
 
 
+@pytest.mark.parametrize("max_depth", [1, 2, 8])
+@pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])
+def test_alpha_is_that_of_path_behind_masks_and_thin_glass(name, max_depth):
+    camera = sensor(16, spp=64)
+    camera["film"]["pixel_format"] = "rgba"
+    sheet = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(2)}
+    behind = mi.ScalarTransform4f().translate([0.5, 0, -0.5])
+    masks = {
+        "front": sheet | {"bsdf": {"type": "mask", "opacity": 0.3, "nested": {"type": "diffuse"}}},
+        "back": sheet | {"to_world": behind, "bsdf": {"type": "mask", "opacity": 0.5, "nested": {"type": "plastic"}}},
+        "pane": sheet | {"to_world": behind @ behind, "bsdf": {"type": "thindielectric"}},
+    }
+    scene = mi.load_dict({"type": "scene", "sensor": camera, "bulb": {"type": "point"}, **masks})
+    ours, path = (render(scene, one, 64, max_depth=max_depth)[..., 3] for one in (name, "path"))
+    assert np.allclose(ours, path, atol=0.35) and np.allclose(ours.mean(), path.mean(), atol=0.015)
+
+
 @pytest.mark.parametrize(("first", "store"), [(1, 1 << 24), (2, 300), (16, 0)])
 @pytest.mark.parametrize("most", [0, 5])
 def test_cuts_do_not_depend_on_rounds_and_memory(monkeypatch, first, store, most):

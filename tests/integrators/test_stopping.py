@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from integrators import bands
 from tests.support.paths import ROOT
 from tests.support.processes import PATIENCE
 from tests.support.rendering import render
@@ -48,6 +49,30 @@ def test_sizes_of_kernels_do_not_change_the_image(monkeypatch, scene, name):
     expected = render(scene, create(name))
     small_kernels(monkeypatch)
     np.testing.assert_allclose(render(scene, create(name)), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_an_image_in_bands_does_not_stop_because_of_an_earlier_render(monkeypatch, scene):
+    plugin = mi.load_dict({"type": "adaptivedirect"})
+    expected = render(scene, plugin)
+    monkeypatch.setattr(bands, "LARGEST_BAND", 24 * 4 * 8)
+    plugin.cancel()
+    assert plugin.should_stop()
+    np.testing.assert_allclose(render(scene, plugin).mean(), expected.mean(), rtol=0.05)
+
+
+def test_timeout_ends_an_image_in_bands(monkeypatch, scene):
+    monkeypatch.setattr(bands, "LARGEST_BAND", 24 * 4 * 8)
+    whole, limited = (mi.load_dict({"type": "adaptivedirect", "timeout": seconds}) for seconds in (60.0, 0.01))
+    assert render(scene, limited).mean() < 0.9 * render(scene, whole).mean()
+
+
+@pytest.mark.parametrize("name", ["lightcuts", "manylights"])
+def test_below_a_wrapper_nothing_stops_because_of_an_earlier_render(scene, name):
+    plugin = mi.load_dict({"type": name, "max_depth": 4})
+    wrapper = mi.load_dict({"type": "moment", "nested": plugin})
+    expected = render(scene, wrapper)[..., :3].mean()
+    plugin.cancel()
+    np.testing.assert_allclose(render(scene, wrapper)[..., :3].mean(), expected, rtol=1e-3)
 
 
 # A separate process, which a stale handler would end

@@ -18,10 +18,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import chunks, download, upload, upload_limit
+from ..core.arrays import chunks, download, upload
 from ..core.sampling import derived_seed
 from ..points.bsdf_proxies import probe_materials
 from ..points.camera_paths import GatherPoints, PixelGrid
+from ..points.path_limits import PathLimits
 from ..points.surfaces import Batch, LambertianSurface, make_batches
 from .all_sources import SourceRounds
 from .cluster_cuts import GroupCuts, cut_clusters, has_wide_source
@@ -48,7 +49,8 @@ class DirectOptions:
     """Properties of ``adaptivedirect`` and ``unoccludeddirect``, under the same names.
 
     ``lights``: "clusters", "all" or "auto"; or "unoccluded", the reference method.  ``cluster_angle``: steradians [IAS
-    section 5.7]; ``max_passes``, ``max_samples`` of a pixel: [IAS section 5.9]; ``time``: seconds, 0 for no limit.
+    section 5.7]; ``max_passes``, ``max_samples`` of a pixel: [IAS section 5.9]; ``time``: seconds, 0 for no limit;
+    ``rr_depth``: see :class:`vpl.points.path_limits.PathLimits`.
     """
 
     error: float = 0.03
@@ -60,6 +62,7 @@ class DirectOptions:
     samples_per_ray: int = 100
     bsdf_share: float = 0.125
     time: float = 0.0
+    rr_depth: int = 5
 
 
 @dataclass
@@ -116,7 +119,7 @@ class _BatchLight:
     def __init__(self, scene, traits, sources, points, batch: Batch, grid, max_depth, options, seed: int):
         self.batch, self.options, self.grid, self.nodes = batch, options, grid, sources.nodes
         self._common = scene, traits, sources, batch
-        self._beyond = upload_limit(max_depth) if traits.delta and max_depth > 2 else None
+        self._beyond = PathLimits.of(max_depth, options.rr_depth) if traits.delta and max_depth > 2 else None
         self.rows = download(batch.index)
         pixel = download(points.ray)[self.rows].astype(np.int64) // grid.samples
         position, normal = download(batch.position), download(batch.normal)

@@ -173,10 +173,10 @@ def _bsdf_sample(context: PassContext, site: _Site, random):
     radiance, rank, source_pdf = context.sources.find(hit, ray, going)
     pdf = source_pdf * _probability_of(context, site, rank, going)
     radiance *= power_heuristic(site.bsdf_samples * bsdf_pdf, site.samples * pdf)
-    if context.max_depth is not None:
-        beyond = context.traits.interactions.at(hit, ray, going)
+    if context.beyond is not None:
+        surface_hit = context.traits.interactions.at(hit, ray, going)
         radiance += emission_beyond_delta(
-            context.sources.emitters, context.traits, beyond, surface.depth + 1, context.max_depth, random, going,
+            context.sources.emitters, context.traits, surface_hit, surface.depth + 1, context.beyond, random, going,
         )  # fmt: skip
     return finite_or_zero(weight * radiance) & going
 

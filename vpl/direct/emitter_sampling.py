@@ -11,12 +11,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import finite_or_zero, upload_limit
+from ..core.arrays import finite_or_zero
 from ..core.loops import recorded_once
 from ..core.sampling import Choice, SpreadSamples, derived_seed, independent_sampler
 from ..lights.emission import bounding_sphere, other_power
 from ..lights.emitters import Emitters
 from ..points.camera_paths import GatherPoints, emitted_towards
+from ..points.path_limits import PathLimits
 
 _UNIFORM_SHARE = 0.5
 
@@ -80,7 +81,7 @@ class ExtendedEmitters:
         return density
 
 
-def _scattered_emission(extended: ExtendedEmitters, traits, si, sample, depth, max_depth, sampler, active):
+def _scattered_emission(extended: ExtendedEmitters, traits, si, sample, depth, limits, sampler, active):
     """Emitted radiance along a BSDF sample, MIS-weighted; beyond delta surfaces the weight is 1."""
     direction = si.to_world(sample.wo)
     hit = traits.interactions.meet(si.spawn_ray(direction), active)
@@ -88,36 +89,41 @@ def _scattered_emission(extended: ExtendedEmitters, traits, si, sample, depth, m
     radiance = emitted_towards(extended.emitters, hit, active) * weight
     if traits.delta:
         edges = mi.UInt32(depth) + 1
-        radiance += emission_beyond_delta(extended.emitters, traits, hit, edges, max_depth, sampler, active)
+        radiance += emission_beyond_delta(extended.emitters, traits, hit, edges, limits, sampler, active)
     return finite_or_zero(radiance)
 
 
 @dr.syntax
-def emission_beyond_delta(emitters: Emitters, traits, hit, depth, max_depth, sampler, active):
+def emission_beyond_delta(emitters: Emitters, traits, hit, depth, limits: PathLimits, sampler, active):
     """Emitted radiance that a ray finds through mirrors, glass and masks.
 
-    ``hit``: first surface of the ray; ``depth``: edges from the camera to ``hit``.
+    ``hit``: first surface of the ray; ``depth``: edges from the camera to ``hit``.  Russian roulette knows the
+    throughput from ``hit`` alone.
     """
     hit, depth = mi.SurfaceInteraction3f(hit), mi.UInt32(depth)
     radiance = dr.zeros(mi.UnpolarizedSpectrum, dr.width(hit.p))
     factor = dr.full(mi.UnpolarizedSpectrum, 1, dr.width(hit.p))
-    going = active & hit.is_valid() & (depth < max_depth)
-    while dr.hint(going, exclude=[emitters, traits, max_depth]):
+    eta, going = mi.Float(1), active & hit.is_valid() & (depth < limits.max_depth)
+    while dr.hint(going, exclude=[emitters, traits, limits]):
         onward, share = hit.bsdf().sample(mi.BSDFContext(), hit, sampler.next_1d(going), sampler.next_2d(going), going)
         going &= mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
         factor *= mi.unpolarized_spectrum(share)
+        eta *= onward.eta
         hit = traits.interactions.meet(hit.spawn_ray(hit.to_world(onward.wo)), going)
         radiance += dr.select(going, factor * emitted_towards(emitters, hit, going), 0)
+        survival = limits.survival(factor, eta, depth)
         depth += 1
-        going &= hit.is_valid() & (depth < max_depth) & (dr.max(factor) > 0)
+        going &= hit.is_valid() & (depth < limits.max_depth) & (dr.max(factor) > 0)
+        going &= sampler.next_1d() < survival
+        factor /= survival
     return radiance
 
 
 @recorded_once
 @dr.syntax
 def direct_light(
-    scene, extended: ExtendedEmitters, traits, points: GatherPoints, max_depth, samples: int, rays_per_pixel: int,
-    seed: int,
+    scene, extended: ExtendedEmitters, traits, points: GatherPoints, limits: PathLimits, samples: int,
+    rays_per_pixel: int, seed: int,
 ):  # fmt: skip
     """Direct light of ``extended`` at every gather point: (radiance, number of shadow rays).
 
@@ -129,7 +135,6 @@ def direct_light(
         return dr.zeros(mi.UnpolarizedSpectrum, points.count), 0
     sampler = independent_sampler(seed, points.count)
     context = mi.BSDFContext()
-    limit = upload_limit(max_depth)
     total, of_pixel = dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, rays_per_pixel)
     pixel = points.ray // of_pixel
     first = (points.ray - pixel * of_pixel) * total
@@ -138,7 +143,7 @@ def direct_light(
     k = mi.UInt32(0)
     while dr.hint(
         k < total,
-        exclude=[scene, extended, traits, points, si, bsdf, context, limit, first, total, to_emitters, to_directions],
+        exclude=[scene, extended, traits, points, si, bsdf, context, limits, first, total, to_emitters, to_directions],
     ):
         # ---- Emitter sampling
         choice, *sample = to_emitters.at(first + k)
@@ -157,7 +162,7 @@ def direct_light(
         choice, *sample = to_directions.at(first + k)
         sample, value = bsdf.sample(context, si, choice, mi.Point2f(*sample))
         smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Smooth) & dr.any(mi.unpolarized_spectrum(value) > 0)
-        found = _scattered_emission(extended, traits, si, sample, points.depth, limit, sampler, smooth)
+        found = _scattered_emission(extended, traits, si, sample, points.depth, limits, sampler, smooth)
         radiance += dr.select(smooth, finite_or_zero(mi.unpolarized_spectrum(value) * found), 0)
         k += 1
     radiance /= mi.Float(total)

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..core.arrays import upload
 from ..points.camera_paths import SceneTraits
+from ..points.path_limits import PathLimits
 from ..points.surfaces import Batch
 from .cluster_cuts import GroupCuts
 from .sites import Sites
@@ -87,7 +88,7 @@ class PassContext:
     """Context shared by the lanes of a pass.
 
     ``importance``, ``probability``: one value per entry; without ``probability`` every cluster is sampled.
-    ``max_depth``: None if no path continues through delta surfaces beyond a gather point.
+    ``beyond``: limits of the paths that continue through delta surfaces beyond a gather point; None if none does.
     """
 
     scene: mi.Scene
@@ -95,7 +96,7 @@ class PassContext:
     sources: Sources
     batch: Batch
     table: SiteTable
-    max_depth: mi.UInt32 | None
+    beyond: PathLimits | None
     importance: mi.Float | None = None
     statistics: Statistics | None = None
     probability: mi.Float | None = None

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import add_at, channel_mean, download, finite_or_zero, ones, upload, upload_limit
+from ..core.arrays import add_at, channel_mean, download, finite_or_zero, ones, upload
 from ..core.interactions import Interactions
 from ..core.materials import Materials
 from ..core.morton import morton_order
@@ -23,6 +23,8 @@ from ..core.sampling import derived_seed, independent_sampler
 from ..core.shapes import SceneShapes
 from ..lights.emitters import Emitters
 from ..lights.perturbed import perturbed_shapes
+from .alpha import opaque_rays
+from .path_limits import PathLimits
 
 # Least probability of the delta and of the smooth lobes, unless their reflectance is zero
 _LEAST_PROBABILITY = 0.05
@@ -114,7 +116,8 @@ class GatherPoints:
 class CameraPaths:
     """Result of following camera rays.
 
-    ``emission``: per camera ray, radiance of directly visible emitters; ``valid``: whether the ray hits a surface.
+    ``emission``: per camera ray, radiance of directly visible emitters; ``valid``: whether the ray is opaque in the
+    film's alpha (without the sky, see :mod:`vpl.points.alpha`).
     """
 
     emission: mi.UnpolarizedSpectrum
@@ -197,17 +200,23 @@ def emitted_towards(emitters: Emitters, si, active=True):
     return emission
 
 
-def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughput, depth, path_settings, skip, active):
+def _surfaces(scene, traits: SceneTraits, ray, coherent, skip, active):
+    """The nearest surfaces on rays; ``skip``: see :func:`follow_camera_rays`."""
+    if skip is None:
+        return traits.interactions.meet(ray, active, coherent)
+    return traits.interactions.at(skip(scene, ray, True, active), ray, active)
+
+
+def _wave(
+    scene, emitters: Emitters, traits: SceneTraits, random, ray, throughput, depth, limits: PathLimits, skip, active
+):  # fmt: skip
     """One edge of the camera paths, evaluated in one kernel.
 
     ``skip``: None, or a function that intersects rays with non-emitting surfaces only (hidden emitters).  Returns
-    emission, hit mask, (gather mask, surface interaction, weight), (mask, ray, throughput) of continuing paths.
+    emission, hit mask, mask of hits that may be passed unscattered, (gather mask, surface interaction, weight), (mask,
+    ray, throughput) of continuing paths.
     """
-    max_depth, rr_depth = path_settings
-    if skip is None:
-        si = traits.interactions.meet(ray, active, depth == 1)
-    else:
-        si = traits.interactions.at(skip(scene, ray, True, active), ray, active)
+    si = _surfaces(scene, traits, ray, depth == 1, skip, active)
     hit = active & si.is_valid()
     emission = dr.zeros(mi.UnpolarizedSpectrum, dr.width(ray.d))
     if skip is None:
@@ -219,21 +228,21 @@ def _wave(scene, emitters: Emitters, traits: SceneTraits, random, ray, throughpu
     direction, following, eta = mi.Vector3f(0, 0, 1), mi.UnpolarizedSpectrum(0), mi.Float(1)
     if traits.delta:
         # The next surface is too deep to gather, so following both costs no additional gather point
-        both = depth + 1 == max_depth
+        both = depth + 1 == limits.max_depth
         goes_on, stays, direction, following, eta, smooth_weight = _follow_delta(si, bsdf, flags, both, *random[:3])
-    gathered = hit & mi.has_flag(flags, mi.BSDFFlags.Smooth) & stays & (depth < max_depth)
+    gathered = hit & mi.has_flag(flags, mi.BSDFFlags.Smooth) & stays & (depth < limits.max_depth)
     weight = throughput * smooth_weight
     if traits.delta:
         following *= throughput
-        survival = dr.minimum(dr.max(following) * dr.square(eta), 0.95)
-        roulette = depth >= rr_depth
-        goes_on &= hit & (depth < max_depth) & dr.any(following > 0) & (~roulette | (random[3] < survival))
-        following = dr.select(roulette, following / survival, following)
+        survival = limits.survival(following, eta, depth)
+        goes_on &= hit & (depth < limits.max_depth) & dr.any(following > 0) & (random[3] < survival)
+        following /= survival
     next_ray = si.spawn_ray(direction)
     # Widen uniform fields, which have a single entry, because points are gathered and scattered by index
     si = dr.select(gathered, si, dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d)))
-    dr.eval(emission, hit, gathered, si, weight, goes_on, next_ray.o, next_ray.d, following)
-    return emission, hit, (gathered, si, weight), (goes_on, next_ray, following)
+    passable = hit & mi.has_flag(flags, mi.BSDFFlags.Null) if traits.null else mi.Bool(False)
+    dr.eval(emission, hit, passable, gathered, si, weight, goes_on, next_ray.o, next_ray.d, following)
+    return emission, hit, passable, (gathered, si, weight), (goes_on, next_ray, following)
 
 
 def follow_camera_rays(
@@ -250,19 +259,20 @@ def follow_camera_rays(
     ray.maxt += dr.zeros(mi.Float, count)
     lane = dr.arange(mi.UInt32, count)
     active = mi.Bool(active) & (lane < dr.opaque(mi.UInt32, count))
-    path_settings = (upload_limit(max_depth), dr.opaque(mi.UInt32, rr_depth))
+    limits = PathLimits.of(max_depth, rr_depth)
     throughput, depth = ones(count), 1
     found = None
     while True:
         random = (sampler.next_1d(), sampler.next_2d(), sampler.next_1d(), sampler.next_1d()) if traits.delta else None
         # Opaque: the waves of all depths share one kernel
         dr.make_opaque(ray, active, throughput, random)
-        emitted, hit, gathered, going = _wave(
-            scene, emitters, traits, random, ray, throughput, dr.opaque(mi.UInt32, depth), path_settings, skip, active
+        emitted, hit, passable, gathered, going = _wave(
+            scene, emitters, traits, random, ray, throughput, dr.opaque(mi.UInt32, depth), limits, skip, active
         )
-        skip = None
         if found is None:
             emission, valid = emitted, hit
+            if traits.null:
+                _open_masks(scene, traits, ray, skip, limits, derived_seed(seed, 4), valid, passable)
             mask, si, weight = gathered
             found = (mask, si, weight, dr.full(mi.UInt32, 1, count))
             dr.eval(found)
@@ -271,6 +281,7 @@ def follow_camera_rays(
             # A ray that continued beside a gather point finds no second one
             for target, value in zip(found, (*gathered, mi.UInt32(depth)), strict=True):
                 dr.scatter(target, value, lane, gathered[0])
+        skip = None
         if not traits.delta:
             break
         onward = dr.compress(going[0])
@@ -283,6 +294,17 @@ def follow_camera_rays(
         depth, active = depth + 1, dr.full(mi.Bool, True, len(onward))
         sampler = independent_sampler(derived_seed(seed, 3, depth), len(onward))
     return CameraPaths(emission, valid, _collect(*found, along_curve))
+
+
+def _open_masks(scene, traits, ray, skip, limits: PathLimits, seed: int, valid, passable) -> None:
+    """Remove from the mask ``valid`` the rays that pass unscattered what they meet; ``passable``: those that may."""
+    lanes = dr.compress(passable)
+    if len(lanes) == 0:
+        return
+    maxt, ray = ray.maxt, mi.Ray3f(*(dr.gather(type(x), x, lanes) for x in (ray.o, ray.d, ray.time)))
+    ray.maxt = dr.gather(mi.Float, maxt, lanes)
+    si = _surfaces(scene, traits, ray, mi.Bool(True), skip, mi.Bool(True))
+    dr.scatter(valid, opaque_rays(traits, si, limits, independent_sampler(seed, len(lanes))), lanes)
 
 
 def _collect(mask, si, weight, depth, along_curve: bool) -> GatherPoints:

@@ -29,6 +29,7 @@ from ..core.loops import recorded_once
 from ..core.sampling import SPREAD_STEPS
 from ..direct.emitter_sampling import power_heuristic
 from ..points.camera_paths import SceneTraits
+from ..points.path_limits import throughput_survival
 from ..transport.carried_share import carried_share
 from ..transport.minorant import agrees
 from .contributions import Contributions, LayerSums
@@ -36,7 +37,7 @@ from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
 from .gather_vertices import Gathered, GatherVertices, SecondVertices
 from .lattice import Lattice
 from .path_state import FirstEdge, Gathering, Hit, Noise, Path, PathSettings, State, Traced, Vertex
-from .roulette import residual_survival, throughput_survival
+from .roulette import residual_survival
 
 
 @recorded_once

@@ -9,7 +9,7 @@ image.
    brightness of the pixel.  The multiple m has the least variance × cost (:func:`best_multiple`).  [Vorba and Křivánek
    2016, "Adjoint-driven Russian roulette"; Rath et al. 2022, "EARS: efficiency-aware Russian roulette", eq. 14: the
    best probability is proportional to the root of variance over cost.]
-3. **Throughput.**  The rule of Mitsuba's ``path`` from ``rr_depth`` on (:func:`throughput_survival`).
+3. **Throughput.**  The rule of Mitsuba's ``path`` from ``rr_depth`` on (:mod:`vpl.points.path_limits`).
 """
 
 from __future__ import annotations
@@ -85,12 +85,6 @@ def residual_survival(residual, full, applies):
     """Probability by rule 1: the ratio of the spectra ``residual`` and ``full``; 1 where the rule does not apply."""
     left = dr.max(dr.abs(residual)) / dr.max(dr.abs(full))
     return dr.select(applies & dr.isfinite(left), dr.clip(left, _LEAST_RESIDUAL, 1), 1)
-
-
-def throughput_survival(largest, eta, applies):
-    """Probability by rule 3, like Mitsuba's ``path``; ``largest``: component of the throughput; 1 where the rule does
-    not apply."""
-    return dr.select(applies, dr.minimum(largest * dr.square(eta), 0.95), 1)
 
 
 def best_multiple(

@@ -1,0 +1,36 @@
+"""Camera rays that are opaque in the film's alpha, as in Mitsuba's ``path``."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.loops import recorded_once
+from .path_limits import PathLimits
+
+
+@recorded_once
+@dr.syntax
+def opaque_rays(traits, si: mi.SurfaceInteraction3f, limits: PathLimits, sampler):
+    """Mask of rays whose paths scatter at a surface, and do not only pass masks and thin glass, evaluated.
+
+    ``traits`` of the scene; ``si``: the first surface of each ray.
+    """
+    si, depth, opaque = mi.SurfaceInteraction3f(si), mi.UInt32(1), mi.Bool(False)
+    going = si.is_valid()
+    while dr.hint(going, exclude=[traits, limits]):
+        numbers = sampler.next_1d(), sampler.next_2d()
+        onward = traits.materials.call(si.bsdf(), _sampled, si, *numbers, active=going)
+        passes = going & mi.has_flag(onward.sampled_type, mi.BSDFFlags.Null)
+        opaque |= going & ~passes
+        passes &= depth < limits.max_depth
+        si = traits.interactions.meet(si.spawn_ray(si.to_world(onward.wo)), passes)
+        depth += 1
+        going = passes & si.is_valid()
+    dr.eval(opaque)
+    return opaque
+
+
+def _sampled(bsdf, si, lobe, direction, active):
+    sample, _ = bsdf.sample(mi.BSDFContext(), si, lobe, direction, active)
+    return sample
