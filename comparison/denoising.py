@@ -90,11 +90,13 @@ class Denoiser:
     `quality`, or else the fastest one, would take more than a third of the `time_limit`. `quality`: one of `QUALITIES`;
     by default the one that leaves the least error, as the time that it saves is for samples. With `parts` of 1 and no
     time limit it is the best one. `copies`: number of denoised copies, 1 by networks other than the best one.
-    `restores`: whether the limits allow detail (detail.py); `has_detail`: whether the last image of `denoise_passes`
-    has it.
+    `hide_emitters`: of the integrator. `restores`: whether the limits allow detail (detail.py); `has_detail`: whether
+    the last image of `denoise_passes` has it.
     """
 
-    def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None, parts=1):
+    def __init__(
+        self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None, parts=1, hide_emitters=False
+    ):  # fmt: skip
         self._oidn, begin = import_oidn(), time.perf_counter()
         self._networks = {name: getattr(self._oidn.Quality, name.capitalize()) for name in QUALITIES}
         self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
@@ -105,7 +107,9 @@ class Denoiser:
             # The time of a network is that of its tiles at the resolution of `parts`
             is_quick = self._expected(quality or QUALITIES[-1]) <= FINE_SHARE * time_limit
             self.parts = parts if is_quick else 1
-        self.features, self.feature_spp = features_of(scene, one, seed, spp, time_limit, self.parts)
+        self.features, self.feature_spp = features_of(
+            scene, one, seed, spp, time_limit, self.parts, hide_emitters
+        )  # fmt: skip
         ways = [way for way in WAYS if quality in (None, way[0])]
         self.quality, self.copies = self._usual_way(ways, spp, time_limit)
         if time_limit is not None:

@@ -68,21 +68,38 @@ class Layers:
         return np.concatenate((image, self.planes), axis=-1)
 
 
-def features_of(scene, sensor, seed=0, spp=None, time_limit=None, parts=1):
+def layers_of(names, scene, sensor, denoiser, **limits):
+    """Return the `Layers` with some `names` for a sensor (an index), None for no names: those of the denoiser if there
+    is one. `limits`: see `features_of`."""
+    if not names:
+        return None
+    if denoiser:
+        return Layers.of(names, denoiser.merged_features, denoiser.feature_spp)
+    return Layers.of(names, *features_of(scene, scene.sensors()[sensor], **limits))
+
+
+def hides_emitters(integrator):
+    """Return whether an integrator hides emitters from the camera. Mitsuba does not tell this of the integrator inside
+    a wrapper such as `moment`, nor of one that traces light from the emitters."""
+    return getattr(integrator, "hide_emitters", False)
+
+
+def features_of(scene, sensor, seed=0, spp=None, time_limit=None, parts=1, hide_emitters=False):
     """Return (the features of an image, a dict as of `auxiliary_features`; samples per pixel). `sensor`: a `mi.Sensor`;
-    `seed`, `spp`, `time_limit`: of the image, None if unlimited; `parts`: see `auxiliary_features`."""
+    `seed`, `spp`, `time_limit`: of the image, None if unlimited; `parts`, `hide_emitters`: see `auxiliary_features`."""
     fewest, most = FEATURE_SPP
     wanted = most if spp is None else min(max(PER_SAMPLE * spp, fewest), most)
     if time_limit is None:
-        return auxiliary_features(scene, sensor, wanted, seed, parts)
+        return auxiliary_features(scene, sensor, wanted, seed, parts, hide_emitters)
     # The first samples tell the time of the others; compilation counts, because people wait for it
     begin = time.perf_counter()
-    first = auxiliary_features(scene, sensor, fewest, seed, parts)
+    first = auxiliary_features(scene, sensor, fewest, seed, parts, hide_emitters)
     spent = time.perf_counter() - begin
     possible = min(FEATURE_SHARE * time_limit / spent * fewest, most if spp is None else wanted - fewest)
     if possible < fewest:
         return first
-    return _mean_of([first, auxiliary_features(scene, sensor, int(possible), derived_seed(seed, 1), parts)])
+    more = auxiliary_features(scene, sensor, int(possible), derived_seed(seed, 1), parts, hide_emitters)
+    return _mean_of([first, more])
 
 
 def _mean_of(renders):
@@ -93,12 +110,12 @@ def _mean_of(renders):
     return {name: total / whole for name, total in sums.items()}, whole
 
 
-def auxiliary_features(scene, sensor, spp, seed, parts=1):
+def auxiliary_features(scene, sensor, spp, seed, parts=1, hide_emitters=False):
     """Render "albedo", "normal" and "depth", a dict of (height, width, channels) float32, of the first surfaces that
     are neither mirror nor glass, with the film's filter and about `spp` samples per pixel; `sensor` is a `mi.Sensor`.
     The samples are stratified if the sensor's sampler is `independent`. `parts`: in the resolution of a fine film
-    (fine_film.py), with its filter. Return the dict and the samples per pixel: `spp` rounded down to a multiple of 16,
-    at least 16.
+    (fine_film.py), with its filter. `hide_emitters`: of the integrator, as in Mitsuba's `path`. Return the dict and the
+    samples per pixel: `spp` rounded down to a multiple of 16, at least 16.
 
     Albedo, 0 to 1: directional albedo, estimated by one BSDF sample, times the throughput of mirrors and glass before
     the surface, plus emission. Normal: shading normal in world space, turned towards the viewer. Depth: length of the
@@ -111,12 +128,12 @@ def auxiliary_features(scene, sensor, spp, seed, parts=1):
     # One after the other: large images take much memory
     with fine_film(sensor, parts):
         return _mean_of(
-            (_rendered(scene, sensor, each // parts**2, (seed, part)), each)
+            (_rendered(scene, sensor, each // parts**2, (seed, part), hide_emitters), each)
             for part, each in enumerate(sizes or [small])
         )
 
 
-def _rendered(scene, sensor, spp, key):
+def _rendered(scene, sensor, spp, key, hide_emitters):
     """Render the features of `auxiliary_features` at once, with `spp` samples per pixel of the sensor's film; `key`:
     integers that make the seed."""
     seed = int(np.random.SeedSequence((FEATURE_SEED, *key)).generate_state(1)[0])
@@ -124,7 +141,8 @@ def _rendered(scene, sensor, spp, key):
     from integrators.camera_samples import stratified
 
     with stratified(sensor, spp) as wrapper, garbage_kept():
-        mi.render(scene, sensor=wrapper, integrator=_feature_integrator(mi.variant()), spp=spp, seed=seed)
+        integrator = _feature_integrator(mi.variant(), hide_emitters)
+        mi.render(scene, sensor=wrapper, integrator=integrator, spp=spp, seed=seed)
         bitmap = sensor.film().bitmap()
     names = [entry.name for entry in bitmap.struct_()]
     planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
@@ -135,7 +153,7 @@ def _rendered(scene, sensor, spp, key):
 
 
 @cache
-def _feature_integrator(variant):
+def _feature_integrator(variant, hide_emitters):
     """Return an integrator that renders a black image with the features as AOVs. Mitsuba's base class depends on the
     variant; `variant`, the current one, is the cache key."""
 
@@ -148,42 +166,49 @@ def _feature_integrator(variant):
             number = sampler.next_1d()
             own = independent_sampler(int(dr.reinterpret_array(mi.UInt32, number)[0]), dr.width(number))
             materials = Materials.of(SceneShapes.of(scene))
-            first = _first_rough_surface(scene, materials, own, mi.Ray3f(ray), mi.Bool(active))
+            hides = dr.opaque(mi.Bool, self.hide_emitters)
+            first = _first_rough_surface(scene, materials, own, mi.Ray3f(ray), mi.Bool(active), hides)
             albedo, normal, depth, valid = first
             finite = dr.all(dr.isfinite(albedo)) & dr.all(dr.isfinite(normal)) & dr.isfinite(depth)
             albedo, normal = dr.select(finite, dr.minimum(albedo, 1), 0), dr.select(finite, normal, 0)
             return mi.Spectrum(0), valid, [*albedo, *normal, dr.select(finite, depth, 0)]
 
-    return FeatureIntegrator(mi.Properties())
+    properties = mi.Properties()
+    properties["hide_emitters"] = hide_emitters
+    return FeatureIntegrator(properties)
 
 
 @recorded_once
 @dr.syntax
-def _first_rough_surface(scene, materials: Materials, sampler, ray, active):
-    """Trace camera rays through mirrors, glass and masks; return albedo, normal, depth, and the mask of hits."""
+def _first_rough_surface(scene, materials: Materials, sampler, ray, active, hides):
+    """Trace camera rays through mirrors, glass and masks; return albedo, normal, depth, and the mask of hits. `hides`:
+    whether emitters are hidden from the camera."""
     throughput, bounces = mi.Color3f(1), mi.UInt32(0)
     albedo, normal, valid = mi.Color3f(0), mi.Normal3f(0), mi.Bool(False)
     depth, length = mi.Float(0), mi.Float(0)
-    while dr.hint(active, exclude=[scene, materials]):
+    while dr.hint(active, exclude=[scene, materials, hides]):
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=bounces == 0, active=active)
         hit = active & si.is_valid()
         length += dr.select(hit, si.t, 0)
-        albedo += throughput * _three(si.emitter(scene).eval(si, active))
+        emitter = si.emitter(scene)
+        hidden = hides & (bounces == 0) & (emitter != None)  # noqa: E711
+        albedo += throughput * _three(emitter.eval(si, active & ~hidden))
         bsdf = si.bsdf(ray)
         numbers = sampler.next_1d(hit), sampler.next_2d(hit)
         sample, weight = materials.call(bsdf, _sampled, si, *numbers, active=hit)
-        throughput *= _three(weight)
+        throughput = dr.select(hidden, throughput, throughput * _three(weight))
         # A surface with a delta and a smooth lobe, such as plastic, counts by its smooth lobe
         smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         passed = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
         onward = hit & (passed | (mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta) & ~smooth))
+        onward |= hit & hidden
         ends = hit & ~onward
         albedo[ends] += throughput
         normal[ends] = mi.Normal3f(dr.mulsign(si.sh_frame.n, si.wi.z))
         depth[ends] = length
-        valid |= hit
-        ray = si.spawn_ray(si.to_world(sample.wo))
-        bounces += 1
+        valid |= hit & ~hidden
+        ray = si.spawn_ray(dr.select(hidden, ray.d, si.to_world(sample.wo)))
+        bounces += dr.select(hidden, 0, 1)
         active = onward & (bounces < DEEPEST)
     return albedo, normal, depth, valid
 

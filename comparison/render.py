@@ -21,7 +21,7 @@ from .checkpoint import Checkpoint
 from .counters import TotalStatistics
 from .denoising import Denoiser, for_denoising, quality_of
 from .ending import Ending
-from .features import Layers, channels_of, features_of
+from .features import channels_of, hides_emitters, layers_of
 from .fine_film import usual_parts
 from .interruption import Interruption, is_interruption
 from .rendering import Progressive
@@ -131,8 +131,9 @@ def render(
     begin = clock.perf_counter()
     # Passes of a checkpoint have the usual resolution, as the choice depends on times
     parts = 1 if checkpoint or not denoise else usual_parts(scene.sensors()[sensor], integrator, spp)
-    denoiser = Denoiser(scene, sensor, seed, spp, time, quality, parts) if denoise else None
-    planes = layers_of(layers, scene, sensor, denoiser, seed=seed, spp=spp, time_limit=time)
+    shown = {"seed": seed, "spp": spp, "time_limit": time, "hide_emitters": hides_emitters(integrator)}
+    denoiser = Denoiser(scene, sensor, quality=quality, parts=parts, **shown) if denoise else None
+    planes = layers_of(layers, scene, sensor, denoiser, **shown)
     # The error is that of the raw image, which equal numbers of samples suit best
     chooses = denoiser.denoise if denoiser and not error else None
     # Without a limit of time for a checkpoint, which may go on with another one or on other machines
@@ -152,16 +153,6 @@ def check_layers(layers, integrator):
     """Raise ValueError for `layers` that are not names of features, and for those that the integrator has."""
     if own := set(channels_of(layers)) & set(integrator.aov_names()):
         raise ValueError(f"layers must not name channels of the integrator, got {', '.join(sorted(own))}")
-
-
-def layers_of(names, scene, sensor, denoiser, **limits):
-    """Return the `Layers` with some `names` for a sensor (an index), None for no names: those of the denoiser if there
-    is one. `limits`: see `features_of`."""
-    if not names:
-        return None
-    if denoiser:
-        return Layers.of(names, denoiser.merged_features, denoiser.feature_spp)
-    return Layers.of(names, *features_of(scene, scene.sensors()[sensor], **limits))
 
 
 def _render_all(scene, integrator, **limits):

@@ -24,6 +24,7 @@ from . import images, machine
 from .command_line import check_integrator, failure, set_variant, versions
 from .counters import total_statistics
 from .denoising import Denoiser
+from .features import hides_emitters
 from .fine_film import usual_parts
 from .measuring import measure
 from .rendering import Progressive
@@ -178,7 +179,10 @@ def render(job):
 
 def _denoiser(scene, job, parts):
     """Return the `Denoiser` for the image of a job; `parts`: see there."""
-    return Denoiser(scene, seed=job.seed, spp=None if job.budget else job.spp, time_limit=job.budget, parts=parts)
+    return Denoiser(
+        scene, seed=job.seed, spp=None if job.budget else job.spp, time_limit=job.budget, parts=parts,
+        hide_emitters=hides_emitters(scene.integrator()),
+    )  # fmt: skip
 
 
 def _denoise(job, scene, progressive, denoiser, described):

@@ -5,8 +5,9 @@ import time as clock
 
 from ..denoising import Denoiser, quality_of
 from ..ending import Ending
+from ..features import hides_emitters, layers_of
 from ..pass_sizes import PassSizes
-from ..render import check, check_layers, layers_of, render_passes
+from ..render import check, check_layers, render_passes
 from .passes import DistributedPasses, samples_of_a_pass
 from .pool import TASKS_PER_WORKER
 from .scene_travel import bundle
@@ -55,6 +56,8 @@ class DistributedRender:
             if layers:
                 check_layers(layers, self._scene.integrator)
             limits = {"seed": self._seed, "spp": self.spp, "time_limit": self._time}
+            if scene:
+                limits["hide_emitters"] = hides_emitters(self._scene.integrator)
             denoiser = Denoiser(scene, self._sensor, **limits, quality=quality_of(denoise)) if denoise else None
             self.passes.keeps_halves = bool(denoiser) and denoiser.restores
             planes = layers_of(layers, scene, self._sensor, denoiser, **limits)

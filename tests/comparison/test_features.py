@@ -38,6 +38,25 @@ def test_features_are_those_of_the_surface_that_is_seen():
     np.testing.assert_allclose(normal, np.broadcast_to((0, 0, 1), normal.shape), atol=1e-5)
 
 
+@pytest.mark.parametrize("hide_emitters", [False, True])
+def test_emitters_that_are_hidden_are_in_no_feature(hide_emitters):
+    lamp = wall([0, 0, 1], [0, 1, 0], 0, 5) | {"emitter": {"type": "area"}}
+    sky = {"type": "constant", "radiance": 0.5}
+    half = wall([-5, 0, -1], [0, 1, 0], 0, 5, RED)
+    scene = mi.load_dict({"type": "scene", "sensor": sensor(8), "lamp": lamp, "half": half, "sky": sky})
+    found, _ = features.auxiliary_features(scene, scene.sensors()[0], 64, 0, hide_emitters=hide_emitters)
+    left, right = (RED, (0, 0, 0)) if hide_emitters else ((1, 1, 1), (1, 1, 1))
+    np.testing.assert_allclose(found["albedo"][:, :3], np.broadcast_to(left, (8, 3, 3)), rtol=1e-4)
+    np.testing.assert_allclose(found["albedo"][:, 5:], np.broadcast_to(right, (8, 3, 3)), rtol=1e-4)
+    # The camera is at a distance of 4 from the origin; depth begins at the near clipping distance
+    assert np.abs(found["depth"][4, 1] - (5 if hide_emitters else 3)).max() < 0.5
+
+
+@pytest.mark.parametrize(("name", "hides"), [("path", True), ("manylights", True), ("ptracer", False)])
+def test_integrators_tell_whether_they_hide_emitters(name, hides):
+    assert features.hides_emitters(mi.load_dict({"type": name, "hide_emitters": True})) is hides
+
+
 def test_normals_are_turned_towards_the_viewer():
     two_sided = {"type": "twosided", "bsdf": {"type": "diffuse"}}
     _, normal = guides(away=wall([0, 0, 0], [0, 1, 0], 180, 5, bsdf=two_sided))
