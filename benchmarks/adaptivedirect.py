@@ -22,6 +22,7 @@ import argparse
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from statistics import geometric_mean
@@ -125,7 +126,7 @@ def method(name: str):
     return as_printed() if name == PRINTED else nullcontext()
 
 
-def table(names, options) -> dict:
+def table(names, options) -> Iterator[dict]:
     """Part "table"."""
     rows: dict = {}
     print(f"\n## at the same rule, error {100 * options.error:g}%, {RAYS} camera rays, width {options.width}, warm")
@@ -159,9 +160,9 @@ def table(names, options) -> dict:
         ]
         columns += [f"{slower[label]:.1f}" if label in slower else "-" for label in ratios]
         print(f"{name} | {' | '.join(columns)}", flush=True)
+        yield rows
     means = {label: f"{geometric_mean(values):.1f}" for label, values in ratios.items() if values}
     print("geometric means:", ", ".join(f"{label} {value}" for label, value in means.items()))
-    return rows
 
 
 def _numbers(found: tuple) -> dict:
@@ -169,7 +170,7 @@ def _numbers(found: tuple) -> dict:
     return dict(zip(("seconds", "relmse", "rays"), found, strict=True))
 
 
-def departures(names, options) -> dict:
+def departures(names, options) -> Iterator[dict]:
     """Part "paper": what the departures from the paper bring."""
     rows: dict = {}
     print("\n## the method as printed, and with what was changed, at the same rule")
@@ -196,10 +197,10 @@ def departures(names, options) -> dict:
         rows[name] = {label: _numbers(one) | {"bias": bias[label] / 100} for label, one in found.items()}
         rows[name]["speedup"] = ratio
         print(f"{name} | {columns[0]} | {columns[1]} | {ratio:.1f}", flush=True)
-    return rows
+        yield rows
 
 
-def number_of_lights(options) -> dict:
+def number_of_lights(options) -> Iterator[dict]:
     """Part "lights"."""
     rows: dict = {}
     print(f"\n## the hall with N lights: error {100 * options.error:g}% (compared with renders of 1% and 64 rays)")
@@ -230,7 +231,7 @@ def number_of_lights(options) -> dict:
             rows[count]["speedup"] = found["all"][0] * found["all"][2] / (found["auto"][0] * found["auto"][2])
             ratio = f"{rows[count]['speedup']:.2f}"
         print(f"{count} | {load:.1f} | {shown[0]} | {shown[1]} | {ratio}", flush=True)
-    return rows
+        yield rows
 
 
 _COLD = """
@@ -245,7 +246,7 @@ print(scenes.timed(lambda: mi.render(scene, integrator=integrator, spp=1, seed=1
 """
 
 
-def cold_starts(options) -> dict:
+def cold_starts(options) -> Iterator[dict]:
     """Part "cold"."""
     rows: dict = {}
     print("\n## first render in a fresh process with an empty kernel cache, and the second (1 sample a pixel)")
@@ -268,7 +269,7 @@ def cold_starts(options) -> dict:
                 shown.append(f"{first:.1f}, {second:.1f}")
                 rows.setdefault(name, {})[kind] = {"seconds": first, "second_seconds": second}
             print(f"{name} | {shown[0]} | {shown[1]}", flush=True)
-    return rows
+            yield rows
 
 
 def main() -> None:

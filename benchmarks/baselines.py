@@ -20,6 +20,7 @@ import argparse
 import multiprocessing
 import resource
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -172,7 +173,7 @@ def _median(runs: list[Found]) -> Found:
     return sorted(runs, key=lambda one: one.seconds)[len(runs) // 2]
 
 
-def curves(names, options) -> dict:
+def curves(names, options) -> Iterator[dict]:
     """Part "curve"."""
     rows = {}
     print(
@@ -195,7 +196,7 @@ def curves(names, options) -> dict:
                         f"{found.seconds:.2f}"
                     )
                 print(f"{name} | {samples} | {method} | {' | '.join(shown)}", flush=True)
-    return rows
+        yield rows
 
 
 def _numbers(found: Found) -> dict:
@@ -204,7 +205,7 @@ def _numbers(found: Found) -> dict:
     return {name: float(getattr(found, name)) for name in names}
 
 
-def equal_errors(names, width: int, samples: int, points: int, methods) -> dict:
+def equal_errors(names, width: int, samples: int, points: int, methods) -> Iterator[dict]:
     """A table of ``lightcuts`` at 1% and of other methods at its mean absolute error."""
     print(f"\n## {samples} samples a pixel, equal mean absolute error (width {width}, {VPLS} VPLs, warm)")
     print(
@@ -232,22 +233,22 @@ def equal_errors(names, width: int, samples: int, points: int, methods) -> dict:
                 print(
                     "  stages:", ", ".join(f"{stage} {spent:.2f}" for stage, spent in found.stages.items()), flush=True
                 )
+        yield rows
     for method, found in speedups.items() if rows else ():
         print(f"geometric mean of the speedups of {method}: {geometric_mean(found):.2f}")
-    return rows
 
 
-def many_samples(names, options) -> dict:
+def many_samples(names, options) -> Iterator[dict]:
     """Part "samples"."""
     return equal_errors(names, options.width, options.samples, options.points, ("mdlightcuts", "lightslice"))
 
 
-def slices(names, options) -> dict:
+def slices(names, options) -> Iterator[dict]:
     """Part "slices"."""
     return equal_errors(names, 4 * options.width, 1, options.points, ("lightslice",))
 
 
-def growth(names, options) -> dict:
+def growth(names, options) -> Iterator[dict]:
     """Part "growth"."""
     rows: dict = {}
     print(f"\n## mdlightcuts at 1% with more samples a pixel (width {options.width}, {VPLS} VPLs, warm)")
@@ -266,10 +267,10 @@ def growth(names, options) -> dict:
             time = f"{found.seconds:.2f}" if samples == 1 else f"{found.seconds / base:.1f}"
             shown.append(f"{time}, {found.rays:.0f}")
         print(f"{name} | {' | '.join(shown)}", flush=True)
-    return rows
+        yield rows
 
 
-def memory(names, options) -> dict:
+def memory(names, options) -> Iterator[dict]:
     """Part "memory": every scene in a process of its own, which tells the most memory that it ever had."""
     rows = {}
     print("\n## lightslice at 1600×1200, 600 000 VPLs, 800 columns")
@@ -280,7 +281,7 @@ def memory(names, options) -> dict:
             before, after, seconds = pool.apply(_render_large, (name,))
         rows[name] = {"memory": (after - before) / 2**20, "seconds": seconds}
         print(f"{name} | {(after - before) / 2**20:.2f} | {after / 2**20:.2f} | {seconds:.1f}", flush=True)
-    return rows
+        yield rows
 
 
 def _render_large(name: str):

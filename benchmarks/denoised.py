@@ -11,6 +11,7 @@ whichever is less favourable to ``manylights``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from unittest import mock
 
@@ -149,11 +150,14 @@ def longer(error: float, goal: float, fall: float) -> float:
     return float(min((max(error, LEAST_ERROR) / max(goal, LEAST_ERROR)) ** exponent for exponent in exponents))
 
 
-def compare(names, width: int, seconds: float, passes: int) -> dict:
-    """Print the rows of all scenes; returns them by name."""
+def compare(names, width: int, seconds: float, passes: int) -> Iterator[dict]:
+    """Print the rows of all scenes; yields the rows so far by name, after each scene."""
     print(f"denoised, {width} wide, images of {seconds:g} s: error, samples; time of `path` for equal error over that")
     print("of manylights, with the sampler `independent` and the usual denoising, and with the best of three ways")
-    return {name: compare_one(name, width, seconds, passes) for name in names}
+    rows = {}
+    for name in names:
+        rows[name] = compare_one(name, width, seconds, passes)
+        yield rows
 
 
 def _warm_denoiser(scene, seconds: float, parts: int) -> Denoiser:

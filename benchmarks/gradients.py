@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -143,7 +144,7 @@ def optimised(problem: Problem, primal: str, spp: int, adjoint_spp: int, seconds
     return row
 
 
-def compare(names, width: int, seconds: float, target_spp: int, adjoint_spp: int) -> dict:
+def compare(names, width: int, seconds: float, target_spp: int, adjoint_spp: int) -> Iterator[dict]:
     """Print the losses of each scene, integrator and number of samples, with the steps taken."""
     print(f"loss, {width} wide, {seconds:g} s for each optimisation, derivatives with {adjoint_spp} samples")
     print(f"{'scene':16s}{'image by':>12s}{'samples':>9s}{'steps':>7s}", end="")
@@ -158,7 +159,7 @@ def compare(names, width: int, seconds: float, target_spp: int, adjoint_spp: int
                 steps = max(one["steps"] for one in row.values())
                 print(f"{name:16s}{primal:>12s}{spp:9d}{steps:7d}{losses}", flush=True)
                 rows[f"{name}, {primal}, {spp} samples"] = row
-    return rows
+        yield rows
 
 
 def main() -> None:

@@ -21,6 +21,7 @@ import resource
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import geometric_mean
@@ -110,7 +111,7 @@ class Problem:
         return error
 
 
-def equal_quality(title: str, names, samples: int, lightcuts_error: float, **settings) -> dict:
+def equal_quality(title: str, names, samples: int, lightcuts_error: float, **settings) -> Iterator[dict]:
     """Print the table of ``lightcuts`` and both forms of ``illuminationcut`` at its RMSE."""
     print(f"\n## {title} (width {WIDTH}, {samples} sample(s) per pixel, {VPLS} VPLs, max_depth {DEPTH}, warm)")
     print("scene | method | error | preprocessing s | render s | rays/px | RMSE | relative L1 | bounds/px | speedup")
@@ -144,12 +145,12 @@ def equal_quality(title: str, names, samples: int, lightcuts_error: float, **set
                 f"{speedup:.1f}",
                 flush=True,
             )
+        yield rows
     for visibility, values in speedups.items() if rows else ():
         print(f"geometric mean of the speedups, visibility={visibility}: {geometric_mean(values):.2f}")
-    return rows
 
 
-def ray_rates(names) -> dict:
+def ray_rates(names) -> Iterator[dict]:
     """Part "rays"."""
     rows = {}
     print("\n## shadow rays per second: all of shade, error 1.5%, against the rays of its pairs alone")
@@ -165,7 +166,7 @@ def ray_rates(names) -> dict:
         rate, bare = rays / whole / 1e6, rays / alone / 1e6
         rows[name] = {"illuminationcut": {"rays_per_second": rate}, "rays alone": {"rays_per_second": bare}}
         print(f"{name} | {rays / 1e6:.1f} | {rate:.1f} | {bare:.1f} | {100 * rate / bare:.0f}%", flush=True)
-    return rows
+        yield rows
 
 
 def _seconds_alone(plugin, job, most: int = 1 << 22) -> float:
@@ -201,7 +202,7 @@ def _seconds_alone(plugin, job, most: int = 1 << 22) -> float:
     return seconds / max(count, 1)
 
 
-def many_lights(names) -> dict:
+def many_lights(names) -> Iterator[dict]:
     """Part "lights"."""
     rows = {}
     print("\n## render time and number of VPLs (width 512, illuminationcut at its default error)")
@@ -224,6 +225,7 @@ def many_lights(names) -> dict:
                 visibility: {"seconds": one} for visibility, one in zip(("all", "adaptive"), seconds, strict=True)
             }
             print(f"{name} | {count} | {tree:.2f} | {seconds[0]:.2f} | {seconds[1]:.2f}", flush=True)
+        yield rows
     print("\n## peak memory above the scene, 1600×1200, 1.2 M VPLs, 1 sample per pixel")
     for name in names:
         command = [sys.executable, __file__, "--memory-of", name]
@@ -231,7 +233,7 @@ def many_lights(names) -> dict:
         print(f"{name}: {done.stdout.strip()}", flush=True)
         words = done.stdout.split()
         rows[f"{name}, 1600×1200"] = {words[k]: {"memory": float(words[k + 1])} for k in range(0, len(words), 3)}
-    return rows
+        yield rows
 
 
 def memory_of(name: str) -> None:
@@ -247,7 +249,7 @@ def memory_of(name: str) -> None:
     print()
 
 
-def public_settings() -> dict:
+def public_settings() -> Iterator[dict]:
     """Part "public"."""
     print("\n## settings of the public C++ code: Cornell box, 512×512, max_depth 9, 2048 direct and 47 k indirect")
     print("VPLs, distances clamped at 5% of the diagonal; CPU seconds of all threads")
@@ -279,7 +281,7 @@ def public_settings() -> dict:
                 f"{found.bounds:.0f} | {100 * found.relative:.2f}% | {published[0]} s, {100 * published[1]:.2f}%",
                 flush=True,
             )
-    return measured
+            yield measured
 
 
 def main() -> None:

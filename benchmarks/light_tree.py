@@ -133,7 +133,7 @@ def benchmark_builds(counts):
         cost, baseline = total_cost(tree), total_cost(halved(*lights))
         rows[count] = {"seconds": total, "depth": tree.depth, "cost": cost, "halved": {"cost": baseline}}
         print(f"{count:9d} {total:8.3f}  {stages}  {tree.depth:5d} {cost:7.2f} {baseline:7.2f} {cost / baseline:6.2f}")
-    return rows
+        yield rows
 
 
 # --- Cuts ---
@@ -224,9 +224,9 @@ def main():
         for count in arguments.counts or [60_000]:
             benchmark_cuts(count)
     else:
-        rows = benchmark_builds(arguments.counts or [10_000, 50_000, 200_000, 650_000, 1_200_000])
-        if arguments.json:
-            results.write_results(arguments.json, "builds", {}, rows)
+        for rows in benchmark_builds(arguments.counts or [10_000, 50_000, 200_000, 650_000, 1_200_000]):
+            if arguments.json:
+                results.write_results(arguments.json, "builds", {}, rows)
 
 
 if __name__ == "__main__":

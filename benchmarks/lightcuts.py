@@ -15,6 +15,7 @@ import argparse
 import json
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import geometric_mean
 
@@ -45,7 +46,7 @@ def lightcuts(**more):
     return mi.load_dict({"type": "lightcuts", "max_depth": DEPTH, "vpl_count": VPLS, "error": 0.01, **more})
 
 
-def brute_force(names) -> dict:
+def brute_force(names) -> Iterator[dict]:
     """Part "brute"."""
     print(f"\n## lightcuts, error 1%, against all VPLs (width 256, {VPLS} VPLs, max_depth {DEPTH}, warm)")
     print("scene | VPLs | lightcuts s | of it tree | rays/px | bounds/px | cut | rel. L1 | all VPLs s | ratio")
@@ -76,9 +77,9 @@ def brute_force(names) -> dict:
             f"{found['cut_size'] / points:.0f} | {100 * error:.2f}% | {common + brute:.0f} | {ratios[-1]:.0f}",
             flush=True,
         )
+        yield rows
     if ratios:
         print(f"geometric mean of the ratios: {geometric_mean(ratios):.0f}")
-    return rows
 
 
 def _error_and_brute_seconds(scene, plugin):
@@ -102,7 +103,7 @@ def _error_and_brute_seconds(scene, plugin):
     return difference / total, seconds
 
 
-def ray_rates(names) -> dict:
+def ray_rates(names) -> Iterator[dict]:
     """Part "rays"."""
     rows = {}
     print("\n## shadow rays per second: the whole cut evaluation (estimate, cut, shading, rays) against the rays alone")
@@ -120,7 +121,7 @@ def ray_rates(names) -> dict:
         rate, bare = rays / whole / 1e6, rays / alone / 1e6
         rows[name] = {"lightcuts": {"rays_per_second": rate}, "rays alone": {"rays_per_second": bare}}
         print(f"{name} | {rays / 1e6:.1f} | {rate:.1f} | {bare:.1f} | {100 * rate / bare:.0f}%", flush=True)
-    return rows
+        yield rows
 
 
 def _seconds_alone(plugin, job) -> float:
@@ -156,7 +157,7 @@ print(scenes.timed(lambda: mi.render(scene, integrator=integrator, spp=1, seed=0
 """
 
 
-def cold_starts(names) -> dict:
+def cold_starts(names) -> Iterator[dict]:
     """Part "cold"."""
     rows = {}
     print("\n## first render in a fresh process with an empty kernel cache (1 sample a pixel; loading not counted)")
@@ -173,14 +174,14 @@ def cold_starts(names) -> dict:
         rows[name] = {plugin: {"seconds": spent} for plugin, spent in seconds.items()}
         ratio = seconds["lightcuts"] / seconds["path"]
         print(f"{name} | {seconds['lightcuts']:.1f} | {seconds['path']:.1f} | {ratio:.2f}", flush=True)
-    return rows
+        yield rows
 
 
-def against_path(names, budget: float) -> dict:
+def against_path(names, budget: float) -> Iterator[dict]:
     """Part "path": what compare.py prints for the scenes that have a reference."""
     files = [str(scenes.scene_file(name)) for name in names if scenes.reference_file(name)]
     if not files:
-        return {}
+        return
     status = compare.main(
         [
             *files, "--integrators", "path,lightcuts,mdlightcuts", "--param", "mdlightcuts.error=0.02",
@@ -191,7 +192,7 @@ def against_path(names, budget: float) -> dict:
     if status:
         # The folder may hold the results of an earlier comparison
         raise SystemExit(status)
-    return _compared_rows(json.loads(Path("output/path/results.json").read_text()))
+    yield _compared_rows(json.loads(Path("output/path/results.json").read_text()))
 
 
 def _compared_rows(found: dict) -> dict:

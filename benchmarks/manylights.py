@@ -32,6 +32,7 @@ import functools
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from statistics import geometric_mean
@@ -81,18 +82,16 @@ def scale_of(name: str, images: list, width: int, view: int = 0) -> np.ndarray:
     return scenes.scale_of_truth(known[0] if known else np.mean(images, axis=0))
 
 
-def product(names, width: int, seconds: float, passes: int, views: int) -> dict:
+def product(names, width: int, seconds: float, passes: int, views: int) -> Iterator[dict]:
     """Print variance × time and the ratio, from the cameras of the scenes or from ``views`` random cameras of each."""
     print(f"product, {width} wide, {passes} passes of about {seconds:g} s; variance × time, with samples of a pass")
     print(f"{'scene':18s} {'path':>22s} {'manylights':>22s}   ratio   plain   bias                sets")
-    numbers = range(1, views + 1) if views else (0,)
-    rows = {
-        f"{name} {view}" if view else name: product_of(name, width, seconds, passes, view)
-        for name in names
-        for view in numbers
-    }
+    rows = {}
+    for name in names:
+        for view in range(1, views + 1) if views else (0,):
+            rows[f"{name} {view}" if view else name] = product_of(name, width, seconds, passes, view)
+            yield rows
     print_mean(rows)
-    return rows
 
 
 def print_mean(rows: dict, speedup: str = "speedup", of: str = "") -> None:
@@ -144,12 +143,14 @@ def product_of(name: str, width: int, seconds: float, passes: int, view: int) ->
     return row | {quantity: float(value) for quantity, value in more.items()}
 
 
-def timed(names, width: int, seconds: float, passes: int) -> dict:
+def timed(names, width: int, seconds: float, passes: int) -> Iterator[dict]:
     """Print variance × time of images of equal time, and the ratio."""
     print(f"timed, {width} wide, {passes} images of {seconds:g} s; variance × time, with samples of an image")
-    rows = {name: timed_of(name, width, seconds, passes) for name in names}
+    rows = {}
+    for name in names:
+        rows[name] = timed_of(name, width, seconds, passes)
+        yield rows
     print_mean(rows)
-    return rows
 
 
 def timed_of(name: str, width: int, seconds: float, passes: int) -> dict:
@@ -177,15 +178,16 @@ def with_references(names: list[str]) -> list[str]:
     return [name for name in names if name not in missing]
 
 
-def denoised_part(names, width: int, seconds: float, passes: int) -> dict:
+def denoised_part(names, width: int, seconds: float, passes: int) -> Iterator[dict]:
     """Print the denoised errors, and the time of ``path`` for those of ``manylights`` over their time."""
-    rows = denoised.compare(names, width, seconds, passes)
+    rows: dict = {}
+    for rows in denoised.compare(names, width, seconds, passes):
+        yield rows
     print_mean(rows)
     print_mean(rows, "independent_speedup", "with the sampler independent: ")
-    return rows
 
 
-def lights(names, width: int, seconds: float, passes: int) -> dict:
+def lights(names, width: int, seconds: float, passes: int) -> Iterator[dict]:
     """Print variance × time with fewer and more light paths than chosen, over that with the chosen number."""
     rows = {}
     print(f"lights, {width} wide: variance × time with so many times the light paths, over that with those chosen")
@@ -205,10 +207,10 @@ def lights(names, width: int, seconds: float, passes: int) -> dict:
             for factor, value in zip(SWEEP, products / products[chosen], strict=True)
             if factor != 1
         }
-    return rows
+        yield rows
 
 
-def cold(names, width: int) -> dict:
+def cold(names, width: int) -> Iterator[dict]:
     """Print seconds and peak memory of first renders of a process with an empty kernel cache, and seconds with the
     kernels of another scene."""
     rows = {}
@@ -232,7 +234,7 @@ def cold(names, width: int) -> dict:
         above = [state for key, state in states.items() if ours[key] > 2 * theirs[key] + 1]
         within = f"  above 2 × path + 1 s: {', '.join(above)}" if above else ""
         print(f"{name:16s} {'; '.join(columns)}{within}", flush=True)
-    return rows
+        yield rows
 
 
 @functools.cache

@@ -23,6 +23,7 @@ import argparse
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from statistics import geometric_mean
@@ -71,7 +72,7 @@ def _rate(found: Found, pixels: int) -> float:
     return found.rays * pixels / found.counts["entries"]
 
 
-def table(names, options) -> dict:
+def table(names, options) -> Iterator[dict]:
     """Part "table"."""
     rows: dict = {}
     print(f"\n## equal error and equal rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
@@ -88,10 +89,10 @@ def table(names, options) -> dict:
                 method = label.split(",")[0]
                 pair = (one.rays / ours.rays, one.seconds / ours.seconds)
                 ratios.setdefault(method, []).append(pair)
+        yield rows
     for method, pairs in ratios.items():
         rays, seconds = (geometric_mean(values) for values in zip(*pairs, strict=True))
         print(f"geometric means over {method}: {rays:.2f} times fewer rays, {seconds:.2f} times faster")
-    return rows
 
 
 def _equal_error_row(found: dict, problem: Problem) -> dict:
@@ -123,7 +124,7 @@ def _equal_plugins(problem: Problem, measures) -> dict:
     return plugins
 
 
-def costs(_, options) -> dict:
+def costs(_, options) -> Iterator[dict]:
     """Part "cost"."""
     rows: dict = {}
     print(f"\n## more and more expensive rays ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs, warm)")
@@ -146,7 +147,7 @@ def costs(_, options) -> dict:
                 f"{one.rmse:.4f} | {each:.0f} | {one.rays / ours.rays:.1f} | {one.seconds / ours.seconds:.2f}",
                 flush=True,
             )
-    return rows
+        yield rows
 
 
 def _show(name: str, label: str, one: Found, ours: Found, problem: Problem) -> None:
@@ -167,7 +168,7 @@ def _show(name: str, label: str, one: Found, ours: Found, problem: Problem) -> N
         print(f"  stages: {stages}; prediction and separation {100 * share:.0f}%; counted: {one.counts}", flush=True)
 
 
-def steps(names, options) -> dict:
+def steps(names, options) -> Iterator[dict]:
     """Part "steps"."""
     rows: dict = {label: {} for label in STEPS}
     print(f"\n## steps left out ({SAMPLES} samples a pixel, width {options.width}, {VPLS} VPLs)")
@@ -184,11 +185,11 @@ def steps(names, options) -> dict:
                 f"{name} | {label} | {found.rays:.1f} | {rate:.1f}% | {100 * found.absolute:.2f}% | {found.rmse:.4f}",
                 flush=True,
             )
-    return rows
+        yield rows
 
 
-def pictures(names, options) -> None:
-    """Part "pictures"."""
+def pictures(names, options) -> tuple:
+    """Part "pictures", without rows."""
     from benchmarks.matrix_pictures import draw_slice
 
     options.out.mkdir(parents=True, exist_ok=True)
@@ -200,6 +201,7 @@ def pictures(names, options) -> None:
         with replacing(file) as temporary:
             draw_slice(plugin, job, options.slice, temporary, {"scene": name, "VPLs": VPLS, "seed": 0})
         print(file, flush=True)
+    return ()
 
 
 def main() -> None:

@@ -6,6 +6,7 @@ virtual lights stay those of the whole image.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from types import SimpleNamespace
 from unittest import mock
@@ -87,11 +88,14 @@ def single_classes():
         yield chosen
 
 
-def classes(names, width: int, passes: int) -> dict:
+def classes(names, width: int, passes: int) -> Iterator[dict]:
     """Print the share of each class in the variance and, in brackets, in the light, in percent."""
     print(f"classes, {width} wide, {SPP} samples, {passes} passes: percent of the variance (of the light)")
     print(" " * 16 + "".join(f"{name:>11s}" for name in CLASSES) + f"{'sum':>10s}{'whole':>10s}")
-    return {name: classes_of(name, width, passes) for name in names}
+    rows = {}
+    for name in names:
+        rows[name] = classes_of(name, width, passes)
+        yield rows
 
 
 def classes_of(name: str, width: int, passes: int) -> dict:

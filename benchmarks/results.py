@@ -98,12 +98,14 @@ def parse(parser, arguments=None):
 
 
 def run_parts(options, parts: dict, settings: dict) -> None:
-    """Run the functions of ``parts`` that ``options`` name, each of which returns its rows, and write the result file
-    with the ``settings``."""
+    """Run the functions of ``parts`` that ``options`` name, and write the result file with the ``settings``.
+
+    A function yields its rows so far whenever one is finished, so that a run that is interrupted has a file.
+    """
     for part in options.parts:
-        rows = parts[part]()
-        if options.json:
-            write_results(options.json, part, settings, rows)
+        for rows in parts[part]():
+            if options.json:
+                write_results(options.json, part, settings, rows)
 
 
 def write_results(path, part: str, settings: dict, rows: dict) -> None:

@@ -7,6 +7,7 @@ else the machine does.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from statistics import geometric_mean
 from unittest import mock
@@ -92,7 +93,7 @@ def whole_edges(scene) -> float:
     return float(np.mean(edges))
 
 
-def cost(names, width: int, passes: int) -> dict:
+def cost(names, width: int, passes: int) -> Iterator[dict]:
     """Print CPU seconds of ``manylights`` over those of ``path``, scene by scene and for each of SAMPLES."""
     print(f"cost, {width} wide, one thread, {passes} renders of each: CPU seconds; stages of manylights in seconds")
     print(f"{'scene':16s}{'samples':>8s}{'path':>8s}{'ours':>8s}{'ratio':>7s}", end="")
@@ -103,10 +104,10 @@ def cost(names, width: int, passes: int) -> dict:
         with one_thread():
             row = {f"{spp} samples": cost_of(name, scene, width, spp, passes) for spp in SAMPLES}
         rows[name] = row
+        yield rows
     for spp in SAMPLES:
         ratios = [row[f"{spp} samples"]["cost_ratio"] for row in rows.values()]
         print(f"geometric mean at {spp} samples: {geometric_mean(ratios):.2f}, highest {max(ratios):.2f}")
-    return rows
 
 
 def cost_of(name: str, scene, width: int, spp: int, passes: int) -> dict:

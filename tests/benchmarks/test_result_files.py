@@ -82,9 +82,15 @@ def test_a_file_takes_one_part_and_is_checked_before_the_work(tmp_path, monkeypa
 
 def test_parts_write_their_rows(tmp_path):
     options = parsed("--json", tmp_path / "a.json", "--parts", "cold")
-    results.run_parts(options, {"cold": lambda: {"hall": {"seconds": 2.0}}}, {"width": 9})
-    written = json.loads((tmp_path / "a.json").read_text())
-    assert written["part"] == "cold" and written["rows"] == {"hall": {"seconds": 2.0}}
+
+    def cold():
+        yield {"hall": {"seconds": 2.0}}
+        written = json.loads((tmp_path / "a.json").read_text())
+        assert written["part"] == "cold" and written["rows"] == {"hall": {"seconds": 2.0}}
+        yield {"hall": {"seconds": 2.0}, "kitchen": {"seconds": 3.0}}
+
+    results.run_parts(options, {"cold": cold}, {"width": 9})
+    assert list(json.loads((tmp_path / "a.json").read_text())["rows"]) == ["hall", "kitchen"]
 
 
 def test_a_variance_needs_two_passes():
