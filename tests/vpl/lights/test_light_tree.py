@@ -86,38 +86,38 @@ def check_structure(tree, count):
 
 def check_tree(tree, position, direction, flux):
     """Assert every invariant of a tree over the given lights; what is rounded is compared to within its rounding."""
-    count = len(flux)
-    check_structure(tree, count)
+    check_structure(tree, len(flux))
     record, escape = tree.records, tree.escape.astype(np.int64)
     assert np.isfinite(np.delete(record, [ESCAPE, REPRESENTATIVE], axis=1)).all()
     np.testing.assert_allclose(np.linalg.norm(record[:, CONE_AXIS].astype(np.float64), axis=1), 1, atol=2e-7)
     assert (np.abs(record[:, CONE_COS]) <= 1).all()
     leaves_before = np.concatenate([[0], np.cumsum(escape == np.arange(len(escape)) + 1)])
-    wide = flux.astype(np.float64)
-    for node, (begin, end) in enumerate(zip(leaves_before[:-1], leaves_before[escape], strict=True)):
-        lights = tree.leaf_order[begin:end]
-        assert tree.representative[node] in lights
-        total = wide[lights].sum(axis=0)
-        # float64 sums round to the nearest float32; the second 2^-24 is for another order of summation.
-        np.testing.assert_allclose(record[node, FLUX], total, rtol=2.0**-23, atol=2e-45)
-        np.testing.assert_allclose(record[node, INTENSITY], total.mean(), rtol=2.0**-23, atol=2e-45)
-        if position is None:
-            assert (record[node, BOX_MIN] == 0).all()
-            assert (record[node, BOX_MAX] == 0).all()
-        else:
-            assert (record[node, BOX_MIN] == position[lights].min(axis=0)).all()
-            assert (record[node, BOX_MAX] == position[lights].max(axis=0)).all()
-        if direction is None:
-            assert record[node, CONE_AXIS].tolist() == [0, 0, 1]
-            assert record[node, CONE_COS] == -1
-        else:
-            unit = direction[lights].astype(np.float64)
-            unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-            cosine = (unit @ record[node, CONE_AXIS].astype(np.float64)).min()
-            # No tolerance on this side: the cone is rounded outwards. Conversely, the cone is as wide as its lights
-            # need.
-            assert record[node, CONE_COS] <= cosine
-            assert record[node, CONE_COS] >= max(cosine - 1e-6, -1)
+    # The lights below each node in turn, and where they begin
+    below = leaves_before[escape] - leaves_before[:-1]
+    first, node = np.cumsum(below) - below, np.repeat(np.arange(len(record)), below)
+    lights = tree.leaf_order[np.arange(below.sum()) - (first - leaves_before[:-1])[node]]
+    assert np.logical_or.reduceat(tree.representative[node] == lights, first).all()
+    total = np.add.reduceat(flux.astype(np.float64)[lights], first)
+    # float64 sums round to the nearest float32; the second 2^-24 is for another order of summation.
+    np.testing.assert_allclose(record[:, FLUX], total, rtol=2.0**-23, atol=2e-45)
+    np.testing.assert_allclose(record[:, INTENSITY], total.mean(axis=1), rtol=2.0**-23, atol=2e-45)
+    if position is None:
+        assert (record[:, BOX_MIN] == 0).all()
+        assert (record[:, BOX_MAX] == 0).all()
+    else:
+        assert (record[:, BOX_MIN] == np.minimum.reduceat(position[lights], first)).all()
+        assert (record[:, BOX_MAX] == np.maximum.reduceat(position[lights], first)).all()
+    if direction is None:
+        assert (record[:, CONE_AXIS] == [0, 0, 1]).all()
+        assert (record[:, CONE_COS] == -1).all()
+    else:
+        unit = direction.astype(np.float64)
+        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+        axis = record[:, CONE_AXIS].astype(np.float64)
+        cosine = np.minimum.reduceat(np.einsum("ij,ij->i", unit[lights], axis[node]), first)
+        # No tolerance on this side: the cone is rounded outwards. Conversely, the cone is as wide as its lights need.
+        assert (record[:, CONE_COS] <= cosine).all()
+        assert (record[:, CONE_COS] >= np.maximum(cosine - 1e-6, -1)).all()
     inner = np.flatnonzero(escape != np.arange(len(escape)) + 1)
     inherited = tree.representative[inner + 1] == tree.representative[inner]
     inherited |= tree.representative[escape[inner + 1]] == tree.representative[inner]
