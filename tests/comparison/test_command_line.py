@@ -201,7 +201,7 @@ def test_log_says_what_replaced_what(tmp_path):
 def test_exr_file_says_what_was_chosen(tmp_path):
     """Samples are enough for virtual lights to pay."""
     output = tmp_path / "a.exr"
-    assert run(CORNELL, "-D", "resx=192", "-D", "resy=192", "-o", output, "--spp", 64, "--pass-spp", 64) == 0
+    assert run(CORNELL, "-D", "resx=96", "-D", "resy=96", "-o", output, "--spp", 64, "--pass-spp", 64) == 0
     found = json.loads(images.read_exr(output)[2]["statistics"])
     assert "of the variance" in found["plan"]
     assert found["light_paths"] > 0 and found["shadow_rays"] > 0 and found["seconds"]["cuts"] > 0

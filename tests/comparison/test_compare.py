@@ -281,7 +281,7 @@ def test_reference_by_vpl_shares_the_lights(tmp_path, capsys):
 def test_comparison_is_of_path_and_manylights_unless_others_are_named(tmp_path, capsys):
     """The report states the choice; the samples suffice for virtual lights to pay."""
     status = compare.main([
-        CORNELL, "--spp", "64", "--width", "128", "--reference", "path:128", "--cache", str(tmp_path / "cache"), "-o",
+        CORNELL, "--spp", "64", "--width", "96", "--reference", "path:128", "--cache", str(tmp_path / "cache"), "-o",
         str(tmp_path),
     ])  # fmt: skip
     assert status == 0, capsys.readouterr().out

@@ -173,17 +173,17 @@ def test_every_film_with_every_plugin(options, name):
     assert image_of(scene, name, max_depth=3).shape == render(scene, "path", 1).shape
 
 
-def never_sampled(emitter, count=1):
-    """The given number of an emitter of the catalogue, with sampling weight 0 for ``path``."""
-    (lamp,) = EMITTERS[emitter]().values()
-    return {f"lamp{k}": lamp | {"sampling_weight": 0.0} for k in range(count)}
+def never_sampled(*emitters, count=1):
+    """The given number of each of some emitters of the catalogue, with sampling weight 0 for ``path``."""
+    lamps = {name: EMITTERS[name]()["lamp"] | {"sampling_weight": 0.0} for name in emitters}
+    return {f"{name}{k}": lamp for name, lamp in lamps.items() for k in range(count)}
 
 
 @pytest.mark.parametrize(
     "emitters",
-    [lambda: EMITTERS["directionalarea"](), lambda: never_sampled("directional") | never_sampled("projector"),
-     lambda: never_sampled("point", 40) | never_sampled("spot", 40)],
-    ids=["directionalarea", "directional, projector", "points and spots"],
+    [lambda: {"area": EMITTERS["directionalarea"]()["lamp"]} | never_sampled("directional", "projector"),
+     lambda: never_sampled("point", "spot", count=40)],
+    ids=["directionalarea, directional, projector", "points and spots"],
 )  # fmt: skip
 def test_emitters_that_path_never_finds_light_nothing(emitters):
     """A directional area emitter emits in a direction that no surface samples; the remaining emitters have a sampling

@@ -198,7 +198,7 @@ def furnished():
 
 
 @pytest.mark.usefixtures("lights_cost_nothing")
-@pytest.mark.parametrize("keep_lights", [False, True])
+@pytest.mark.parametrize("keep_lights", [True, *stress(False)])
 def test_an_optimised_scene_has_the_images_of_a_fresh_one(keep_lights):
     optimised = mi.load_dict(furnished())
     parameters = mi.traverse(optimised)

@@ -53,7 +53,7 @@ def test_error_zero_is_the_sum_of_all_lights(direct, phase_one_error):
     assert np.allclose(cut, render(scene, "vpl", 1, **settings), rtol=1e-4, atol=1e-5 * cut.mean())
 
 
-@pytest.mark.parametrize(("direct", "visibility"), [("nee", "all"), ("vpl", "all"), ("vpl", "adaptive")])
+@pytest.mark.parametrize(("direct", "visibility"), [("nee", "all"), ("vpl", "adaptive"), *stress(("vpl", "all"))])
 def test_the_error_of_the_image_follows_the_bound(direct, visibility):
     scene = glossy_room()
     settings = {"vpl_count": 5000, "max_depth": 5, "direct": direct, "direct_count": 256}

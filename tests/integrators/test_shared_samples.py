@@ -39,8 +39,9 @@ pytestmark = pytest.mark.usefixtures("lights_cost_nothing")
 @pytest.mark.parametrize(
     ("plugin", "material", "allowed"),
     [
-        ("adaptivedirect", "diffuse", 0.2), ("unoccludeddirect", "diffuse", 0.25), ("lightcuts", "diffuse", 0.2),
-        ("mdlightcuts", "diffuse", 0.2), ("manylights", "diffuse", 0.2), ("adaptivedirect", "roughplastic", 0.35),
+        ("unoccludeddirect", "diffuse", 0.25), ("lightcuts", "diffuse", 0.2), ("mdlightcuts", "diffuse", 0.2),
+        ("adaptivedirect", "roughplastic", 0.35),
+        *stress(("adaptivedirect", "diffuse", 0.2), ("manylights", "diffuse", 0.2)),
     ],
 )  # fmt: skip
 def test_textures_stay_sharp_under_mitsubas_usual_filter(plugin, material, allowed):

@@ -1,10 +1,13 @@
 """Surface interactions, against those of Mitsuba."""
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import stress
 from tests.support.paths import ROOT
 from tests.support.scenes import cornell, sensor
 from vpl.core import interactions
@@ -141,10 +144,14 @@ def test_meshes(shapes):
     assert_equal_interactions(scene, *rays())
 
 
-@pytest.mark.parametrize("shapes", OTHERS.values(), ids=OTHERS)
-def test_other_shapes_beside_meshes_and_alone(shapes):
-    assert_equal_interactions(mi.load_dict({"type": "scene", **shapes()}), *rays())
-    assert_equal_interactions(mi.load_dict({"type": "scene", **shapes(), **MESHES["several"]()}), *rays())
+SLOW = ("grid of distances", "beside meshes")
+PLACES = [one for one in itertools.product(OTHERS, ("alone", "beside meshes")) if one != SLOW]
+
+
+@pytest.mark.parametrize(("name", "place"), [*PLACES, *stress(SLOW)])
+def test_other_shapes_beside_meshes_and_alone(name, place):
+    meshes = MESHES["several"]() if place == "beside meshes" else {}
+    assert_equal_interactions(mi.load_dict({"type": "scene", **OTHERS[name](), **meshes}), *rays())
 
 
 def test_very_many_other_shapes_are_called_by_pointer(monkeypatch):

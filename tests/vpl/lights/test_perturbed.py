@@ -111,7 +111,7 @@ def test_glossy_light_is_spread_and_none_is_lost(nested):
     assert found == pytest.approx(expected, rel=0.1)
 
 
-@pytest.mark.parametrize("shape", ["rectangle", "shape group"])
+@pytest.mark.parametrize("shape", ["shape group", *stress("rectangle")])
 def test_light_goes_on_between_perturbed_walls(shape):
     bulb = {"bulb": {"type": "point", "position": [0.3, 0.4, 0.6], "intensity": rgb(1.0)}}
     box = closed_box(bulb, 16)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
+from tests.support.marks import stress
 from tests.support.pairs import prepared
 from tests.support.properties import examples
 from tests.support.rooms import glossy_room
@@ -153,9 +154,13 @@ def test_weights_and_costs_are_what_they_are_said_to_be(monkeypatch):
         assert np.allclose(cost[k], expected, rtol=1e-3, atol=1e-5 * expected.max())
 
 
-@pytest.mark.parametrize("batch", [0, 1])
-@pytest.mark.parametrize("shared", [30, 10**9])
-@pytest.mark.parametrize("clamping", [0.01, 0.0])
+@pytest.mark.parametrize(
+    ("clamping", "shared", "batch"),
+    [
+        (0.01, 30, 0), (0.01, 10**9, 1), (0.0, 30, 1), (0.0, 10**9, 0),
+        *stress((0.01, 30, 1), (0.01, 10**9, 0), (0.0, 30, 0), (0.0, 10**9, 1)),
+    ],
+)  # fmt: skip
 def test_no_column_that_can_arrive_has_a_weight_of_zero(batch, shared, clamping):
     """Whatever rows saw: here something, and then nothing."""
     job = prepared(glossy_room(), vpl_count=300, direct="vpl", direct_count=64, clamping=clamping)[1][batch]

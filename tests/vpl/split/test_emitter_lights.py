@@ -242,7 +242,7 @@ def test_lights_have_the_power_of_the_emitters_and_typical_distances():
 
 def test_lights_stand_for_many_emitters_and_not_for_few():
     rng = np.random.default_rng(3)
-    few, many = (mi.load_dict(closed_box(bulbs(number, rng), 192)) for number in (10, 300))
+    few, many = (mi.load_dict(closed_box(bulbs(number, rng), 96)) for number in (10, 300))
     integrator = mi.load_dict({"type": "manylights", "max_depth": 2})
     assert_lights_stand_for_emitters(integrator, many, 64)
     assert integrator.statistics["lights"] == {"emitters": 300}

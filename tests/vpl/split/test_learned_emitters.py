@@ -273,6 +273,7 @@ def test_changes_of_emitters_are_seen():
 # ---------------------- Emitters that `path` never samples ----------------------
 
 
+@pytest.mark.stress
 def test_a_point_emitter_that_is_never_sampled_is_black_as_in_path():
     scene = mi.load_dict(closed_box(bulbs(sampling_weight=0.0), 8))
     found, expected = (render(scene, name, 256, max_depth=3).mean() for name in ("manylights", "path"))

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from tests.support.marks import stress
 from tests.support.properties import examples
 from vpl.core.arrays import upload
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
@@ -179,7 +180,7 @@ def lattice_numbers(rays, seed, vertex):
     return np.concatenate([np.array(x).reshape(-1, rays.count) for x in numbers])
 
 
-@pytest.mark.parametrize("mean", [4, 12, 64])
+@pytest.mark.parametrize("mean", [4, 12, *stress(64)])
 def test_numbers_of_every_pixel_are_one_in_each_stratum(mean):
     rays = usual_rays(2**16 // mean, mean)
     numbers = lattice_numbers(rays, 7, 3)
@@ -282,7 +283,7 @@ def test_so_many_first_vertices_of_each_pixel_are_lit_as_many_of_each_half(most)
         assert abs(of_first - share * -(-rays.numbers[place] // 2)) < 1
 
 
-@pytest.mark.parametrize("most", [1, 2, 4, 6, 8, 16])
+@pytest.mark.parametrize("most", [1, 2, 6, 16, *stress(4, 8)])
 def test_every_cell_and_half_has_as_many_lit_vertices_and_no_ray_is_preferred(most):
     rays, seeds = replace(PixelRays.uniform(5, 16), cells=4), 500
     cells, turns = (np.array(x) for x in rays.places(dr.arange(mi.UInt32, rays.count)).in_cells(mi.UInt32(4)))

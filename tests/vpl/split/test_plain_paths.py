@@ -1,5 +1,6 @@
 """Plain paths, those of large images without virtual lights: the paths of other images, in a smaller kernel."""
 
+import itertools
 from unittest import mock
 
 import drjit as dr
@@ -7,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.marks import stress
 from tests.support.rendering import plugin_with_model, render
 from tests.support.rooms import many_kinds, sunny, veiled_room
 from tests.support.scenes import area_light, closed_box, sensor, wall
@@ -75,17 +77,20 @@ def assert_same_paths(scene, **given):
     return one
 
 
-@pytest.mark.parametrize("most", [1, 4])
-@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+SCENES_AND_SAMPLES = list(itertools.product(SCENES, [1, 4]))
+SLOW = list(itertools.product(["constant sky", "black sky", "sun"], [4]))
+
+
+@pytest.mark.parametrize(("scene", "most"), [*(one for one in SCENES_AND_SAMPLES if one not in SLOW), *stress(*SLOW)])
 def test_plain_paths_are_the_paths_of_other_images(scene, most):
-    statistics = assert_same_paths(mi.load_dict(with_alpha(scene())), most=most)
+    statistics = assert_same_paths(mi.load_dict(with_alpha(SCENES[scene]())), most=most)
     if most == 1:
         assert statistics["emitter_samples"] == "1"
-    elif scene is many_kinds:
+    elif scene == "gloss and some emitters":
         assert float(statistics["emitter_samples"]) > 1.5
 
 
-@pytest.mark.parametrize("hide_emitters", [False, True])
+@pytest.mark.parametrize("hide_emitters", [True, *stress(False)])
 def test_hidden_emitters_layers_and_groups(hide_emitters):
     lamp = {"type": "sphere", "radius": 0.3, "emitter": {"type": "area", "radiance": 2.0}}
     scene = mi.load_dict(closed_box({"lamp": lamp, "bulb": {"type": "point", "position": [0, 0.8, 0]}}, 16))

@@ -363,6 +363,7 @@ def test_clusters_hold_their_vertices(alone):
     assert (cosine >= np.array(receiver.normal_cosine)[of]).all()
 
 
+@pytest.mark.stress
 def test_later_vertices_are_drawn_by_weight_and_stand_for_all_of_them():
     rng, pixels, samples, most = np.random.default_rng(2), 50, 8, 3
     weights = []
