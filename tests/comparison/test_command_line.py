@@ -374,11 +374,15 @@ def test_interruption_reaches_a_process(tmp_path):
     assert all(file.name == "a.exr" for file in tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("moment", ["__init__", "render", "sample"])
-@pytest.mark.parametrize("more", [["-v"], [str(ROOT / "scenes" / "glossy.xml")]], ids=["verbose", "two scenes"])
-def test_interruption_within_the_integrator(tmp_path, moment, more):
+@pytest.mark.parametrize(
+    ("scenes", "moment"),
+    [("one", "__init__"), ("one", "render"), ("one", "sample"), ("two", "sample"),
+     *stress(("two", "__init__"), ("two", "render"))],
+)  # fmt: skip
+def test_interruption_within_the_integrator(tmp_path, scenes, moment):
     """Mitsuba replaces KeyboardInterrupt while it loads a scene, and after a second Ctrl-C in a pass."""
-    output = tmp_path / "a.exr" if more == ["-v"] else tmp_path
+    output = tmp_path / "a.exr" if scenes == "one" else tmp_path
+    more = ["-v"] if scenes == "one" else [str(ROOT / "scenes" / "glossy.xml")]
     script = f"""
 import signal, sys
 import mitsuba as mi
