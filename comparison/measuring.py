@@ -57,7 +57,8 @@ def _render_in_time(progressive, budget, seeds=None):
     """Render passes in parts within a `budget` in seconds, of the sizes that `render` uses with a limit of time."""
     sizes = sizes_of(progressive, time=budget)
     while not isinstance(spp := sizes.next(progressive.passes, progressive.seconds), str):
-        progressive.render(spp, next(seeds) if seeds else None, is_probe=sizes.is_probe)
+        seed = next(seeds) if seeds else None
+        progressive.render(spp, seed, is_probe=sizes.is_probe, is_last=sizes.is_last)
 
 
 def _render_cold(progressive, job):

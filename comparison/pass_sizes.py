@@ -45,7 +45,8 @@ class PassSizes:
         self._spp, self._fixed, self._many, self._in_parts = spp, fixed, many, in_parts
         self._any_size = in_parts and not many and not fixed  # after the first pass, not only powers of two
         self._accepts, self._probes = accepts, probes and self._any_size
-        self.is_probe = False  # whether the last pass that was asked for determines the samples of pixels
+        # Whether the last pass that was asked for determines the samples of pixels, and will probably end the render
+        self.is_probe = self.is_last = False
         self._minimum, self._multiple, self._least_probe = least, multiple, max(LEAST_SAMPLES, multiple)
         self._largest = max(power_of_two(largest_pass(pixels, in_parts)), least)
         self._least = max(USUAL if USUAL * pixels <= FIRST_SAMPLES else 1, least)
@@ -62,7 +63,9 @@ class PassSizes:
             # Too few for the halves of a pass: a pass of the usual size
             self.is_probe = False
             size = self._size(passes, done, elapsed)
-        return size - size % self._multiple if self.is_probe else size
+        size = size - size % self._multiple if self.is_probe else size
+        self.is_last = self._spp is not None and size >= self._spp - done
+        return size
 
     def _expected_samples(self, done, elapsed):
         """Return the expected samples per pixel of the render, of which `done` are rendered."""

@@ -37,7 +37,8 @@ class Took:
 
     `spp`: samples per pixel; `passes`: number of passes, each with its own seed; `seconds`: wall-clock time of the
     call, including compilation and denoising; `error`: estimated relative standard error that 95% of the pixels do not
-    exceed (see convergence.py), before denoising, None for fewer than two passes and where pixels have different
+    exceed (see convergence.py), before denoising, an upper estimate in renders by `manylights` without the limit
+    `error`, whose passes are stratified together, None for fewer than two passes and where pixels have different
     numbers of samples; `statistics`: counters of the integrator, summed over passes; `ended_by`: the limit that was
     reached ("spp", "time" or "error"), "interruption" (Ctrl-C, or `cancel` of the integrator) or "progress", None
     during the render; `channels`: names of the channels;
@@ -140,6 +141,8 @@ def render(
     limits = {} if checkpoint else {"seconds": time, "spp": spp}
     progressive = Progressive(scene, seed, sensor, integrator, chooses, denoiser.parts if denoiser else 1, **limits)
     progressive.keeps_halves = bool(denoiser) and denoiser.restores
+    # An image that ends by its error needs independent passes, and a checkpoint may go on with them on other machines
+    progressive.shares_lattices = not (denoiser or error or checkpoint)
     reserved = denoiser.expected_seconds if denoiser else 0.0
     sizes = sizes_of(progressive, spp, time and time - reserved, pass_spp, error is not None)
     ending = Ending(spp, time and time - reserved, error, reserved)
@@ -251,18 +254,18 @@ class _Render:
             if isinstance(size, str):
                 self._ended_by = size
                 return
-            one = self._pass(size, interrupted, sizes.is_probe)
+            one = self._pass(size, interrupted, is_probe=sizes.is_probe, is_last=sizes.is_last)
             if one is not None:
                 self._look()
             if one is None or interrupted():
                 self._ended_by = "time" if self.progressive.is_late() else "interruption"
 
-    def _pass(self, size, interrupted, is_probe):
+    def _pass(self, size, interrupted, **kind):
         """Render a pass and return it, None after an interruption."""
         try:
             with listening(self._listener()) if self._progress else nullcontext():
                 # Ctrl-C also stops Mitsuba, so that the pass may be unfinished
-                return self.progressive.render(size, accept=lambda: not interrupted(), is_probe=is_probe)
+                return self.progressive.render(size, accept=lambda: not interrupted(), **kind)
         except BaseException as error:
             # Mitsuba and Dr.Jit replace exceptions that they pass on
             if self._raised is not None:

@@ -117,7 +117,11 @@ class Passes:
 class Progressive(Passes):
     """Running average of passes in this process. `integrator` is by default the scene's; `denoise`: see
     `SampleDensity`, for an image that will be denoised; `parts`: see fine_film.py; `seconds`, `spp`: limits of the
-    render, or None."""
+    render, or None. `shares_lattices`: whether the samples of later passes continue those of earlier ones where pixels
+    have equal numbers of samples. The estimated error, which takes passes for independent, is then an upper estimate.
+    It is set before the first pass."""
+
+    shares_lattices = False
 
     def __init__(self, scene, seed, sensor=0, integrator=None, denoise=None, parts=1, seconds=None, spp=None):
         self._scene, self._sensor, self._denoise = scene, sensor, denoise
@@ -132,19 +136,20 @@ class Progressive(Passes):
         super().restart()
         self._shared, self.density = SharedStart(**self._rays), SampleDensity(self._denoise, self.parts)
 
-    def render(self, spp, seed=None, accept=lambda: True, is_probe=False):
+    def render(self, spp, seed=None, accept=lambda: True, is_probe=False, is_last=False):
         """Render and add a pass of `spp` samples per pixel; return the `Pass`.
 
         The default `seed` is `pass_seed(seed of the render, index of the pass)`. `is_probe`: whether the pass
-        determines the samples of the pixels in later passes. If the pass raises an exception, or `accept` returns False
-        afterwards (the result is then None), the average does not change.
+        determines the samples of the pixels in later passes; `is_last`: whether it will probably end the render. If the
+        pass raises an exception, or `accept` returns False afterwards (the result is then None), the average does not
+        change.
         """
         seed = pass_seed(self.seed, len(self.passes)) if seed is None else seed
         first = (self.passes[0].spp, self.passes[0].seed) if self.passes else None
         sensor = self._scene.sensors()[self._sensor]
         density = self.density.of_pass(self.integrator, sensor, spp)
         half = is_probe and self.density.suits_probe(self.integrator, sensor, spp)
-        continued = None if density is None else self._continued(sensor)
+        continued = self._continued(sensor, density, is_last)
         image = render_pass(
             self._scene, self._sensor, self.integrator, spp, seed, first, self._shared, density=density, half=half,
             parts=self.parts, continued=continued, measures=self._may_compile,
@@ -160,11 +165,23 @@ class Progressive(Passes):
         """Whether the next pass may compile much: it is the first one, or the pass before it compiled kernels."""
         return not self.passes or bool(self.passes[-1].compile_seconds)
 
-    def _continued(self, sensor):
-        """Return the passes so far whose lattices a pass with different numbers of samples continues."""
-        # The first two passes determine the numbers, and small passes have equal ones
-        earlier = (one.spp for one in self.passes[2:] if self.density.suits(self.integrator, sensor, one.spp))
+    def _continued(self, sensor, density, is_last):
+        """Return the passes so far whose lattices a pass continues, None for lattices of its own. `density`: samples of
+        pixels over their mean, None for equal numbers."""
+        if density is not None:
+            # The first two passes determine the numbers, and small passes have equal ones
+            earlier = (one.spp for one in self.passes[2:] if self.density.suits(self.integrator, sensor, one.spp))
+        elif self._shares(is_last):
+            earlier = (one.spp for one in self.passes[1:])
+        else:
+            return None
         return Continued(sum(earlier), derived_seed(self.seed, _CONTINUED_STREAM))
+
+    def _shares(self, is_last):
+        """Return whether a pass with equal numbers of samples shares lattices: not the first one, which is small, nor a
+        second one that is the last. A lattice of its own is more even."""
+        alone = not self.passes or (is_last and len(self.passes) == 1)
+        return self.shares_lattices and not alone and getattr(self.integrator, "may_continue", False)
 
     def accepts(self, spp):
         """Return whether the sampler keeps a number of samples per pixel, which some samplers round up, and whether

@@ -32,6 +32,7 @@ LIT = 2.0  # usual cost of a sample with virtual lights over that without, at mo
 UNSURE = 1.1  # cost over a predicted one, usually at most: measured are 0.67 to 1.2 (decisions.md)
 DOUBT = 0.5  # fraction of the remaining time for a second pass, which may have lights and cost more than expected
 DIFFERENT = 1.08  # usual cost of a sample where pixels have different numbers: there are more at edges and on glass
+LAST_SHARE = 0.75  # minimum fraction of the remaining time of a pass that will probably end the render
 LONGEST = 2.0  # times the wanted seconds: longer passes shrink
 CHANGED = 1.5  # ratio of the times of two passes of equal size at which earlier times are discarded
 MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of extrapolated times
@@ -84,6 +85,8 @@ class TimedSizes(PassSizes):
             self._learn(passes[-1], sum(one.spp for one in passes), is_first=len(passes) == self._before + 1)
         self._dearer = DIFFERENT if self.is_probe else 1.0
         self._asked = super().next(passes, elapsed)
+        if passes and isinstance(self._asked, int) and self._asked:
+            self.is_last |= self._expected(self._asked) > LAST_SHARE * (self._time - elapsed)
         return self._asked or "time"
 
     def _expected_samples(self, done, elapsed):

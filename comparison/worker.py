@@ -148,6 +148,7 @@ def render(job):
     parts, denoise = denoiser.parts if denoiser else 1, denoiser.denoise if decides else None
     progressive = Progressive(scene, job.seed, denoise=denoise, parts=parts, seconds=job.budget)
     progressive.keeps_halves = bool(denoiser) and denoiser.restores
+    progressive.shares_lattices = not denoiser
     cold = measure(progressive, job)
     passes, spp, pixels = progressive.passes, progressive.spp, progressive.pixels
     warm = [one.seconds for one in passes[1 if job.cold else 0 :]]

@@ -32,7 +32,7 @@ class LatticeSampler(mi.Sampler):
 
     Each call of ``next_1d`` or ``next_2d`` takes a lattice in an independent random order.  The numbers are for camera
     rays and not for symbolic loops.  ``pixels``: of the film, borders included; ``cells``: the :class:`FilmCells` of a
-    render in one pass, if rays are not in the order of the film, else None.
+    render in one pass, if rays are not in the order of the film or continue lattices, else None.
     """
 
     def __init__(self):
@@ -68,18 +68,18 @@ class LatticeSampler(mi.Sampler):
     def next_2d(self, active=True):
         """A point of the unit square for each lane."""
         # Mitsuba takes the place in the pixel first, and assumes its own order
-        if self.cells and self._calls == 0:
+        if self._in_cells and self._calls == 0:
             return self._next(self._in_cells)[1] + self._offset
         return self._next()[1]
 
     def _begin(self):
         lanes = self.wavefront_size()
         each, lane, self._calls = lanes // self.pixels, dr.arange(mi.UInt32, lanes), 0
-        seed, earlier, cells = self._seed, None, 1
-        if self.cells:
-            rays = self.cells.rays
-            places, sizes, earlier = rays.places(lane), rays.sizes, rays.earlier
-            seed = rays.continued.seed if rays.continued else seed
+        seed, earlier, cells, rays = self._seed, None, 1, self.cells and self.cells.rays
+        if rays and rays.continued:
+            seed, earlier = rays.continued.seed, rays.earlier
+        if rays and not self.cells.is_plain:
+            places, sizes = rays.places(lane), rays.sizes
             in_cells = self.cells.places(lane)
             cells = rays.cells
             self._in_cells = Lattice(in_cells, self.cells.sizes, seed, self.cells.earlier)
@@ -182,17 +182,18 @@ def cells_of(
     film, spp: int, parts: int, density: np.ndarray | None = None, continued: Continued | None = None
 ) -> FilmCells | None:  # fmt: skip
     """Cells of a ``film`` with ``parts``² pixels for each pixel of the image and ``spp`` samples for each pixel of the
-    film; None if rays have the order of the film.
+    film; None if rays have the order of the film and lattices of their own.
 
     ``density`` (height, width): samples of the image's pixels over their mean, about; None: equal numbers;
-    ``continued``: earlier rays by this density.  Raises ValueError for a density of another shape.
+    ``continued``: earlier rays with these numbers.  Raises ValueError for a density of another shape.
     """
-    if parts == 1 and density is None:
+    if parts == 1 and density is None and continued is None:
         return None
     width, height = (film_size(film) // parts).tolist()
     samples = spp * parts**2
     if density is None:
-        return FilmCells(replace(PixelRays.uniform(width * height, samples), cells=parts**2), width)
+        rays = replace(PixelRays.uniform(width * height, samples), cells=parts**2, continued=continued)
+        return FilmCells(rays, width)
     if density.shape != (height, width):
         raise ValueError(f"density must have the shape of the image, {(height, width)}, got {density.shape}")
     return FilmCells(replace(PixelRays.by_density(density, samples, continued), cells=parts**2), width)

@@ -57,8 +57,8 @@ class PassRenderer(GatheringIntegrator):
         of the image over their mean, about; None for equal numbers.  ``half``: whether the image has the mean of every
         second sample as channels of the layer :data:`vpl.split.film_cells.HALF`, with an even number of samples for
         each pixel of the film.  Both need :meth:`may_differ`, and exclude each other.  ``continued``: earlier passes
-        with this density whose lattices the samples continue; None for lattices of their own.  The density must not
-        depend on these passes: their samples tell where the next ones lie.
+        with this density whose lattices the samples continue, which needs :attr:`may_continue`; None for lattices of
+        their own.  The density must not depend on these passes: their samples tell where the next ones lie.
         """
         if half and density is not None:
             raise ValueError("half must be False where pixels have different numbers of samples, by a density")
@@ -79,6 +79,11 @@ class PassRenderer(GatheringIntegrator):
             yield
         finally:
             self._pass = before
+
+    @property
+    def may_continue(self) -> bool:
+        """Whether the samples of a pass may continue the lattices of earlier passes."""
+        return self.stratified and self.samples_per_pass == NO_LIMIT
 
     def may_differ(self, sensor, spp: int, parts: int = 1) -> bool:
         """Whether the pixels of a pass of an image for denoising may have different numbers of samples, ``spp`` in the

@@ -57,10 +57,10 @@ class DistributedPasses(Passes):
         self._pool.forget(self)
         self._finished.clear()
 
-    def render(self, spp, accept=lambda: True, is_probe=False):
+    def render(self, spp, accept=lambda: True, is_probe=False, is_last=False):
         """Wait for the next pass, of `spp` samples per pixel, add it and return the `Pass`; None if `accept` returns
         False, or after the deadline. Raises ClusterError if a pass failed. `is_probe`: False, as the passes of workers
-        have equal numbers of samples in all pixels."""
+        have equal numbers of samples in all pixels; `is_last`: not used, as they share no lattices."""
         index = len(self.passes)
         while index not in self._finished:
             if self._failure:

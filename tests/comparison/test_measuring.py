@@ -18,7 +18,7 @@ class Recorded(rendering.Progressive):
     pixels, integrator = property(lambda self: self._pixels), None
     _denoise, _rays, differs, parts = None, {}, False, 1
 
-    def render(self, spp, seed=None, is_probe=False):
+    def render(self, spp, seed=None, is_probe=False, is_last=False):
         self.asked.append((spp, seed is not None))
         seconds = self._seconds.pop(0) if self._seconds else self._start + spp
         self.passes.append(single_pass.Pass(seed or 0, spp, seconds))
@@ -41,7 +41,7 @@ class InParts(Recorded):
     def accepts(self, spp):
         return True
 
-    def render(self, spp, seed=None, is_probe=False):
+    def render(self, spp, seed=None, is_probe=False, is_last=False):
         self.asked.append((spp, seed is not None))
         pilot = 0.0 if self.passes else 2.0
         stages = {Stage.PILOT: pilot, Stage.TRACED: 0.01 * spp, Stage.CUTS: 0.0}

@@ -1,5 +1,7 @@
 """Samples of pixels in images that will be denoised."""
 
+from functools import cache
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -213,6 +215,41 @@ def test_passes_with_numbers_of_their_own_share_lattices(tmp_path, monkeypatch, 
     assert [one for _, one in seen[:2]] == [None, None] and seen[-1][1] is None and len(shared) > 2
     assert shared == [(spp, sum(size for size, _ in shared[:index])) for index, (spp, _) in enumerate(shared)]
     assert len({continued.seed for _, continued in seen if continued}) == 1
+
+
+@pytest.mark.parametrize("limits", [{}, {"error": 1e-4}, {"denoise": True}])
+def test_passes_of_raw_images_share_lattices_unless_they_end_by_error(monkeypatch, limits):
+    seen, before = [], rendering.render_pass
+
+    def spied(*arguments, continued, **more):
+        seen.append((arguments[3], continued))
+        return before(*arguments, continued=continued, **more)
+
+    monkeypatch.setattr(rendering, "render_pass", spied)
+    for spp, shared in ((12, [None, 0, 4]), (8, [None, None])):
+        seen.clear()
+        _, took = manylights.render(cornell().load(), "manylights", spp=spp, pass_spp=4, **limits)
+        assert took.error > 0
+        found = [continued and continued.earlier for _, continued in seen]
+        assert found == ([None] * len(shared) if limits else shared)
+
+
+def test_passes_that_share_lattices_have_the_mean_and_less_noise():
+    """Direct light of a large lamp, which a lattice samples well."""
+    scene = mi.load_dict(closed_box({"lamp": area_light()}, 16))
+    plugin = mi.load_dict({"type": "manylights", "max_depth": 2})
+
+    @cache
+    def image(shares, seed):
+        progressive = rendering.Progressive(scene, seed, integrator=plugin)
+        progressive.shares_lattices = shares
+        for spp in (2, 10, 10, 10, 10):
+            progressive.render(spp)
+        return progressive.image[..., :3]
+
+    shared, alone = (np.array([image(shares, seed) for seed in range(8)]) for shares in (True, False))
+    assert shared.var(0, ddof=1).mean() < 0.85 * alone.var(0, ddof=1).mean()
+    assert_same_mean(lambda seed: (image(True, seed), image(False, seed)), 8)
 
 
 def test_a_seed_gives_the_same_image():
