@@ -10,6 +10,7 @@ sizes over its inner nodes; "halved" is a balanced tree over the lights in Morto
 import argparse
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -119,7 +120,8 @@ def timed_stages():
     return seconds
 
 
-def benchmark_builds(counts):
+def benchmark_builds(counts) -> Iterator[dict]:
+    """Print the seconds of builds, and the quality of their trees; yields the rows so far."""
     print(f"{'lights':>9} {'seconds':>8}  " + " ".join(f"{name[1:]:>14}" for name in STAGES), end="")
     print(f"  {'depth':>5} {'cost':>7} {'halved':>7} {'ratio':>6}")
     seconds, rows = timed_stages(), {}
@@ -224,9 +226,8 @@ def main():
         for count in arguments.counts or [60_000]:
             benchmark_cuts(count)
     else:
-        for rows in benchmark_builds(arguments.counts or [10_000, 50_000, 200_000, 650_000, 1_200_000]):
-            if arguments.json:
-                results.write_results(arguments.json, "builds", {}, rows)
+        builds = benchmark_builds(arguments.counts or [10_000, 50_000, 200_000, 650_000, 1_200_000])
+        results.write_rows(arguments.json, "builds", {}, builds)
 
 
 if __name__ == "__main__":

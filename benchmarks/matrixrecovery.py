@@ -188,7 +188,7 @@ def steps(names, options) -> Iterator[dict]:
         yield rows
 
 
-def pictures(names, options) -> tuple:
+def pictures(names, options) -> Iterator[dict]:
     """Part "pictures", without rows."""
     from benchmarks.matrix_pictures import draw_slice
 
@@ -201,7 +201,7 @@ def pictures(names, options) -> tuple:
         with replacing(file) as temporary:
             draw_slice(plugin, job, options.slice, temporary, {"scene": name, "VPLs": VPLS, "seed": 0})
         print(file, flush=True)
-    return ()
+    yield from ()
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ import os
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -100,33 +101,43 @@ def parse(parser, arguments=None):
 def run_parts(options, parts: dict, settings: dict) -> None:
     """Run the functions of ``parts`` that ``options`` name, and write the result file with the ``settings``.
 
-    A function yields its rows so far whenever one is finished, so that a run that is interrupted has a file.
+    A function yields its rows so far from time to time, usually after each scene.  They are in ``FILE.partial`` until
+    all are there, so that an interrupted run loses nothing and replaces no complete file.
     """
     for part in options.parts:
-        for rows in parts[part]():
-            if options.json:
-                write_results(options.json, part, settings, rows)
+        write_rows(options.json, part, settings, parts[part]())
 
 
-def write_results(path, part: str, settings: dict, rows: dict) -> None:
+def write_rows(path: Path | None, part: str, settings: dict, growing: Iterable[dict]) -> None:
+    """Take the ``growing`` rows of a part, see :func:`run_parts`; write them to the result file ``path``, if any."""
+    if path is None:
+        for _ in growing:
+            pass
+        return
+    partial, made_by = path.with_name(path.name + ".partial"), origin()
+    for rows in growing:
+        write_results(partial, part, settings, rows, made_by)
+    if partial.exists():
+        partial.replace(path)
+
+
+def origin() -> dict:
+    """Command, commit, date and machine of this run."""
+    date = datetime.now(UTC).date().isoformat()
+    return {"command": command(), "commit": commit(), "date": date, "machine": described_machine()}
+
+
+def write_results(path, part: str, settings: dict, rows: dict, made_by: dict | None = None) -> None:
     """Write the result file of one part.
 
     ``rows``: {row: {quantity: number}}, or {row: {method: {quantity: number}}}, where a row is a scene, and the
-    quantities are keys of ``UNITS``. The file replaces an older one at once. Raises ValueError for an unknown
-    quantity or a number that is not finite.
+    quantities are keys of ``UNITS``; ``made_by``: :func:`origin`, by default of now. The file replaces an older one at
+    once. Raises ValueError for an unknown quantity or a number that is not finite.
     """
     quantities: set = set()
     rows = {str(name): _checked(row, str(name), quantities) for name, row in rows.items()}
-    content = {
-        "command": command(),
-        "part": part,
-        "commit": commit(),
-        "date": datetime.now(UTC).date().isoformat(),
-        "machine": described_machine(),
-        "settings": settings,
-        "units": {name: UNITS[name] for name in sorted(quantities)},
-        "rows": rows,
-    }
+    units = {name: UNITS[name] for name in sorted(quantities)}
+    content = {"part": part} | (made_by or origin()) | {"settings": settings, "units": units, "rows": rows}
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 

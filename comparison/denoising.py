@@ -94,9 +94,7 @@ class Denoiser:
     the last image of `denoise_passes` has it.
     """
 
-    def __init__(
-        self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None, parts=1, hide_emitters=False
-    ):  # fmt: skip
+    def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None, parts=1, hide_emitters=False):
         self._oidn, begin = import_oidn(), time.perf_counter()
         self._networks = {name: getattr(self._oidn.Quality, name.capitalize()) for name in QUALITIES}
         self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
@@ -107,9 +105,7 @@ class Denoiser:
             # The time of a network is that of its tiles at the resolution of `parts`
             is_quick = self._expected(quality or QUALITIES[-1]) <= FINE_SHARE * time_limit
             self.parts = parts if is_quick else 1
-        self.features, self.feature_spp = features_of(
-            scene, one, seed, spp, time_limit, self.parts, hide_emitters
-        )  # fmt: skip
+        self.features, self.feature_spp = features_of(scene, one, seed, spp, time_limit, self.parts, hide_emitters)
         ways = [way for way in WAYS if quality in (None, way[0])]
         self.quality, self.copies = self._usual_way(ways, spp, time_limit)
         if time_limit is not None:

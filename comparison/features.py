@@ -68,14 +68,14 @@ class Layers:
         return np.concatenate((image, self.planes), axis=-1)
 
 
-def layers_of(names, scene, sensor, denoiser, **limits):
+def layers_of(names, scene, sensor, denoiser, **of_image):
     """Return the `Layers` with some `names` for a sensor (an index), None for no names: those of the denoiser if there
-    is one. `limits`: see `features_of`."""
+    is one. `of_image`: see `features_of`."""
     if not names:
         return None
     if denoiser:
         return Layers.of(names, denoiser.merged_features, denoiser.feature_spp)
-    return Layers.of(names, *features_of(scene, scene.sensors()[sensor], **limits))
+    return Layers.of(names, *features_of(scene, scene.sensors()[sensor], **of_image))
 
 
 def hides_emitters(integrator):
@@ -114,7 +114,7 @@ def auxiliary_features(scene, sensor, spp, seed, parts=1, hide_emitters=False):
     """Render "albedo", "normal" and "depth", a dict of (height, width, channels) float32, of the first surfaces that
     are neither mirror nor glass, with the film's filter and about `spp` samples per pixel; `sensor` is a `mi.Sensor`.
     The samples are stratified if the sensor's sampler is `independent`. `parts`: in the resolution of a fine film
-    (fine_film.py), with its filter. `hide_emitters`: of the integrator, as in Mitsuba's `path`. Return the dict and the
+    (fine_film.py), with its filter. `hide_emitters`: of the integrator, as in Mitsuba's `prb`. Return the dict and the
     samples per pixel: `spp` rounded down to a multiple of 16, at least 16.
 
     Albedo, 0 to 1: directional albedo, estimated by one BSDF sample, times the throughput of mirrors and glass before
@@ -155,7 +155,7 @@ def _rendered(scene, sensor, spp, key, hide_emitters):
 @cache
 def _feature_integrator(variant, hide_emitters):
     """Return an integrator that renders a black image with the features as AOVs. Mitsuba's base class depends on the
-    variant; `variant`, the current one, is the cache key."""
+    variant; `variant`, the current one, is part of the cache key."""
 
     class FeatureIntegrator(mi.SamplingIntegrator):
         def aov_names(self):

@@ -132,9 +132,9 @@ def render(
     begin = clock.perf_counter()
     # Passes of a checkpoint have the usual resolution, as the choice depends on times
     parts = 1 if checkpoint or not denoise else usual_parts(scene.sensors()[sensor], integrator, spp)
-    shown = {"seed": seed, "spp": spp, "time_limit": time, "hide_emitters": hides_emitters(integrator)}
-    denoiser = Denoiser(scene, sensor, quality=quality, parts=parts, **shown) if denoise else None
-    planes = layers_of(layers, scene, sensor, denoiser, **shown)
+    of_image = {"seed": seed, "spp": spp, "time_limit": time, "hide_emitters": hides_emitters(integrator)}
+    denoiser = Denoiser(scene, sensor, quality=quality, parts=parts, **of_image) if denoise else None
+    planes = layers_of(layers, scene, sensor, denoiser, **of_image)
     # The error is that of the raw image, which equal numbers of samples suit best
     chooses = denoiser.denoise if denoiser and not error else None
     # Without a limit of time for a checkpoint, which may go on with another one or on other machines

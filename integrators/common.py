@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from vpl.core.arrays import add_at, download
+from vpl.core.path_limits import PathLimits
 from vpl.core.sampling import derived_seed
 from vpl.core.stages import Stage
 from vpl.direct.adaptive import DirectOptions, light_directly
@@ -17,7 +18,6 @@ from vpl.direct.sources import Sources
 from vpl.lights.light_set import LightOptions, LightSet, prepare_lights
 from vpl.points.bsdf_proxies import probe_materials
 from vpl.points.camera_paths import PixelGrid
-from vpl.points.path_limits import PathLimits
 from vpl.points.surfaces import Batch, make_batches
 from vpl.transport.evaluation import Transport, mean_radiance
 

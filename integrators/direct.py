@@ -16,7 +16,7 @@ from vpl.direct.sources import Sources
 from vpl.points.camera_paths import PixelGrid
 
 from .bands import fits_one_band, random_rays, render_in_bands
-from .gathering import CameraPass, GatheringIntegrator, add_statistics, whole_sum
+from .gathering import CameraPass, GatheringIntegrator, add_statistics, for_all_samples, whole_sum
 from .knobs import Depth, Fraction, Integer, Number, Words, knobs_of
 
 # Camera rays that estimate the mean radiance of the surfaces that an image rendered in bands shows
@@ -81,7 +81,7 @@ class DirectLightIntegrator(GatheringIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        self._in_base, self._band, self._is_black = False, None, False
+        self._in_base, self._band, self._is_clearing = False, None, False
 
     def options(self) -> DirectOptions:
         """Options of :func:`vpl.direct.adaptive.light_directly`, from the knobs of the same names."""
@@ -107,18 +107,18 @@ class DirectLightIntegrator(GatheringIntegrator):
     def _clear_stop(self, scene) -> None:
         """Begin the time of ``timeout``, and forget that an earlier render was cancelled.  Only Mitsuba's ``render``
         does that: here for a black image of one pixel."""
-        film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
-        self._is_black = True
+        # The pixel format of mono variants, which warn of others
+        film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+        self._is_clearing = True
         try:
-            super()._render(scene, mi.load_dict({"type": "perspective", "film": film}), 0, 1, False, True)
+            super()._render(scene, mi.load_dict({"type": "perspective", "film": film}), 0, 1, False, False)
         finally:
-            self._is_black = False
+            self._is_clearing = False
 
-    def sample(self, scene, sampler, ray, medium=None, active=True):
-        """See :meth:`integrators.gathering.GatheringIntegrator.sample`."""
-        if self._is_black:
+    def _sample(self, scene, sampler, ray, active):
+        if self._is_clearing:
             return mi.Spectrum(0), mi.Bool(False), [mi.Float(0)] * len(self.aovs)
-        return super().sample(scene, sampler, ray, medium, active)
+        return super()._sample(scene, sampler, ray, active)
 
     def _render_bands(self, scene, sensor, seed: int, samples: int) -> None:
         """Render the bands with a common mean radiance and a common time limit."""
@@ -138,7 +138,8 @@ class DirectLightIntegrator(GatheringIntegrator):
 
     def _find_level(self, scene, sensor, seed: int) -> float:
         """Mean radiance of direct light over the gather points, from one pass with _LEVEL_RAYS camera rays."""
-        camera = self.begin(scene, *random_rays(sensor, seed, _LEVEL_RAYS))
+        sampler, ray = random_rays(sensor, seed, _LEVEL_RAYS)
+        camera = self.begin(scene, sampler, *for_all_samples(sampler, ray, True))
         if camera.dark or self.max_depth < 2:
             return 0.0
         quick = replace(self.options(), max_passes=1, lights="clusters")

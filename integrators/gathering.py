@@ -54,7 +54,7 @@ def _hear_interruptions() -> None:
         signal.signal(signal.SIGINT, handler)
 
 
-def _for_all_samples(sampler, ray, active):
+def for_all_samples(sampler, ray, active):
     """(Camera rays, mask) with a lane for each sample: some sensors, such as ``radiancemeter``, give a single ray."""
     count = dr.width(ray) if dr.width(ray.o, ray.d) > 1 else sampler.wavefront_size()
     ray, wide = mi.Ray3f(ray), dr.zeros(mi.Float, max(count, 1))
@@ -177,7 +177,7 @@ class GatheringIntegrator(mi.SamplingIntegrator):
                 self._refuse_recording()
                 self.check_scene(scene)
                 share_code(scene)
-                return self._sample(scene, sampler, *_for_all_samples(sampler, ray, active))
+                return self._sample(scene, sampler, *for_all_samples(sampler, ray, active))
             except Exception as error:
                 # Logged, as `mi.render` raises a general error with this error as the cause
                 mi.Log(mi.LogLevel.Warn, f"{type(self).__name__}: {error}")

@@ -55,12 +55,12 @@ class DistributedRender:
             scene = self._scene.get() if denoise or layers else None
             if layers:
                 check_layers(layers, self._scene.integrator)
-            limits = {"seed": self._seed, "spp": self.spp, "time_limit": self._time}
+            of_image = {"seed": self._seed, "spp": self.spp, "time_limit": self._time}
             if scene:
-                limits["hide_emitters"] = hides_emitters(self._scene.integrator)
-            denoiser = Denoiser(scene, self._sensor, **limits, quality=quality_of(denoise)) if denoise else None
+                of_image["hide_emitters"] = hides_emitters(self._scene.integrator)
+            denoiser = Denoiser(scene, self._sensor, **of_image, quality=quality_of(denoise)) if denoise else None
             self.passes.keeps_halves = bool(denoiser) and denoiser.restores
-            planes = layers_of(layers, scene, self._sensor, denoiser, **limits)
+            planes = layers_of(layers, scene, self._sensor, denoiser, **of_image)
             reserved = denoiser.expected_seconds if denoiser else 0.0
             ending = Ending(self.spp, self._time and self._time - reserved, self._error, reserved)
             if self._time:

@@ -85,12 +85,13 @@ def test_parts_write_their_rows(tmp_path):
 
     def cold():
         yield {"hall": {"seconds": 2.0}}
-        written = json.loads((tmp_path / "a.json").read_text())
+        written = json.loads((tmp_path / "a.json.partial").read_text())
         assert written["part"] == "cold" and written["rows"] == {"hall": {"seconds": 2.0}}
         yield {"hall": {"seconds": 2.0}, "kitchen": {"seconds": 3.0}}
 
     results.run_parts(options, {"cold": cold}, {"width": 9})
     assert list(json.loads((tmp_path / "a.json").read_text())["rows"]) == ["hall", "kitchen"]
+    assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
 
 
 def test_a_variance_needs_two_passes():

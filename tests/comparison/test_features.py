@@ -52,6 +52,16 @@ def test_emitters_that_are_hidden_are_in_no_feature(hide_emitters):
     assert np.abs(found["depth"][4, 1] - (5 if hide_emitters else 3)).max() < 0.5
 
 
+def test_layers_of_an_image_hide_the_emitters_that_its_integrator_hides():
+    """Behind the lamp is nothing."""
+    lamp = wall([0, 0, 0], [0, 1, 0], 0, 5) | {"emitter": {"type": "area"}}
+    scene = mi.load_dict({"type": "scene", "sensor": sensor(8), "lamp": lamp})
+    for hides in (False, True):
+        integrator = mi.load_dict({"type": "path", "hide_emitters": hides})
+        image, took = manylights.render(scene, integrator, spp=4, layers=["albedo"])
+        assert (image.numpy()[..., took.channels.index("albedo.R")] == 1 - hides).all()
+
+
 @pytest.mark.parametrize(("name", "hides"), [("path", True), ("manylights", True), ("ptracer", False)])
 def test_integrators_tell_whether_they_hide_emitters(name, hides):
     assert features.hides_emitters(mi.load_dict({"type": name, "hide_emitters": True})) is hides

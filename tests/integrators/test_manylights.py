@@ -20,15 +20,16 @@ QUICK_MATERIALS = ("roughplastic", "principled", "blendbsdf", "twosided", "diffu
 pytestmark = pytest.mark.usefixtures("lights_cost_nothing")
 
 
-def assert_image_of_path(description, spp=128, seeds=8, finds=0.025, reference="path", lights=True, **more):
-    """Means over seeds, over tiles and over the image, are those of ``reference``."""
+def assert_image_of_path(description, spp=128, seeds=8, finds=0.025, reference="path", lights=True, of=None, **more):
+    """Means over seeds, over tiles and over the image, are those of ``reference``; ``of``: its scene, if another one."""
     scene = mi.load_dict(description)
+    scene_of_reference = mi.load_dict(of) if of else scene
 
     def pair(seed):
         found, statistics = render_with_statistics("manylights", scene, spp, seed, **more)
         assert np.isfinite(found).all() and statistics["dropped"] == 0
         assert (statistics.get("light_paths", 0) > 0) == lights, statistics["plan"]
-        return found, render(scene, reference, spp, seed, **more)
+        return found, render(scene_of_reference, reference, spp, seed, **more)
 
     assert_same_mean(pair, seeds, finds)
 
@@ -247,7 +248,9 @@ def test_a_room_lit_through_a_window():
     for number, y in enumerate((-0.6, 0.6)):
         transform = mi.ScalarTransform4f().translate([-1, y, 0]).rotate([0, 1, 0], 90).scale([1, 0.4, 1])
         box[f"wall{number}"] = {"type": "rectangle", "to_world": transform, "bsdf": {"type": "diffuse"}}
-    assert_image_of_path(box, finds=0.03, max_depth=6)
+    # Where it samples this sky of 16 × 8 texels, `path` (Mitsuba 3.9.1) is 0.2% too bright (decisions.md)
+    unsampled = {"sky": box["sky"] | {"sampling_weight": 0.0}, "dark": {"type": "point", "intensity": rgb(0.0)}}
+    assert_image_of_path(box, finds=0.03, of=box | unsampled, max_depth=6)
 
 
 @pytest.mark.stress

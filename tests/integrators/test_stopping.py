@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 
 import mitsuba as mi
 import numpy as np
@@ -58,6 +59,14 @@ def test_an_image_in_bands_does_not_stop_because_of_an_earlier_render(monkeypatc
     plugin.cancel()
     assert plugin.should_stop()
     np.testing.assert_allclose(render(scene, plugin).mean(), expected.mean(), rtol=0.05)
+
+
+def test_the_time_of_an_image_in_bands_begins_with_its_render(scene):
+    plugin = mi.load_dict({"type": "adaptivedirect", "timeout": 0.5, "aovs": "noise"})
+    time.sleep(0.6)
+    assert plugin.should_stop()
+    plugin._clear_stop(scene)
+    assert not plugin.should_stop()
 
 
 def test_timeout_ends_an_image_in_bands(monkeypatch, scene):

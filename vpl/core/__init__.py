@@ -9,6 +9,7 @@
 - ``garbage``: code blocks without Python's cyclic garbage collector
 - ``morton``: codes and orders along a Morton curve
 - ``cones``: axes of direction cones, rounding of cone cosines
+- ``path_limits``: where paths end, as in Mitsuba's ``path``: the longest path and Russian roulette by throughput
 - ``clock``: seconds of a render by stage
 - ``compilation``: seconds that Dr.Jit compiles kernels
 - ``stages``: names of the stages of a render, keys of its timings

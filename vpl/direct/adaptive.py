@@ -19,10 +19,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import chunks, download, upload
+from ..core.path_limits import PathLimits
 from ..core.sampling import derived_seed
 from ..points.bsdf_proxies import probe_materials
 from ..points.camera_paths import GatherPoints, PixelGrid
-from ..points.path_limits import PathLimits
 from ..points.surfaces import Batch, LambertianSurface, make_batches
 from .all_sources import SourceRounds
 from .cluster_cuts import GroupCuts, cut_clusters, has_wide_source
@@ -50,7 +50,7 @@ class DirectOptions:
 
     ``lights``: "clusters", "all" or "auto"; or "unoccluded", the reference method.  ``cluster_angle``: steradians [IAS
     section 5.7]; ``max_passes``, ``max_samples`` of a pixel: [IAS section 5.9]; ``time``: seconds, 0 for no limit;
-    ``rr_depth``: see :class:`vpl.points.path_limits.PathLimits`.
+    ``rr_depth``: see :class:`vpl.core.path_limits.PathLimits`.
     """
 
     error: float = 0.03

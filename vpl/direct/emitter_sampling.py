@@ -13,11 +13,11 @@ import numpy as np
 
 from ..core.arrays import finite_or_zero
 from ..core.loops import recorded_once
+from ..core.path_limits import PathLimits
 from ..core.sampling import Choice, SpreadSamples, derived_seed, independent_sampler
 from ..lights.emission import bounding_sphere, other_power
 from ..lights.emitters import Emitters
 from ..points.camera_paths import GatherPoints, emitted_towards
-from ..points.path_limits import PathLimits
 
 _UNIFORM_SHARE = 0.5
 
@@ -97,8 +97,8 @@ def _scattered_emission(extended: ExtendedEmitters, traits, si, sample, depth, l
 def emission_beyond_delta(emitters: Emitters, traits, hit, depth, limits: PathLimits, sampler, active):
     """Emitted radiance that a ray finds through mirrors, glass and masks.
 
-    ``hit``: first surface of the ray; ``depth``: edges from the camera to ``hit``.  Russian roulette knows the
-    throughput from ``hit`` alone.
+    ``hit``: first surface of the ray; ``depth``: edges from the camera to ``hit``.  The throughput
+    for Russian roulette is 1 at ``hit``.
     """
     hit, depth = mi.SurfaceInteraction3f(hit), mi.UInt32(depth)
     radiance = dr.zeros(mi.UnpolarizedSpectrum, dr.width(hit.p))

@@ -13,8 +13,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import upload
+from ..core.path_limits import PathLimits
 from ..points.camera_paths import SceneTraits
-from ..points.path_limits import PathLimits
 from ..points.surfaces import Batch
 from .cluster_cuts import GroupCuts
 from .sites import Sites

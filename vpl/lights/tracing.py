@@ -24,6 +24,7 @@ import numpy as np
 
 from ..core.arrays import download, even_chunks, ones, select_record, spectrum_to_rgb
 from ..core.garbage import garbage_kept
+from ..core.path_limits import throughput_survival
 from ..core.sampling import derived_seed, independent_sampler, stratified
 from .emission import emitter_samplers
 from .emitters import Emitters
@@ -131,10 +132,9 @@ def _bounce(scene, perturbed, settings: LightPathSettings, sampler, ray, through
     intensity = spectrum_to_rgb(leaving * power) * dr.inv_pi
 
     # ---- Russian roulette, as in ``path``
-    survival = dr.minimum(dr.max(following), 0.95)
-    alive = scattered.goes_on & ~bad & ~(scattered.delta & refuses_delta)
-    alive &= (depth < settings.rr_depth) | (sampler.next_1d() < survival)
-    following = dr.select(depth < settings.rr_depth, following, following / survival)
+    survival = throughput_survival(dr.max(following), 1, depth >= settings.rr_depth)
+    alive = scattered.goes_on & ~bad & ~(scattered.delta & refuses_delta) & (sampler.next_1d() < survival)
+    following = following / survival
 
     next_ray = si.spawn_ray(scattered.direction)
     light = (stored, si.p, scattered.normal, intensity, scattered.facing)

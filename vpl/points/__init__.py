@@ -7,7 +7,7 @@ Data flow and reading order::
 
 - ``camera_paths``: camera rays through mirrors, glass and masks to ``GatherPoints``; capabilities of a scene's surfaces
   (``SceneTraits``); layout of camera rays in the image (``PixelGrid``)
-- ``path_limits``: where paths end, as in Mitsuba's ``path``; ``alpha``: camera rays that are opaque in the film's alpha
+- ``alpha``: camera rays that are opaque in the film's alpha
 - ``bsdf_proxies``: upper bounds of materials, found by probing, for error bounds only
 - ``surfaces``: gather points for kernels, in a ``Batch`` of Lambertian points and a ``Batch`` of the remaining points;
   ``Receiver``: points or nodes for error bounds

@@ -6,24 +6,29 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.loops import recorded_once
-from .path_limits import PathLimits
+from ..core.path_limits import PathLimits
 
 
 @recorded_once
 @dr.syntax
 def opaque_rays(traits, si: mi.SurfaceInteraction3f, limits: PathLimits, sampler):
-    """Mask of rays whose paths scatter at a surface, and do not only pass masks and thin glass, evaluated.
+    """Mask of the rays whose paths scatter at a surface, rather than only pass masks and thin glass, evaluated.
 
-    ``traits`` of the scene; ``si``: the first surface of each ray.
+    ``traits`` of the scene; ``si``: the first surface of each ray.  As in ``path``, rays that end behind masks by
+    Russian roulette are transparent.
     """
     si, depth, opaque = mi.SurfaceInteraction3f(si), mi.UInt32(1), mi.Bool(False)
-    going = si.is_valid()
+    throughput, going = mi.UnpolarizedSpectrum(1), si.is_valid()
     while dr.hint(going, exclude=[traits, limits]):
         numbers = sampler.next_1d(), sampler.next_2d()
-        onward = traits.materials.call(si.bsdf(), _sampled, si, *numbers, active=going)
+        # Of other materials, the sample is 0, and the surface is opaque
+        onward, weight = traits.open_materials.call(si.bsdf(), _sampled, si, *numbers, active=going)
         passes = going & mi.has_flag(onward.sampled_type, mi.BSDFFlags.Null)
         opaque |= going & ~passes
-        passes &= depth < limits.max_depth
+        throughput *= mi.unpolarized_spectrum(weight)
+        survival = limits.survival(throughput, 1, depth)
+        passes &= (depth < limits.max_depth) & (dr.max(throughput) > 0) & (sampler.next_1d() < survival)
+        throughput /= survival
         si = traits.interactions.meet(si.spawn_ray(si.to_world(onward.wo)), passes)
         depth += 1
         going = passes & si.is_valid()
@@ -32,5 +37,4 @@ def opaque_rays(traits, si: mi.SurfaceInteraction3f, limits: PathLimits, sampler
 
 
 def _sampled(bsdf, si, lobe, direction, active):
-    sample, _ = bsdf.sample(mi.BSDFContext(), si, lobe, direction, active)
-    return sample
+    return bsdf.sample(mi.BSDFContext(), si, lobe, direction, active)

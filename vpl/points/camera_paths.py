@@ -18,13 +18,13 @@ from ..core.arrays import add_at, channel_mean, download, finite_or_zero, ones, 
 from ..core.interactions import Interactions
 from ..core.materials import Materials
 from ..core.morton import morton_order
+from ..core.path_limits import PathLimits
 from ..core.registry import RegistryTable
 from ..core.sampling import derived_seed, independent_sampler
 from ..core.shapes import SceneShapes
 from ..lights.emitters import Emitters
 from ..lights.perturbed import perturbed_shapes
 from .alpha import opaque_rays
-from .path_limits import PathLimits
 
 # Least probability of the delta and of the smooth lobes, unless their reflectance is zero
 _LEAST_PROBABILITY = 0.05
@@ -66,12 +66,13 @@ class SceneTraits:
         return (table.at(hit.shape) == 1) | (table.at(hit.instance) == 1)
 
     @cached_property
-    def _open_materials(self) -> Materials:
+    def open_materials(self) -> Materials:
+        """The materials that transmit light unscattered."""
         return self.materials.having(mi.BSDFFlags.Null)
 
     def transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Fraction of light that passes surfaces unscattered; 0 where a lane is not ``active``."""
-        share = self._open_materials.call(si.bsdf(), _transmission, si, active=active)
+        share = self.open_materials.call(si.bsdf(), _transmission, si, active=active)
         return finite_or_zero(mi.unpolarized_spectrum(share))
 
 
@@ -117,7 +118,7 @@ class CameraPaths:
     """Result of following camera rays.
 
     ``emission``: per camera ray, radiance of directly visible emitters; ``valid``: whether the ray is opaque in the
-    film's alpha (without the sky, see :mod:`vpl.points.alpha`).
+    film's alpha; without the sky, see ``integrators.gathering.CameraPass``.
     """
 
     emission: mi.UnpolarizedSpectrum
@@ -297,13 +298,13 @@ def follow_camera_rays(
 
 
 def _open_masks(scene, traits, ray, skip, limits: PathLimits, seed: int, valid, passable) -> None:
-    """Remove from the mask ``valid`` the rays that pass unscattered what they meet; ``passable``: those that may."""
+    """Clear the mask ``valid`` for the rays that pass unscattered what they meet; ``passable``: those that may."""
     lanes = dr.compress(passable)
     if len(lanes) == 0:
         return
-    maxt, ray = ray.maxt, mi.Ray3f(*(dr.gather(type(x), x, lanes) for x in (ray.o, ray.d, ray.time)))
-    ray.maxt = dr.gather(mi.Float, maxt, lanes)
-    si = _surfaces(scene, traits, ray, mi.Bool(True), skip, mi.Bool(True))
+    first = mi.Ray3f(*(dr.gather(type(x), x, lanes) for x in (ray.o, ray.d, ray.time)))
+    first.maxt = dr.gather(mi.Float, ray.maxt, lanes)
+    si = _surfaces(scene, traits, first, mi.Bool(True), skip, dr.full(mi.Bool, True, len(lanes)))
     dr.scatter(valid, opaque_rays(traits, si, limits, independent_sampler(seed, len(lanes))), lanes)
 
 

@@ -26,10 +26,10 @@ import mitsuba as mi
 
 from ..core.arrays import LARGEST_VALUE, channel_mean, select_record
 from ..core.loops import recorded_once
+from ..core.path_limits import throughput_survival
 from ..core.sampling import SPREAD_STEPS
 from ..direct.emitter_sampling import power_heuristic
 from ..points.camera_paths import SceneTraits
-from ..points.path_limits import throughput_survival
 from ..transport.carried_share import carried_share
 from ..transport.minorant import agrees
 from .contributions import Contributions, LayerSums

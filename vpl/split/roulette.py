@@ -9,7 +9,7 @@ image.
    brightness of the pixel.  The multiple m has the least variance × cost (:func:`best_multiple`).  [Vorba and Křivánek
    2016, "Adjoint-driven Russian roulette"; Rath et al. 2022, "EARS: efficiency-aware Russian roulette", eq. 14: the
    best probability is proportional to the root of variance over cost.]
-3. **Throughput.**  The rule of Mitsuba's ``path`` from ``rr_depth`` on (:mod:`vpl.points.path_limits`).
+3. **Throughput.**  The rule of Mitsuba's ``path`` from ``rr_depth`` on (:mod:`vpl.core.path_limits`).
 """
 
 from __future__ import annotations

@@ -4,11 +4,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from vpl.core.path_limits import PathLimits
 from vpl.core.sampling import independent_sampler
 from vpl.direct.emitter_sampling import emission_beyond_delta
 from vpl.lights.emitters import read_emitters
 from vpl.points.camera_paths import scene_traits
-from vpl.points.path_limits import PathLimits
 
 MIRROR = {"type": "conductor", "material": "none"}
 

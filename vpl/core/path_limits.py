@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import upload_limit
+from .arrays import upload_limit
 
 # Largest survival probability in Mitsuba's ``path``
 _MOST_SURVIVAL = 0.95
 
 
 def throughput_survival(largest, eta, applies):
-    """Survival probability of paths, like Mitsuba's ``path``; ``largest``: component of the throughput; ``eta``:
+    """Survival probability of paths, like Mitsuba's ``path``; ``largest`` component of the throughput; ``eta``:
     relative index of refraction; 1 where roulette does not apply."""
     return dr.select(applies, dr.minimum(largest * dr.square(eta), _MOST_SURVIVAL), 1)
 
