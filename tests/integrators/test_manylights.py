@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("lights_cost_nothing")
 
 
 def assert_image_of_path(description, spp=128, seeds=8, finds=0.025, reference="path", lights=True, of=None, **more):
-    """Means over seeds, over tiles and over the image, are those of ``reference``; ``of``: its scene, if another one."""
+    """Means over seeds, over tiles and over the image, are those of ``reference``; ``of``: its scene, if different."""
     scene = mi.load_dict(description)
     scene_of_reference = mi.load_dict(of) if of else scene
 
