@@ -218,7 +218,7 @@ def test_alpha_is_that_of_path_with_and_without_an_environment():
         assert np.allclose(*alphas, atol=0.3) and np.allclose(alphas[0].mean(), alphas[1].mean(), atol=0.02)
 
 
-@pytest.mark.parametrize("name", ["lightcuts", "adaptivedirect"])
+@pytest.mark.parametrize("name", ["adaptivedirect", *stress("lightcuts")])
 def test_alpha_is_that_of_path_behind_masks_and_thin_glass(name):
     camera = sensor(16, spp=64)
     camera["film"]["pixel_format"] = "rgba"

@@ -63,7 +63,7 @@ def test_the_collector_is_off_in_passes_of_any_integrator(scene, observed):
 
 
 def test_the_collector_is_off_while_features_are_rendered(scene, observed, monkeypatch):
-    monkeypatch.setattr(features, "_feature_integrator", lambda _: mi.load_dict({"type": "observer"}))
+    monkeypatch.setattr(features, "_feature_integrator", lambda *_: mi.load_dict({"type": "observer"}))
     with pytest.raises(ValueError, match="is not in list"):
         features.auxiliary_features(scene, scene.sensors()[0], 0, 1)
     assert observed == [False]
