@@ -19,7 +19,7 @@ from vpl.lights.light_set import ScatteredGroup
 from vpl.lights.virtual_lights import DeviceLights, VirtualLights
 from vpl.points.surfaces import LambertianSurface
 from vpl.split.gather_vertices import GatherVertices, LitVertices, drawn_later
-from vpl.split.lattice import Lattice, lattice_multiplier
+from vpl.split.lattice import EXTENSIBLE, Lattice, lattice_multiplier
 from vpl.split.pixel_clusters import PixelClusters, Receivers
 from vpl.split.pixel_rays import PixelRays
 from vpl.split.spatial_cells import FACINGS, facing
@@ -116,17 +116,24 @@ def test_numbers_are_uniform_and_stratified_in_every_pixel(samples):
             assert (np.minimum(away, 1 - away) ** 2).sum(0).min() * samples > 0.4
 
 
+def worst_error(multiplier, count):
+    """P_2 of a lattice: its worst error over smooth periodic functions."""
+    x = np.stack([np.arange(count), np.arange(count) * multiplier % count]) / count
+    return np.prod(1 + 2 * np.pi**2 * (x * x - x + 1 / 6), axis=0).mean() - 1
+
+
 def test_no_lattice_of_as_many_points_is_much_better():
-    """By the worst error over smooth periodic functions, against all multipliers."""
-
-    def worst_error(multiplier, count):
-        x = np.stack([np.arange(count), np.arange(count) * multiplier % count]) / count
-        return np.prod(1 + 2 * np.pi**2 * (x * x - x + 1 / 6), axis=0).mean() - 1
-
+    """Against all multipliers."""
     for count in (2, 3, 7, 36, 64):
         others = [worst_error(g, count) for g in range(1, count) if np.gcd(g, count) == 1]
         assert worst_error(lattice_multiplier(count), count) == pytest.approx(min(others))
     assert worst_error(lattice_multiplier(1009), 1009) < 1.1 * min(worst_error(g, 1009) for g in range(1, 1009))
+
+
+def test_the_first_points_of_the_extensible_lattice_are_good_lattices():
+    for power in range(4, 11):
+        best = min(worst_error(g, 2**power) for g in range(1, 2**power, 2))
+        assert worst_error(EXTENSIBLE, 2**power) < (1.4 if power <= 8 else 2.3) * best
 
 
 def test_products_of_numbers_are_no_noisier_than_those_of_random_ones():
