@@ -68,6 +68,12 @@ class Layers:
         return np.concatenate((image, self.planes), axis=-1)
 
 
+def check_layers(layers, integrator):
+    """Raise ValueError for `layers` that are not names of features, and for those that the integrator has."""
+    if own := set(channels_of(layers)) & set(integrator.aov_names()):
+        raise ValueError(f"layers must not name channels of the integrator, got {', '.join(sorted(own))}")
+
+
 def layers_of(names, scene, sensor, denoiser, **of_image):
     """Return the `Layers` with some `names` for a sensor (an index), None for no names: those of the denoiser if there
     is one. `of_image`: see `features_of`."""
@@ -195,7 +201,7 @@ def _first_rough_surface(scene, materials: Materials, sampler, ray, active, hide
         albedo += throughput * _three(emitter.eval(si, active & ~hidden))
         bsdf = si.bsdf(ray)
         numbers = sampler.next_1d(hit), sampler.next_2d(hit)
-        sample, weight = materials.call(bsdf, _sampled, si, *numbers, active=hit)
+        sample, weight = materials.sample(bsdf, si, *numbers, hit)
         throughput = dr.select(hidden, throughput, throughput * _three(weight))
         # A surface with a delta and a smooth lobe, such as plastic, counts by its smooth lobe
         smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -211,10 +217,6 @@ def _first_rough_surface(scene, materials: Materials, sampler, ray, active, hide
         bounces += dr.select(hidden, 0, 1)
         active = onward & (bounces < DEEPEST)
     return albedo, normal, depth, valid
-
-
-def _sampled(bsdf, si, lobe, direction, active):
-    return bsdf.sample(mi.BSDFContext(), si, lobe, direction, active)
 
 
 def _three(value):

@@ -21,7 +21,7 @@ from .checkpoint import Checkpoint
 from .counters import TotalStatistics
 from .denoising import Denoiser, for_denoising, quality_of
 from .ending import Ending
-from .features import channels_of, hides_emitters, layers_of
+from .features import channels_of, check_layers, hides_emitters, layers_of
 from .fine_film import usual_parts
 from .interruption import Interruption, is_interruption
 from .rendering import Progressive
@@ -135,12 +135,9 @@ def render(
     of_image = {"seed": seed, "spp": spp, "time_limit": time, "hide_emitters": hides_emitters(integrator)}
     denoiser = Denoiser(scene, sensor, quality=quality, parts=parts, **of_image) if denoise else None
     planes = layers_of(layers, scene, sensor, denoiser, **of_image)
-    # The error is that of the raw image, which equal numbers of samples suit best
-    chooses = denoiser.denoise if denoiser and not error else None
     # Without a limit of time for a checkpoint, which may go on with another one or on other machines
     limits = {} if checkpoint else {"seconds": time, "spp": spp}
-    progressive = Progressive(scene, seed, sensor, integrator, chooses, denoiser.parts if denoiser else 1, **limits)
-    progressive.keeps_halves = bool(denoiser) and denoiser.restores
+    progressive = _progressive(scene, seed, sensor, integrator, denoiser, error, **limits)
     # An image that ends by its error needs independent passes, and a checkpoint may go on with them on other machines
     progressive.shares_lattices = not (denoiser or error or checkpoint)
     reserved = denoiser.expected_seconds if denoiser else 0.0
@@ -152,10 +149,15 @@ def render(
         return render_passes(progressive, sizes, ending, begin, progress, denoiser, checkpoint, planes)
 
 
-def check_layers(layers, integrator):
-    """Raise ValueError for `layers` that are not names of features, and for those that the integrator has."""
-    if own := set(channels_of(layers)) & set(integrator.aov_names()):
-        raise ValueError(f"layers must not name channels of the integrator, got {', '.join(sorted(own))}")
+def _progressive(scene, seed, sensor, integrator, denoiser, error, **limits):
+    """Return the `Progressive` for an image, which a `denoiser` will denoise unless it is None."""
+    if denoiser is None:
+        return Progressive(scene, seed, sensor, integrator, **limits)
+    # The error is that of the raw image, which equal numbers of samples suit best
+    chooses = None if error else denoiser.denoise
+    progressive = Progressive(scene, seed, sensor, integrator, chooses, denoiser.parts, **limits)
+    progressive.keeps_halves = denoiser.restores
+    return progressive
 
 
 def _render_all(scene, integrator, **limits):

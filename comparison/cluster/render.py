@@ -5,9 +5,9 @@ import time as clock
 
 from ..denoising import Denoiser, quality_of
 from ..ending import Ending
-from ..features import hides_emitters, layers_of
+from ..features import check_layers, hides_emitters, layers_of
 from ..pass_sizes import PassSizes
-from ..render import check, check_layers, render_passes
+from ..render import check, render_passes
 from .passes import DistributedPasses, samples_of_a_pass
 from .pool import TASKS_PER_WORKER
 from .scene_travel import bundle

@@ -195,10 +195,8 @@ def test_an_interrupted_render_goes_on_with_its_numbers(tmp_path):
     assert seen[0] is None and seen[1] is None and seen[2] is not None and (seen[2] != 1).any()
 
 
-@pytest.mark.parametrize("interrupted", [False, True])
-def test_passes_with_numbers_of_their_own_share_lattices(tmp_path, monkeypatch, interrupted):
-    """Each goes on after those before; the first two and a small last one have lattices of their own."""
-    scene, limits = cornell().load(), {"spp": 135, "denoise": True}
+def spied_passes(monkeypatch):
+    """A list that receives (samples per pixel, `Continued`) of each later pass."""
     seen, before = [], rendering.render_pass
 
     def spied(*arguments, continued, **more):
@@ -206,6 +204,14 @@ def test_passes_with_numbers_of_their_own_share_lattices(tmp_path, monkeypatch, 
         return before(*arguments, continued=continued, **more)
 
     monkeypatch.setattr(rendering, "render_pass", spied)
+    return seen
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_passes_with_numbers_of_their_own_share_lattices(tmp_path, monkeypatch, interrupted):
+    """Each goes on after those before; the first two and a small last one have lattices of their own."""
+    scene, limits = cornell().load(), {"spp": 135, "denoise": True}
+    seen = spied_passes(monkeypatch)
     monkeypatch.setattr(single_pass, "MAXIMUM_PASS_SAMPLES", 16 * 16 * 32 // single_pass.MORE_IN_PARTS)
     for most in (4, 100) if interrupted else (100,):
         checkpoint = Checkpoint(tmp_path / "image.checkpoint.npz", {})
@@ -219,13 +225,7 @@ def test_passes_with_numbers_of_their_own_share_lattices(tmp_path, monkeypatch, 
 
 @pytest.mark.parametrize("limits", [{}, {"error": 1e-4}, {"denoise": True}])
 def test_passes_of_raw_images_share_lattices_unless_they_end_by_error(monkeypatch, limits):
-    seen, before = [], rendering.render_pass
-
-    def spied(*arguments, continued, **more):
-        seen.append((arguments[3], continued))
-        return before(*arguments, continued=continued, **more)
-
-    monkeypatch.setattr(rendering, "render_pass", spied)
+    seen = spied_passes(monkeypatch)
     for spp, shared in ((12, [None, 0, 4]), (8, [None, None])):
         seen.clear()
         _, took = manylights.render(cornell().load(), "manylights", spp=spp, pass_spp=4, **limits)

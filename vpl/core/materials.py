@@ -47,3 +47,12 @@ class Materials:
         number = self._numbers.at(pointers, active)
         cases = [partial(function, bsdf) for bsdf in self.bsdfs]
         return dr.switch(number - 1, cases, *arguments, active & (number > 0))
+
+    def sample(self, pointers: mi.BSDFPtr, si: mi.SurfaceInteraction3f, lobe, direction, active: mi.Bool):
+        """(Sample, weight) of the material behind each pointer, by a number and a pair of numbers; 0 as in
+        :meth:`call`."""
+        return self.call(pointers, _sampled, si, lobe, direction, active=active)
+
+
+def _sampled(bsdf, si, lobe, direction, active):
+    return bsdf.sample(mi.BSDFContext(), si, lobe, direction, active)

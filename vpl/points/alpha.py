@@ -22,7 +22,7 @@ def opaque_rays(traits, si: mi.SurfaceInteraction3f, limits: PathLimits, sampler
     while dr.hint(going, exclude=[traits, limits]):
         numbers = sampler.next_1d(), sampler.next_2d()
         # Of other materials, the sample is 0, and the surface is opaque
-        onward, weight = traits.open_materials.call(si.bsdf(), _sampled, si, *numbers, active=going)
+        onward, weight = traits.open_materials.sample(si.bsdf(), si, *numbers, going)
         passes = going & mi.has_flag(onward.sampled_type, mi.BSDFFlags.Null)
         opaque |= going & ~passes
         throughput *= mi.unpolarized_spectrum(weight)
@@ -34,7 +34,3 @@ def opaque_rays(traits, si: mi.SurfaceInteraction3f, limits: PathLimits, sampler
         going = passes & si.is_valid()
     dr.eval(opaque)
     return opaque
-
-
-def _sampled(bsdf, si, lobe, direction, active):
-    return bsdf.sample(mi.BSDFContext(), si, lobe, direction, active)
