@@ -100,6 +100,18 @@ def test_emitters_alone_are_seen_as_by_path(max_depth):
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("integrator", ["lightcuts", "adaptivedirect", "manylights"])
+def test_no_light_of_an_environment_enters_a_closed_room(integrator):
+    """Mitsuba's bounding box ignores rectangles of equal materials, so the environment lies close to the ball."""
+    ball = {"type": "sphere", "radius": 0.1, "center": [0.3, -0.5, 0]}
+    box = closed_box({"sky": {"type": "constant"}}, ball=ball)
+    for side in ("left", "right"):
+        box[side]["bsdf"] = box["floor"]["bsdf"]
+    scene = mi.load_dict(box)
+    assert render(scene, "path", max_depth=2).mean() > 0.005
+    assert render(scene, integrator, max_depth=2).max() == 0
+
+
 def test_no_light_path_is_traced_when_light_cannot_bounce():
     scene = mi.load_dict(closed_box({"lamp": area_light()}))
     plugin = mi.load_dict({"type": "lightcuts", "max_depth": 2})

@@ -248,9 +248,9 @@ def test_a_room_lit_through_a_window():
     for number, y in enumerate((-0.6, 0.6)):
         transform = mi.ScalarTransform4f().translate([-1, y, 0]).rotate([0, 1, 0], 90).scale([1, 0.4, 1])
         box[f"wall{number}"] = {"type": "rectangle", "to_world": transform, "bsdf": {"type": "diffuse"}}
-    # Where it samples this sky of 16 × 8 texels, `path` (Mitsuba 3.9.1) is 0.2% too bright (decisions.md)
-    unsampled = {"sky": box["sky"] | {"sampling_weight": 0.0}, "dark": {"type": "point", "intensity": rgb(0.0)}}
-    assert_image_of_path(box, finds=0.03, of=box | unsampled, max_depth=6)
+    # Mitsuba 3.9.1 leaves rectangles out of the scene's box, beyond which its shadow rays do not reach
+    hidden = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([60, 0, 0]).scale(0.01)}
+    assert_image_of_path(box, finds=0.03, of=box | {"hidden": hidden}, max_depth=6)
 
 
 @pytest.mark.stress
@@ -287,6 +287,17 @@ def test_alpha_is_that_of_path(emitter, max_depth, hide_emitters):
     found, expected = (render(scene, name, 256, **more)[..., 3] for name in ("manylights", "path"))
     assert np.abs(found - expected).max() < 0.2
     assert abs(found.mean() - expected.mean()) < 0.01
+
+
+def test_a_screen_before_a_wall_that_nothing_lights():
+    """All light is seen directly, so nothing tells how bright the other light is."""
+    screen = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 0.5]).scale(0.2)}
+    screen |= {"emitter": {"type": "area", "radiance": rgb(4.0)}}
+    box = closed_box({"screen": screen}, 16)
+    for side in ("floor", "ceiling", "left", "right", "front"):
+        del box[side]
+    found, expected = (render(mi.load_dict(box), name, 64, max_depth=5) for name in ("manylights", "path"))
+    assert abs(found.mean() / expected.mean() - 1) < 0.02
 
 
 # ---------------------- Films, sensors, wrappers ----------------------

@@ -117,6 +117,15 @@ class Interactions:
         return si
 
 
+def ray_to_emitter(si, direction: mi.Vector3f, point: mi.Point3f, is_infinite: mi.Bool) -> mi.Ray3f:
+    """Shadow ray from each surface ``si`` to an emitter: to its ``point``, or, where the emitter ``is_infinite``, in a
+    ``direction``.
+
+    Mitsuba 3.9.1 places infinite emitters outside of the scene's bounding box, and the box ignores rectangles.
+    """
+    return dr.select(is_infinite, si.spawn_ray(direction), si.spawn_ray_to(point))
+
+
 def _by_mitsuba(shape, ray, hit, active):
     si = shape.compute_surface_interaction(ray, hit, mi.RayFlags.All, active)
     # A shape names itself by its index in Mitsuba's registry.  As a constant, it would make code of its own for each

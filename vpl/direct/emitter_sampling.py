@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import finite_or_zero
+from ..core.interactions import ray_to_emitter
 from ..core.loops import recorded_once
 from ..core.path_limits import PathLimits
 from ..core.sampling import Choice, SpreadSamples, derived_seed, independent_sampler
@@ -44,10 +45,10 @@ class ExtendedEmitters:
             self.choice = Choice((1 - _UNIFORM_SHARE) * power / power.sum() + _UNIFORM_SHARE * uniform)
 
     def sample(self, si, row_sample, direction_sample, active):
-        """Sample an emitter and a direction: (direction sample, radiance over density, density)."""
+        """Sample an emitter and a direction: (direction sample, shadow ray, radiance over density, density)."""
         row = self.choice.row(row_sample)
         probability = self.choice.probability(row)
-        areas = self.emitters.area.count
+        areas, is_infinite = self.emitters.area.count, mi.Bool(False)
         ds = dr.zeros(mi.DirectionSample3f, dr.width(si.p))
         weight = dr.zeros(mi.UnpolarizedSpectrum, dr.width(si.p))
         if areas:
@@ -59,8 +60,11 @@ class ExtendedEmitters:
             here = active & (row == areas + number)
             one, one_weight = emitter.sample_direction(si, direction_sample, here)
             ds = dr.select(here, one, ds)
+            if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
+                is_infinite |= here
             weight = dr.select(here, finite_or_zero(mi.unpolarized_spectrum(one_weight)), weight)
-        return ds, weight / probability, ds.pdf * probability
+        ray = ray_to_emitter(si, ds.d, ds.p, is_infinite)
+        return ds, ray, weight / probability, ds.pdf * probability
 
     def density(self, si, hit, direction, active):
         """Density of :meth:`sample` for the direction of a ray from ``si`` and the emitter that the ray hit."""
@@ -147,14 +151,14 @@ def direct_light(
     ):
         # ---- Emitter sampling
         choice, *sample = to_emitters.at(first + k)
-        ds, weight, density = extended.sample(si, choice, mi.Point2f(*sample), mi.Bool(True))
+        ds, ray, weight, density = extended.sample(si, choice, mi.Point2f(*sample), mi.Bool(True))
         active = dr.any(weight > 0)
         wo = si.to_local(ds.d)
         value, pdf = bsdf.eval_pdf(context, si, wo, active)
         arriving = mi.unpolarized_spectrum(value) * weight
         active &= dr.any(arriving > 0)
         mis = dr.select(ds.delta, 1, power_heuristic(density, pdf))
-        blocked = scene.ray_test(si.spawn_ray_to(ds.p), active)
+        blocked = scene.ray_test(ray, active)
         rays += dr.select(active, 1, 0)
         radiance += dr.select(active & ~blocked, finite_or_zero(arriving * mis), 0)
 

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import channel_mean, download, upload
+from ..core.arrays import LARGEST_VALUE, channel_mean, download, upload
 from ..core.clock import Clock
 from ..core.sampling import derived_seed
 from ..core.stages import Stage
@@ -111,7 +111,8 @@ def with_roulette(view: View, decision: Decision) -> tuple[View, dict]:
         return view, {}
     # The less variance remains, the more a contribution matters
     multiple *= (whole / max(decision.variance, LEAST_VARIANCE)) ** 0.5
-    importance = upload(mi.Float, multiple / error_scale(of_pixels, model))
+    # Beside light that is seen directly, the other light may be 0
+    importance = upload(mi.Float, np.minimum(multiple / error_scale(of_pixels, model), LARGEST_VALUE))
     return replace(view, outgoing=outgoing, importance=importance), {"roulette": f"{multiple:.3g}"}
 
 

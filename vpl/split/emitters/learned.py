@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...core.arrays import download, finite_or_zero, upload
+from ...core.interactions import ray_to_emitter
 from ...core.registry import RegistryTable
 from ...direct.environment_regions import regions_of
 from ...lights.emitter_groups import EmitterGroups
@@ -87,10 +88,7 @@ class LearnedEmitters(CellEmitters):
         emitter = dr.gather(mi.EmitterPtr, self._emitters, dr.minimum(source, self._count - 1))
         ds, weight = emitter.sample_direction(si, place, of_emitter)
         weight = finite_or_zero(mi.unpolarized_spectrum(weight)) & of_emitter
-        # A ray without an end for infinite emitters: Mitsuba 3.9.1 places infinite emitters outside of the scene's
-        # bounding box, and the box ignores rectangles
-        far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
-        ray = dr.select(far, si.spawn_ray(ds.d), si.spawn_ray_to(ds.p))
+        ray = ray_to_emitter(si, ds.d, ds.p, mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite))
         direction, density, delta = ds.d, ds.pdf, ds.delta & of_emitter
         if self._regions:
             of_region = active & ~of_emitter

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...core.arrays import finite_or_zero, rgb_to_spectrum, upload
+from ...core.interactions import ray_to_emitter
 from ...core.shapes import registered_shapes
 from ...lights.emission import bounding_sphere, solid_angle_radiance
 from ...lights.emitter_groups import EmitterGroups
@@ -173,7 +174,7 @@ class TreeEmitters(CellEmitters):
             toward, far = dr.select(here, -light.direction, toward), far | here
             weight = dr.select(here, rgb_to_spectrum(light.intensity), weight)
             density, is_point = dr.select(here, 1, density), is_point | here
-        ray = dr.select(far, si.spawn_ray(toward), si.spawn_ray_to(target))
+        ray = ray_to_emitter(si, toward, target, far)
         group = mi.UInt32(0)
         if self.groups:
             group = dr.gather(mi.UInt32, self._group, dr.select(near, row, self._tree.count + index), active)

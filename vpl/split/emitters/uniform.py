@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...core.arrays import finite_or_zero
+from ...core.interactions import ray_to_emitter
 from ...lights.emitter_groups import EmitterGroups
 from ...points.camera_paths import SceneTraits, scene_traits
 from .base import EmitterSample, MetEmitter
@@ -29,8 +30,7 @@ class UniformEmitters:
     def sample(self, si, cell, chosen, member, place, active) -> EmitterSample:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.sample`."""
         ds, weight = self._scene.sample_emitter_direction(si, place, False, active)
-        far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        ray = dr.select(far, si.spawn_ray(ds.d), si.spawn_ray_to(ds.p))
+        ray = ray_to_emitter(si, ds.d, ds.p, mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite))
         return EmitterSample(ds.d, finite_or_zero(mi.unpolarized_spectrum(weight)), ds.pdf, ds.delta, ray, self._group)
 
     def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
