@@ -91,7 +91,10 @@ class DirectLightIntegrator(GatheringIntegrator):
 
     def _render(self, scene, sensor, seed, spp, develop, evaluate):
         """Render large images in bands of rows (:mod:`integrators.bands`), and small images by Mitsuba's ``render``."""
-        samples = spp or sensor.sampler().sample_count()
+        if spp:
+            # Some samplers round the number up
+            sensor.sampler().set_sample_count(spp)
+        samples = sensor.sampler().sample_count()
         # Mitsuba's `render` calls this method recursively
         if self._in_base or self.samples_per_pass < samples or fits_one_band(sensor.film(), samples):
             self._in_base = True

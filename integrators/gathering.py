@@ -188,8 +188,8 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         camera = self.begin(scene, sampler, ray, active)
         radiance, channels, found = self.light(scene, sampler, camera)
         image, counters = self._assemble(camera, radiance, channels, found)
-        finite = dr.all(usable(image)) & (self.max_depth > 0)
-        return dr.select(finite, mi.Spectrum(image), 0), camera.valid, counters
+        shown = mi.Bool(self.max_depth > 0)
+        return dr.select(dr.all(usable(image)) & shown, mi.Spectrum(image), 0), camera.valid & shown, counters
 
     def begin(self, scene, sampler, ray, active=True) -> CameraPass:
         """Read the emitters, and follow the camera rays."""

@@ -255,14 +255,14 @@ def test_hidden_emitters_equal_path(mixed, expected):
     assert hidden(0).mean() < 0.95 * expected.mean()
 
 
-@pytest.mark.parametrize("hide", [False, True])
-def test_alpha_equals_path(mixed, hide):
+@pytest.mark.parametrize(("hide", "max_depth"), [(False, 2), (True, 2), (False, 0)])
+def test_alpha_equals_path(mixed, hide, max_depth):
     ours, path = (
-        view(mixed, mi.load_dict({"type": name, "max_depth": 2, "hide_emitters": hide}), 3)
+        view(mixed, mi.load_dict({"type": name, "max_depth": max_depth, "hide_emitters": hide}), 3)
         for name in ("adaptivedirect", "path")
     )
     assert ours.shape == (16, 16, 4) and np.array_equal(ours[..., 3], path[..., 3])
-    assert (path[..., 3].min() < 1) == hide
+    assert (path[..., 3].min() < 1) == (hide or max_depth == 0)
 
 
 # ---- Scenes at the limits

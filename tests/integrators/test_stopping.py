@@ -52,6 +52,15 @@ def test_sizes_of_kernels_do_not_change_the_image(monkeypatch, scene, name):
     np.testing.assert_allclose(render(scene, create(name)), expected, rtol=1e-4, atol=1e-6)
 
 
+def test_bands_have_the_samples_of_a_sampler_that_rounds_up(monkeypatch):
+    box = closed_box({"lamp": area_light()}, size=24)
+    box["sensor"]["sampler"] = {"type": "stratified"}
+    scene, plugin = mi.load_dict(box), mi.load_dict({"type": "adaptivedirect"})
+    expected = render(scene, plugin, 9)
+    monkeypatch.setattr(bands, "LARGEST_BAND", 24 * 4 * 9)
+    np.testing.assert_allclose(render(scene, plugin, 8).mean(), expected.mean(), rtol=0.05)
+
+
 def test_an_image_in_bands_does_not_stop_because_of_an_earlier_render(monkeypatch, scene):
     plugin = mi.load_dict({"type": "adaptivedirect"})
     expected = render(scene, plugin)
