@@ -129,7 +129,7 @@ TABLES = {
         (Column("ratio", ratio="speedup"), Column("over `independent`", ratio="independent_speedup")),
     ),
     "views": Table({"": ("manylights_views",)}, (Column("ratio", ratio="speedup"),), first="scene, view"),
-    "own": Table({"": ("manylights_own_before", "manylights_own")}, (Column("ratio", ratio="speedup"),)),
+    "own": Table({"": ("manylights_own",)}, (Column("ratio", ratio="speedup"),)),
     "timed10": Table(
         {"": ("manylights_timed10",)},
         (
