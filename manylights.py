@@ -57,7 +57,7 @@ from comparison.cluster.connection import connected, workers
 from comparison.command_line import UsageError, parameter, positive
 from comparison.denoising import QUALITIES, for_denoising, import_oidn
 from comparison.features import FEATURES
-from comparison.images import check_extension, write
+from comparison.images import check_exposure, check_extension, write
 from comparison.one_image import INTERRUPTED, Failed, Image, LazyScene
 from comparison.render import Took, render
 from comparison.scene_files import SceneFile
@@ -152,11 +152,12 @@ def parse(arguments):
     of_light = ",".join(name for name in options.layers if name in LENGTHS), options.light_groups
     options.light_layers = {name: text for name, text in zip(("layers", "light_groups"), of_light, strict=True) if text}
     options.layers = tuple(name for name in options.layers if name in FEATURES)
-    if options.output and not options.output.is_dir():
-        try:
+    try:
+        check_exposure(options.exposure)
+        if options.output and not options.output.is_dir():
             check_extension(options.output)
-        except ValueError as error:
-            parser.error(str(error))
+    except ValueError as error:
+        parser.error(str(error))
     return options
 
 

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from comparison.images import planes_of
 from comparison.scene_files import SceneFile
 
 PROJECT = Path(__file__).resolve().parent.parent
@@ -46,10 +47,9 @@ def reference_at(name: str, width: int) -> tuple[np.ndarray, np.ndarray] | None:
     file = reference_file(name)
     if file is None or width != REFERENCE_WIDTH:
         return None
-    bitmap = mi.Bitmap(str(file))
-    names, values = [field.name for field in bitmap.struct_()], np.array(bitmap, np.float64)
+    values, names = planes_of(mi.Bitmap(str(file)))
     truth, noise = ([names.index(prefix + channel) for channel in "RGB"] for prefix in ("", "se."))
-    return values[..., truth], values[..., noise]
+    return tuple(values[..., which].astype(np.float64) for which in (truth, noise))
 
 
 def scale_of_truth(truth: np.ndarray) -> np.ndarray:

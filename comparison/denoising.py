@@ -21,7 +21,7 @@ import numpy as np
 from . import detail
 from .features import features_of
 from .fine_film import merged
-from .images import colour
+from .images import colour, colour_indices, with_colour
 from .scene_files import known_parameters
 
 GUIDES = ("albedo", "normal")  # features that the denoiser uses
@@ -138,7 +138,7 @@ class Denoiser:
         image = self.denoise_fine(np.float32(whole), passes.channels)
         self.has_detail = self.restores and detail.suits(passes)
         if self.has_detail:
-            begin, before, where = time.perf_counter(), self.seconds, _colour_indices(passes.channels)
+            begin, before, where = time.perf_counter(), self.seconds, colour_indices(passes.channels)
             names = [passes.channels[index] for index in where]
             fine = [np.float32(half[..., where]) for half in passes.fine_halves]
             denoised = [self.denoise_fine(half, names, detail.QUALITY) for half in fine]
@@ -161,8 +161,7 @@ class Denoiser:
         inputs = {"color": rgb, **{name: features[name] for name in GUIDES}}
         network, copies = self._networks[quality or self.quality], 1 if quality else self.copies
         filtered = sum(self._mirrored(inputs, network, axes) for axes in MIRRORED[:copies]) / np.float32(copies)
-        where = _colour_indices(channels)
-        planes[..., where] = filtered if len(where) == 3 else filtered.mean(axis=-1, keepdims=True)
+        planes = with_colour(planes, channels, filtered)
         self.seconds += time.perf_counter() - begin
         return type(image)(planes) if isinstance(image, mi.TensorXf) else planes
 
@@ -250,11 +249,6 @@ class Denoiser:
         network.quality, network.hdr, network.clean_aux = quality, True, True
         network.execute()
         return output
-
-
-def _colour_indices(channels):
-    """Return the indices of the colour among the names of channels: R, G and B, or Y."""
-    return [list(channels).index(name) for name in (("R", "G", "B") if "R" in channels else ("Y",))]
 
 
 def for_denoising(integrator, parameters):

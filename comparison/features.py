@@ -20,14 +20,16 @@ from vpl.core.sampling import derived_seed, independent_sampler
 from vpl.core.shapes import SceneShapes
 
 from .fine_film import fine_film
+from .images import planes_of
 
 # Fewest and most samples per pixel. 144 instead of 16: denoised error 4, 6 and 10% less in images of 4, 16 and 64
 # samples, both without a filter (decisions.md)
 FEATURE_SPP = 16, 128
 # Samples per pixel of a render: squares, to which some of Mitsuba's samplers round, and powers of two, which share a
 # kernel that compiles for 0.5 s in kitchen
-AT_ONCE = 64, 16
-FEATURE_WAVEFRONT = 1 << 22  # most samples of an image rendered at once, some 400 MB, or the least of `AT_ONCE`
+AT_ONCE = 64, 16, 4, 1
+# Most samples of an image rendered at once with the first number and with the others, some 100 bytes each
+FEATURE_WAVEFRONTS = 1 << 22, 1 << 24
 # A sample of a path takes 20 to 25 times as long. Features and image gain equally by more time if the features have
 # about twice the samples of the image (decisions.md), which take a tenth of its time with the first ones
 PER_SAMPLE = 2
@@ -128,15 +130,23 @@ def auxiliary_features(scene, sensor, spp, seed, parts=1, hide_emitters=False):
     path from the near clipping distance of the camera, world units, as in Mitsuba's `aov`. All are 0 in empty
     directions.
     """
-    pixels, large, small = int(np.prod(sensor.film().crop_size())), *AT_ONCE
-    several = spp // large if large * pixels <= FEATURE_WAVEFRONT else 0
-    sizes = [large] * several + [small] * ((spp - several * large) // small)
+    sizes = _sizes(max(spp, FEATURE_SPP[0]), int(np.prod(sensor.film().crop_size())), parts**2)
     # One after the other: large images take much memory
     with fine_film(sensor, parts):
         return _mean_of(
             (_rendered(scene, sensor, each // parts**2, (seed, part), hide_emitters), each)
-            for part, each in enumerate(sizes or [small])
+            for part, each in enumerate(sizes)
         )
+
+
+def _sizes(spp, pixels, least):
+    """Return the numbers of samples per pixel that are rendered at once, of `AT_ONCE` and not below `least`: together
+    `spp` rounded down to a multiple of 16."""
+    (large, *others), (most_of_large, most) = AT_ONCE, FEATURE_WAVEFRONTS
+    several = spp // large if large * pixels <= most_of_large else 0
+    small = next(size for size in others if size * pixels <= most or size <= max(least, others[-1]))
+    rest = spp - several * large
+    return [large] * several + [small] * ((rest - rest % others[0]) // small)
 
 
 def _rendered(scene, sensor, spp, key, hide_emitters):
@@ -149,9 +159,7 @@ def _rendered(scene, sensor, spp, key, hide_emitters):
     with stratified(sensor, spp) as wrapper, garbage_kept():
         integrator = _feature_integrator(mi.variant(), hide_emitters)
         mi.render(scene, sensor=wrapper, integrator=integrator, spp=spp, seed=seed)
-        bitmap = sensor.film().bitmap()
-    names = [entry.name for entry in bitmap.struct_()]
-    planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
+        planes, names = planes_of(sensor.film().bitmap())
     found = {
         name: np.nan_to_num(planes[..., [names.index(channel) for channel in channels_of([name])]]) for name in FEATURES
     }

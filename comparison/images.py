@@ -5,6 +5,7 @@ EXR files are read and written by OpenEXR, as Mitsuba waits for ever with a sing
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -27,6 +28,12 @@ ERROR_RANGE = (0.01, 1.0)  # relative errors at the ends of the logarithmic scal
 AOV_PERCENTILES = (1, 99.9)
 EXTENSIONS = (".exr", ".png")  # of files from `write`
 CHANNELS = {1: "Y", 2: "YA", 3: "RGB", 4: "RGBA"}  # by their number
+COLOURS = "RGB", "XYZ", "Y"  # channels of the colour, of which an image has those of the first name that it can have
+# From CIE XYZ to the primaries of sRGB [IEC 61966-2-1], as Mitsuba's `xyz_to_srgb`
+RGB_OF_XYZ = np.array(
+    [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]]
+)
+MOST_STOPS = 100.0  # of an exposure: single precision holds 2^-126 to 2^127
 
 
 @contextmanager
@@ -63,10 +70,13 @@ def write_exr(path, image, channels, metadata=None, half=False):
     for key, value in (metadata or {}).items():
         header[key] = value if _fits_attribute(value) else json.dumps(value)
     planes = np.moveaxis(np.asarray(image, np.float16 if half else np.float32), -1, 0)
+    arrays = {name: np.ascontiguousarray(plane) for name, plane in zip(channels, planes, strict=True)}
+    # OpenEXR raises no OSError if the disk is full, and no error at all for the last bytes
+    content = io.BytesIO()
+    with OpenEXR.File(header, arrays) as file:
+        file.write(content)
     with replacing(path) as temporary:
-        arrays = {name: np.ascontiguousarray(plane) for name, plane in zip(channels, planes, strict=True)}
-        with OpenEXR.File(header, arrays) as file:
-            file.write(str(temporary))
+        temporary.write_bytes(content.getbuffer())
 
 
 def _fits_attribute(value):
@@ -104,14 +114,42 @@ def _plain(header):
     return {key: value for key, value in kept.items() if isinstance(value, str) or math.isfinite(value)}
 
 
-def colour(image, channels, layer=""):
-    """Return the colour (height, width, 3) of an image: channels R, G and B (of a layer such as "se."), or three times
-    Y. Raises ValueError if the image has neither."""
-    for names in (("R", "G", "B"), ("Y", "Y", "Y")):
-        wanted = [layer + name for name in names]
-        if set(wanted) <= set(channels):
-            return image[..., [list(channels).index(name) for name in wanted]]
+def planes_of(bitmap):
+    """Return the image (height, width, channels) float32 of a `mi.Bitmap`, and the names of its channels."""
+    columns, rows = bitmap.size()
+    return np.array(bitmap, np.float32).reshape(rows, columns, -1), [field.name for field in bitmap.struct_()]
+
+
+def colour_indices(channels, layer=""):
+    """Return the indices of the channels of the colour (of a layer such as "se."), as `COLOURS` names them. Raises
+    ValueError if there are none."""
+    channels = list(channels)
+    for names in COLOURS:
+        if {layer + name for name in names} <= set(channels):
+            return [channels.index(layer + name) for name in names]
     raise ValueError(f"no colour channels among {', '.join(channels)}")
+
+
+def colour(image, channels, layer=""):
+    """Return the colour (height, width, 3) of an image: channels R, G and B (of a layer such as "se."), these of X, Y
+    and Z, or three times Y. Raises ValueError if the image has none of them."""
+    where = colour_indices(channels, layer)
+    if len(where) == 1:
+        return image[..., where * 3]
+    found = image[..., where]
+    is_rgb = list(channels)[where[0]] == layer + "R"
+    return found if is_rgb else (found @ RGB_OF_XYZ.T).astype(found.dtype)
+
+
+def with_colour(image, channels, rgb):
+    """Return an image (height, width, channels) with another colour `rgb` (height, width, 3)."""
+    where, image = colour_indices(channels), np.array(image)
+    if len(where) == 1:
+        rgb = rgb.mean(axis=-1, keepdims=True)
+    elif list(channels)[where[0]] == "X":
+        rgb = rgb @ np.linalg.inv(RGB_OF_XYZ).T
+    image[..., where] = rgb
+    return image
 
 
 def automatic_exposure(rgb):
@@ -173,11 +211,13 @@ def write(
     `image`: linear values, as from `mi.render` and `manylights.render`. `channels`: names; by default Y, YA, RGB or
     RGBA by the number of channels. `metadata`: attributes of an .exr file, texts of a .png file. `exposure`: a .png
     file is scaled by 2^exposure, by default so that the 95th percentile of the brightness is 0.8. Works with a single
-    thread, unlike `mi.util.write_bitmap`. Raises ValueError for another extension, and for a wrong number of names.
+    thread, unlike `mi.util.write_bitmap`. Raises ValueError for another extension, for a wrong number of names, and for
+    an exposure beyond 100.
     """
     planes = np.atleast_3d(np.asarray(image, np.float32))
     names = list(channels or CHANNELS.get(planes.shape[-1], ()))
     check_extension(path)
+    check_exposure(exposure)
     if planes.ndim != 3 or len(names) != planes.shape[-1]:
         raise ValueError(
             f"channels must name the channels of an image of shape {planes.shape}, got {', '.join(names) or 'none'}"
@@ -195,6 +235,12 @@ def check_extension(path):
         raise ValueError(f"cannot write '{path}': the output must be an .exr or a .png file")
 
 
+def check_exposure(exposure):
+    """Raise ValueError for an exposure, in stops, that is neither None nor from -100 to 100."""
+    if exposure is not None and not -MOST_STOPS <= exposure <= MOST_STOPS:
+        raise ValueError(f"exposure must be from {-MOST_STOPS:g} to {MOST_STOPS:g} stops, got {exposure!r}")
+
+
 def read_png(path):
     """Return the pixels (height, width, 3) uint8 of a colour PNG file."""
     return np.array(mi.Bitmap(str(path)))
@@ -205,5 +251,7 @@ def write_png(path, pixels, metadata=None):
     bitmap = mi.Bitmap(np.ascontiguousarray(pixels))
     for key, value in (metadata or {}).items():
         bitmap.metadata()[key] = value if isinstance(value, str) else json.dumps(value)
+    content = mi.MemoryStream()
+    bitmap.write(content, mi.Bitmap.FileFormat.PNG)
     with replacing(path) as temporary:
-        bitmap.write(str(temporary))
+        temporary.write_bytes(content.raw_buffer())

@@ -68,6 +68,11 @@ class Deadline:
     def __init__(self, save):
         self._save, self._over = save, threading.Event()
 
+    def restart(self):
+        """Let a Ctrl-C before this call not end the process; a later one will."""
+        over, self._over = self._over, threading.Event()
+        over.set()
+
     def __enter__(self):
         self._reading, self._writing = os.pipe()
         os.set_blocking(self._writing, False)
@@ -85,7 +90,8 @@ class Deadline:
 
     def _watch(self):
         while signals := os.read(self._reading, 64):
-            if signal.SIGINT in signals and not self._over.wait(PATIENCE):
+            over = self._over  # `restart` replaces it
+            if signal.SIGINT in signals and not over.wait(PATIENCE):
                 try:
                     status = self._save()
                 except Exception as error:  # of any kind, as the process must end

@@ -11,7 +11,7 @@ from .checkpoint import Checkpoint, file_of
 from .interruption import Deadline, interruptions_kept
 from .occasional import OccasionalWriter
 from .progress import ImageBar
-from .render import render
+from .render import DENOISING, render
 from .scene_files import SceneFile
 
 WRITE_SECONDS = 10.0  # between writes of the unfinished image
@@ -113,9 +113,12 @@ class Image:
     def _render(self, output):
         """Render with a progress bar, and write from time to time."""
         denoise = self._options.denoise_quality or self._options.denoise
-        with ImageBar() as bar, Deadline(output.end_early):
+        with ImageBar() as bar, Deadline(output.end_early) as deadline:
 
             def progress(took, image):
+                if took.stage == DENOISING:
+                    # An interrupted image is denoised, too, which may take longer than the deadline allows
+                    deadline.restart()
                 bar.show(took, *([f"{took.passes} passes"] if self._remote else []))
                 if image is not None:
                     output.keep(took, image)

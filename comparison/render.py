@@ -7,6 +7,7 @@ import time as clock
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from numbers import Integral, Real
 from typing import Any
 
 import mitsuba as mi
@@ -29,6 +30,7 @@ from .scene_files import SceneFile
 from .timed_sizes import sizes_of
 
 LIMITS = ("spp", "time")  # end a render regardless of its error
+DENOISING = "denoise"  # stage after the last pass
 
 
 @dataclass
@@ -41,12 +43,11 @@ class Took:
     `error`, whose passes are stratified together, None for fewer than two passes and where pixels have different
     numbers of samples; `statistics`: counters of the integrator, summed over passes; `ended_by`: the limit that was
     reached ("spp", "time" or "error"), "interruption" (Ctrl-C, or `cancel` of the integrator) or "progress", None
-    during the render; `channels`: names of the channels;
-    `denoise_seconds`: the part of `seconds` for denoising; `denoiser`: metadata, quality of the denoiser and samples of
-    albedo and normal; `raw`: the image before denoising (`mi.TensorXf`), None without denoising; `layer_spp`: samples
-    per pixel of the requested layers, None without.
+    during the render; `channels`: names of the channels; `denoise_seconds`: the part of `seconds` for denoising;
+    `denoiser`: metadata, quality of the denoiser and samples of albedo and normal; `raw`: the image before denoising
+    (`mi.TensorXf`), None without denoising; `layer_spp`: samples per pixel of the requested layers, None without.
 
-    During a render: `stage`: current stage of the pass, a key of `statistics["seconds"]`, None between passes;
+    During a render: `stage`: current stage, a key of `statistics["seconds"]` or `DENOISING`, None between passes;
     `seconds_left`: expected seconds until the end, None if unknown.
     """
 
@@ -93,15 +94,15 @@ def render(
     pass; later passes have hashes of `seed` and their index. `denoise`: return the denoised image (denoising.py), by
     the network "high", "balanced" or "fast", or, if True, by the one that suits the `time` or the samples, and, where
     time and memory allow, at twice the resolution, with a multiple of four samples; an integrator given by name is then
-    created with its property `denoised`, if it has one. An image of
-    many samples is the mean of mirrored copies that are denoised, and gets back detail that the denoiser removes
-    (detail.py). `manylights` with this property gives more samples to
-    pixels where the denoiser leaves noise (sample_density.py), unless there is an `error`.
-    `progress`: called after each pass with the cost and the image so far; integrators of this project also call it at
-    the start of each stage of a pass, with None for the image. If it returns False, no other pass begins; an exception
-    ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a `checkpoint.Checkpoint` of the
-    same render with one sensor, whose samples and seconds count; it is kept unless a limit ends the render. `layers`:
-    names of features.py, "albedo", "normal" and "depth", which become channels such as "albedo.R".
+    created with its property `denoised`, if it has one. An image of many samples is the mean of mirrored copies that
+    are denoised, and gets back detail that the denoiser removes (detail.py). `manylights` with this property gives more
+    samples to pixels where the denoiser leaves noise (sample_density.py), unless there is an `error`.
+    `progress`: called after each pass with the cost and the image so far, and before denoising with None for the image;
+    integrators of this project also call it so at the start of each stage of a pass. If it returns False, no other pass
+    begins; an exception ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a
+    `checkpoint.Checkpoint` of the same render with one sensor, whose samples and seconds count; it is kept unless a
+    limit ends the render. `layers`: names of features.py, "albedo", "normal" and "depth", which become channels such as
+    "albedo.R".
 
     Ctrl-C, or `cancel()` of the integrator, returns the image of the finished passes. Without a finished pass Ctrl-C
     raises KeyboardInterrupt and `cancel()` RuntimeError. A second Ctrl-C raises KeyboardInterrupt.
@@ -191,7 +192,7 @@ def check(**values):
         if value is None:
             continue
         whole = name.endswith("spp")
-        if not isinstance(value, int if whole else int | float) or not 0 < value < float("inf"):
+        if not isinstance(value, Integral if whole else Real) or not 0 < value < float("inf"):
             raise ValueError(f"{name} must be a positive {'whole ' if whole else ''}number, got {value!r}")
 
 
@@ -317,6 +318,8 @@ class _Render:
             self._ending.goal.warn_if_missed(self._error, self._ended_by)
         image, took = self._image(), self._took()
         if denoiser:
+            if self._progress:
+                self._progress(replace(took, stage=DENOISING), None)
             took.raw, image = image, self._complete(denoiser.denoise_passes(self.progressive))
             took.denoise_seconds, took.denoiser = denoiser.seconds, denoiser.description
             took.seconds = self._elapsed()

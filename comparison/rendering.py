@@ -43,6 +43,7 @@ class Passes:
         """Remove all passes."""
         self.passes, self.channels, self.sum, self.estimate = [], [], 0.0, ErrorEstimate()
         self.first_sum = 0.0  # of the passes of the first half; None for passes of a checkpoint without halves
+        self._image = 0, None  # number of passes, and their average in the resolution of the film
 
     def add(self, image):
         """Add a `PassImage`, and return its `Pass`."""
@@ -52,8 +53,9 @@ class Passes:
         self.sum = self.sum + one.weight * planes
         if self.has_halves and _lighter(self.half_weights) == 0:
             self.first_sum = self.first_sum + one.weight * planes
-        level = _shown(planes, self.channels).mean(axis=-1, keepdims=True)
-        self.estimate.add(self.merged(level), one.weight)
+        if self.has_error:
+            level = _shown(planes, self.channels).mean(axis=-1, keepdims=True)
+            self.estimate.add(self.merged(level), one.weight)
         self.passes.append(one)
         return one
 
@@ -66,9 +68,14 @@ class Passes:
     def decisions(self, arrays):
         """Take nothing: these passes depend on nothing else."""
 
+    @property
+    def has_error(self):
+        """Whether the passes tell the error of the image."""
+        return True
+
     def error(self):
-        """Return the relative standard error, as `ErrorEstimate.relative`."""
-        return self.estimate.relative()
+        """Return the relative standard error, as `ErrorEstimate.relative`; None if the passes do not tell it."""
+        return self.estimate.relative() if self.has_error else None
 
     @property
     def spp(self):
@@ -106,8 +113,10 @@ class Passes:
 
     @property
     def image(self):
-        """The average, (height, width, channels) float64."""
-        return self.merged(self.fine_image)
+        """The average, (height, width, channels) float64; computed once, as the filter of a fine film takes long."""
+        if self._image[0] != len(self.passes):
+            self._image = len(self.passes), self.merged(self.fine_image)
+        return self._image[1]
 
     def merged(self, planes):
         """Return the image in the resolution of the sensor's film, from that in the resolution of the passes."""
@@ -211,10 +220,10 @@ class Progressive(Passes):
     def decisions(self, arrays):
         self.density.relative = arrays.get("density")
 
-    def error(self):
-        """Return the relative standard error, as `ErrorEstimate.relative`; None where pixels have different numbers of
-        samples, so that no common weight describes the precision of a pass."""
-        return super().error() if self.density.relative is None else None
+    @property
+    def has_error(self):
+        """Whether pixels have equal numbers of samples, so that a common weight describes the precision of a pass."""
+        return self.density.relative is None
 
     def should_stop(self):
         """Return whether the integrator's `cancel` was called."""

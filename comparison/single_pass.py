@@ -14,7 +14,7 @@ from vpl.core.stages import Stage
 from vpl.split.film_cells import HALF
 
 from .fine_film import fine_film
-from .images import colour
+from .images import colour, planes_of
 
 MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the time to the first image
 MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
@@ -142,9 +142,7 @@ def render_pass(
             spp = _render(scene, sensor, integrator, spp, seed, parts)
         seconds = time.perf_counter() - begin
         # The film, as the image of `mi.render` lacks names, and channels of nested integrators
-        bitmap = sensor.film().bitmap()
-    channels = [entry.name for entry in bitmap.struct_()]
-    planes = np.array(bitmap, np.float32).reshape(bitmap.size()[1], bitmap.size()[0], -1)
+        planes, channels = planes_of(sensor.film().bitmap())
     statistics = dict(getattr(integrator, "statistics", None) or {})
     taken = Pass(seed, spp, seconds, statistics, compilation and compilation.seconds)
     if not half:

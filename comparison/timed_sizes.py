@@ -204,7 +204,7 @@ class TimedSizes(PassSizes):
     def _filling(self, seconds):
         """Return the largest size of a pass of some `seconds`, by its expected cost."""
         start, each = self._line()
-        affordable = (seconds - self._kernel_seconds - start) / (self._dearer * each)
+        affordable = (seconds - self._kernel_seconds - start) / (self._dearer * max(each, 1e-9))
         found = before = 0
         for cost in self._costs:
             size = int(min((affordable - cost.fixed) / cost.each, cost.most))

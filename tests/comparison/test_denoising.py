@@ -16,7 +16,8 @@ from comparison import render as rendering_module
 from comparison.denoising import Denoiser
 from tests.support.comparisons import results_of
 from tests.support.marks import stress
-from tests.support.paths import CORNELL
+from tests.support.paths import CORNELL, ROOT
+from tests.support.processes import PATIENCE
 from tests.support.rendering import render
 from tests.support.scenes import cornell
 from vpl.split.cost_model import CostModel
@@ -100,6 +101,41 @@ def test_only_colour_is_denoised_and_bad_pixels_stay_alone():
     assert np.isfinite(found).all() and found.shape == image.shape
     np.testing.assert_array_equal(found[..., 3:], image[..., 3:])
     assert found[..., :3].std() < image[..., [0, 2]].std()
+
+
+def test_the_colour_of_xyz_is_denoised():
+    scene, image = cornell(32).load(), np.random.default_rng(0).random((32, 32, 3)).astype(np.float32)
+    rgb, xyz = ["R", "G", "B"], ["X", "Y", "Z"]
+    in_xyz = images.with_colour(image, xyz, image)
+    denoiser = Denoiser(scene)
+    found = images.colour(denoiser.denoise(in_xyz, xyz), xyz)
+    np.testing.assert_allclose(found, denoiser.denoise(image, rgb), atol=1e-3)
+
+
+def test_an_interrupted_image_is_denoised_however_long_that_takes(tmp_path):
+    script = f"""
+import signal, sys, time
+import mitsuba as mi
+import manylights
+from comparison import interruption
+from comparison.denoising import Denoiser
+interruption.PATIENCE = 0.5
+render, denoise, calls = mi.render, Denoiser.denoise_passes, []
+def interrupted(*arguments, **keywords):
+    calls.append(1)
+    if len(calls) == 4:
+        signal.raise_signal(signal.SIGINT)
+    return render(*arguments, **keywords)
+def slow(*arguments):
+    time.sleep(1.5)
+    return denoise(*arguments)
+mi.render, Denoiser.denoise_passes = interrupted, slow
+size = ["-D", "resx=24", "-D", "resy=24", "--pass-spp", "4", "--spp", "400"]
+sys.exit(manylights.main([{CORNELL!r}, *size, "-o", {str(tmp_path / "a.exr")!r}, "--denoise"]))
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == 130 and "interrupted; wrote" in done.stderr, done.stderr
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.denoised.exr", "a.exr"]
 
 
 def command(*arguments):

@@ -12,7 +12,7 @@ from comparison.fine_film import fine_film, merged, usual_parts
 from tests.support.scenes import closed_box, cornell
 
 FILTERS = ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos")
-FORMATS = ("rgb", "rgba", "luminance", "luminance_alpha")
+FORMATS = ("rgb", "rgba", "luminance", "luminance_alpha", "xyz", "xyza")
 
 
 def camera(film=None, **more):

@@ -1,7 +1,9 @@
 """EXR and PNG files, tone mapping, false colours."""
 
+import resource
 import threading
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -67,6 +69,33 @@ def test_a_full_disk_is_an_error_that_names_the_file(tmp_path):
         file.symlink_to("/dev/full")
         file.write_text("{}")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("extension", images.EXTENSIONS)
+def test_a_disk_that_is_full_within_an_image_is_such_an_error(tmp_path, extension):
+    limits, image = resource.getrlimit(resource.RLIMIT_FSIZE), np.random.default_rng(0).random((64, 64, 3))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=rf"'.*/a\{extension}'"):
+            images.write(tmp_path / f"a{extension}", image)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_colour_of_xyz_is_that_of_mitsuba():
+    xyz = np.random.default_rng(0).random((4, 5, 3))
+    expected = np.array(mi.xyz_to_srgb(mi.Color3f(*np.float32(xyz.reshape(-1, 3).T)))).T.reshape(4, 5, 3)
+    image, names = np.concatenate([np.ones((4, 5, 1)), xyz], axis=-1), ["A", "X", "Y", "Z"]
+    np.testing.assert_allclose(images.colour(image, names), expected, atol=1e-5)
+    np.testing.assert_allclose(images.with_colour(np.zeros((4, 5, 4)), names, expected)[..., 1:], xyz, atol=1e-5)
+
+
+def test_exposures_beyond_the_numbers_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="exposure must be from -100 to 100 stops, got 1024"):
+        images.write(tmp_path / "a.png", np.ones((4, 4, 3)), exposure=1024)
+    with pytest.raises(ValueError, match="got nan"):
+        images.check_exposure(float("nan"))
 
 
 def test_tone_mapping():

@@ -237,6 +237,11 @@ def test_bad_values_are_refused(scene, arguments, message):
         manylights.render(scene, **arguments)
 
 
+def test_limits_may_be_numbers_of_numpy(scene):
+    _, took = manylights.render(scene, "path", spp=np.int64(4), time=np.float32(100), sensor=np.int32(0))
+    assert took.spp == 4
+
+
 @pytest.mark.parametrize(("limits", "ended_by"), [({"time": 1e-9}, "time"), ({"spp": 16}, "spp")])
 def test_an_error_that_is_not_reached_is_a_warning(scene, capfd, limits, ended_by):
     _, took = manylights.render(scene, "path", error=1e-4, pass_spp=1, **limits)

@@ -41,6 +41,8 @@ EXTENSIBLE = 29401
 # Largest number of orders and of entries (1 MB) in the table, with a minimum of 1 order; two dimensions share an order
 # and a start with a probability of 1 / entries. Number of candidate multipliers of a lattice
 _ORDERS, _ENTRIES, _TRIED = 256, 1 << 18, 64
+# Most values of the kernel that the search for a multiplier computes, at 10 ns each: fewer candidates for more points
+_SEARCHED = 1 << 24
 
 
 def _mixed(bits, stream: int):
@@ -61,7 +63,8 @@ def lattice_multiplier(count: int, cells: int = 1) -> int:
     """
     candidates = np.arange(1, max(count, 2))
     candidates = candidates[np.gcd(candidates, count) == 1]
-    nearest = np.argsort(np.abs(candidates * (1 + 5**0.5) / 2 - count), kind="stable")[:_TRIED]
+    tried = min(_TRIED, max(_SEARCHED // count, 1))
+    nearest = np.argsort(np.abs(candidates * (1 + 5**0.5) / 2 - count), kind="stable")[:tried]
     errors = np.prod([_worst_errors(size, candidates[nearest]) for size in {count, count // cells}], axis=0)
     return int(candidates[nearest][np.argmin(errors)])
 
