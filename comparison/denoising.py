@@ -134,8 +134,7 @@ class Denoiser:
 
     def denoise_passes(self, passes):
         """Denoise the colour of the image of `rendering.Passes`, as `denoise_fine`, with detail if they suit."""
-        whole = passes.fine_image
-        image = self.denoise_fine(np.float32(whole), passes.channels)
+        image = self.denoise_fine(np.float32(passes.fine_image), passes.channels)
         self.has_detail = self.restores and detail.suits(passes)
         if self.has_detail:
             begin, before, where = time.perf_counter(), self.seconds, colour_indices(passes.channels)
@@ -143,7 +142,7 @@ class Denoiser:
             fine = [np.float32(half[..., where]) for half in passes.fine_halves]
             denoised = [self.denoise_fine(half, names, detail.QUALITY) for half in fine]
             halves = [passes.merged(half) for half in fine]
-            raw, share = passes.merged(whole)[..., where], passes.half_weights[0] / sum(passes.half_weights)
+            raw, share = passes.image[..., where], passes.half_weights[0] / sum(passes.half_weights)
             image[..., where] = detail.restored(image[..., where], raw, halves, denoised, share)
             # Not twice
             self.seconds = before + time.perf_counter() - begin

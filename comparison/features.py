@@ -29,7 +29,7 @@ FEATURE_SPP = 16, 128
 # kernel that compiles for 0.5 s in kitchen
 AT_ONCE = 64, 16, 4, 1
 # Most samples of an image rendered at once with the first number and with the others, some 100 bytes each
-FEATURE_WAVEFRONTS = 1 << 22, 1 << 24
+FEATURE_WAVEFRONTS = 1 << 22, 1 << 25
 # A sample of a path takes 20 to 25 times as long. Features and image gain equally by more time if the features have
 # about twice the samples of the image (decisions.md), which take a tenth of its time with the first ones
 PER_SAMPLE = 2
@@ -38,6 +38,8 @@ FEATURE_SEED = 0xFEA7  # combined with the seed of the image, to avoid correlate
 DEEPEST = 16  # interactions with mirrors, panes and masks
 # Channels of each feature; the names are those of Cycles' layers
 FEATURES = {"albedo": ("R", "G", "B"), "normal": ("X", "Y", "Z"), "depth": ("Z",)}
+# Least and largest value of each; a filter with negative weights goes beyond those of samples
+LIMITS = {"albedo": (0, 1), "normal": (-1, 1), "depth": (0, np.finfo(np.float32).max)}
 
 
 def channels_of(names):
@@ -112,10 +114,13 @@ def features_of(scene, sensor, seed=0, spp=None, time_limit=None, parts=1, hide_
 
 def _mean_of(renders):
     """Return the mean of (images by name, samples) by samples, and the sum of the samples."""
-    sums, whole = dict.fromkeys(FEATURES, 0.0), 0
+    mean, whole = {}, 0
     for one, samples in renders:
-        sums, whole = {name: sums[name] + samples * one[name] for name in FEATURES}, whole + samples
-    return {name: total / whole for name, total in sums.items()}, whole
+        whole += samples
+        share = np.float32(samples / whole)
+        # A single render is not copied
+        mean = {name: mean[name] + share * (plane - mean[name]) if mean else plane for name, plane in one.items()}
+    return mean, whole
 
 
 def auxiliary_features(scene, sensor, spp, seed, parts=1, hide_emitters=False):
@@ -160,10 +165,15 @@ def _rendered(scene, sensor, spp, key, hide_emitters):
         integrator = _feature_integrator(mi.variant(), hide_emitters)
         mi.render(scene, sensor=wrapper, integrator=integrator, spp=spp, seed=seed)
         planes, names = planes_of(sensor.film().bitmap())
-    found = {
-        name: np.nan_to_num(planes[..., [names.index(channel) for channel in channels_of([name])]]) for name in FEATURES
-    }
-    return found | {"albedo": np.clip(found["albedo"], 0, 1), "normal": np.clip(found["normal"], -1, 1)}
+    return {name: _within(planes, names.index(channels_of([name])[0]), name) for name in FEATURES}
+
+
+def _within(planes, first, name):
+    """Return the feature of this name, whose channels begin with the `first` of `planes`, with finite values."""
+    # Slices, as a list of indices takes three times as long
+    found = np.clip(planes[..., first : first + len(FEATURES[name])], *LIMITS[name])
+    found[np.isnan(found)] = 0
+    return found
 
 
 @cache

@@ -101,9 +101,11 @@ def _merged_rows(fine, parts, first, weights):
     rows = np.pad(fine, padding)
     exists = np.pad(np.ones(len(fine)), padding[0])
     total, whole = np.zeros((count, *fine.shape[1:]), fine.dtype), np.zeros(count)
+    weighted = np.empty_like(total)
     for number, weight in enumerate(weights):
         if weight:
             steps = slice(number, number + parts * count, parts)
-            total += fine.dtype.type(weight) * rows[steps]
+            total += np.multiply(rows[steps], fine.dtype.type(weight), out=weighted)
             whole += weight * exists[steps]
-    return total / whole.reshape(-1, *[1] * (fine.ndim - 1)).astype(fine.dtype)
+    total /= whole.reshape(-1, *[1] * (fine.ndim - 1)).astype(fine.dtype)
+    return total

@@ -117,7 +117,9 @@ def _plain(header):
 def planes_of(bitmap):
     """Return the image (height, width, channels) float32 of a `mi.Bitmap`, and the names of its channels."""
     columns, rows = bitmap.size()
-    return np.array(bitmap, np.float32).reshape(rows, columns, -1), [field.name for field in bitmap.struct_()]
+    # Shares the memory of the bitmap, if it holds such numbers
+    planes = np.asarray(bitmap).astype(np.float32, copy=False)
+    return planes.reshape(rows, columns, -1), [field.name for field in bitmap.struct_()]
 
 
 def colour_indices(channels, layer=""):

@@ -113,9 +113,13 @@ class Passes:
 
     @property
     def image(self):
-        """The average, (height, width, channels) float64; computed once, as the filter of a fine film takes long."""
+        """The average, (height, width, channels) float64, or float32 from a fine film.
+
+        Computed once, as the filter of a fine film takes 0.6 s for 1920 x 1080 pixels, 1.0 s in double precision.
+        """
         if self._image[0] != len(self.passes):
-            self._image = len(self.passes), self.merged(self.fine_image)
+            fine = self.fine_image
+            self._image = len(self.passes), self.merged(fine if self.parts == 1 else np.float32(fine))
         return self._image[1]
 
     def merged(self, planes):

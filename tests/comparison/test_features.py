@@ -129,7 +129,7 @@ def test_features_of_more_samples_are_those_of_fewer_with_less_noise(monkeypatch
     exact, _ = features.auxiliary_features(scene, sensor, 1024, 7)
     few, _ = features.features_of(scene, sensor, 0, 4, None)
     timed, count = features.features_of(scene, sensor, 0, None, 1e6)
-    monkeypatch.setattr(features, "FEATURE_WAVEFRONTS", (1, 1 << 24))
+    monkeypatch.setattr(features, "FEATURE_WAVEFRONTS", (1, 1 << 25))
     in_parts, of_parts = features.auxiliary_features(scene, sensor, 50, 0)
     assert (count, of_parts) == (144, 48)
     for name, plane in exact.items():
@@ -141,10 +141,9 @@ def test_features_of_more_samples_are_those_of_fewer_with_less_noise(monkeypatch
     ("pixels", "least", "sizes"),
     [
         (256 * 144, 4, [64, 64]),
-        (1280 * 720, 4, [16] * 8),
-        (1920 * 1080, 1, [4] * 32),
+        (1920 * 1080, 4, [16] * 8),
         (3840 * 2160, 4, [4] * 32),
-        (3840 * 2160, 1, [1] * 128),
+        (7680 * 4320, 1, [1] * 128),
     ],
 )
 def test_features_of_large_images_need_bounded_memory(pixels, least, sizes):
