@@ -155,7 +155,7 @@ class Denoiser:
 
     def _denoised(self, image, channels, quality, features):
         begin = time.perf_counter()
-        planes = np.array(image, np.float32)
+        planes = np.asarray(image, np.float32)
         rgb = np.nan_to_num(colour(planes, channels), nan=0.0, posinf=0.0, neginf=0.0)
         inputs = {"color": rgb, **{name: features[name] for name in GUIDES}}
         network, copies = self._networks[quality or self.quality], 1 if quality else self.copies

@@ -126,16 +126,16 @@ def _mean_of(renders):
 def auxiliary_features(scene, sensor, spp, seed, parts=1, hide_emitters=False):
     """Render "albedo", "normal" and "depth", a dict of (height, width, channels) float32, of the first surfaces that
     are neither mirror nor glass, with the film's filter and about `spp` samples per pixel; `sensor` is a `mi.Sensor`.
-    The samples are stratified if the sensor's sampler is `independent`. `parts`: in the resolution of a fine film
-    (fine_film.py), with its filter. `hide_emitters`: of the integrator, as in Mitsuba's `prb`. Return the dict and the
-    samples per pixel: `spp` rounded down to a multiple of 16, at least 16.
+    Samples rendered at once are stratified if the sensor's sampler is `independent`. `parts`: in the resolution of a
+    fine film (fine_film.py), with its filter. `hide_emitters`: of the integrator, as in Mitsuba's `prb`. Return the
+    dict and the samples per pixel: `spp` rounded down to a multiple of 16, at least 16.
 
     Albedo, 0 to 1: directional albedo, estimated by one BSDF sample, times the throughput of mirrors and glass before
     the surface, plus emission. Normal: shading normal in world space, turned towards the viewer. Depth: length of the
     path from the near clipping distance of the camera, world units, as in Mitsuba's `aov`. All are 0 in empty
     directions.
     """
-    sizes = _sizes(max(spp, FEATURE_SPP[0]), int(np.prod(sensor.film().crop_size())), parts**2)
+    sizes = _sizes(max(spp, FEATURE_SPP[0]), int(np.prod(sensor.film().crop_size())))
     # One after the other: large images take much memory
     with fine_film(sensor, parts):
         return _mean_of(
@@ -144,12 +144,12 @@ def auxiliary_features(scene, sensor, spp, seed, parts=1, hide_emitters=False):
         )
 
 
-def _sizes(spp, pixels, least):
-    """Return the numbers of samples per pixel that are rendered at once, of `AT_ONCE` and not below `least`: together
-    `spp` rounded down to a multiple of 16."""
+def _sizes(spp, pixels):
+    """Return the numbers of samples per pixel that are rendered at once, of `AT_ONCE`: together `spp` rounded down to a
+    multiple of 16. Images of a fine film have few enough `pixels` for 16."""
     (large, *others), (most_of_large, most) = AT_ONCE, FEATURE_WAVEFRONTS
     several = spp // large if large * pixels <= most_of_large else 0
-    small = next(size for size in others if size * pixels <= most or size <= max(least, others[-1]))
+    small = next(size for size in others if size * pixels <= most or size == others[-1])
     rest = spp - several * large
     return [large] * several + [small] * ((rest - rest % others[0]) // small)
 

@@ -28,7 +28,7 @@ ERROR_RANGE = (0.01, 1.0)  # relative errors at the ends of the logarithmic scal
 AOV_PERCENTILES = (1, 99.9)
 EXTENSIONS = (".exr", ".png")  # of files from `write`
 CHANNELS = {1: "Y", 2: "YA", 3: "RGB", 4: "RGBA"}  # by their number
-COLOURS = "RGB", "XYZ", "Y"  # channels of the colour, of which an image has those of the first name that it can have
+COLOURS = "RGB", "XYZ", "Y"  # names of the channels of the colour; the first that are all present count
 # From CIE XYZ to the primaries of sRGB [IEC 61966-2-1], as Mitsuba's `xyz_to_srgb`
 RGB_OF_XYZ = np.array(
     [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]]
@@ -133,8 +133,8 @@ def colour_indices(channels, layer=""):
 
 
 def colour(image, channels, layer=""):
-    """Return the colour (height, width, 3) of an image: channels R, G and B (of a layer such as "se."), these of X, Y
-    and Z, or three times Y. Raises ValueError if the image has none of them."""
+    """Return the colour (height, width, 3) of an image: channels R, G and B (of a layer such as "se."), computed from
+    X, Y and Z, or three times Y. Raises ValueError if the image has none of them."""
     where = colour_indices(channels, layer)
     if len(where) == 1:
         return image[..., where * 3]
@@ -214,7 +214,7 @@ def write(
     RGBA by the number of channels. `metadata`: attributes of an .exr file, texts of a .png file. `exposure`: a .png
     file is scaled by 2^exposure, by default so that the 95th percentile of the brightness is 0.8. Works with a single
     thread, unlike `mi.util.write_bitmap`. Raises ValueError for another extension, for a wrong number of names, and for
-    an exposure beyond 100.
+    an exposure beyond 100 stops, darker or brighter.
     """
     planes = np.atleast_3d(np.asarray(image, np.float32))
     names = list(channels or CHANNELS.get(planes.shape[-1], ()))

@@ -69,7 +69,7 @@ class Deadline:
         self._save, self._over = save, threading.Event()
 
     def restart(self):
-        """Let a Ctrl-C before this call not end the process; a later one will."""
+        """Let the first Ctrl-C, before this call, not end the process; another one will."""
         over, self._over = self._over, threading.Event()
         over.set()
 

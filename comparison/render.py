@@ -101,8 +101,7 @@ def render(
     integrators of this project also call it so at the start of each stage of a pass. If it returns False, no other pass
     begins; an exception ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a
     `checkpoint.Checkpoint` of the same render with one sensor, whose samples and seconds count; it is kept unless a
-    limit ends the render. `layers`: names of features.py, "albedo", "normal" and "depth", which become channels such as
-    "albedo.R".
+    limit ends the render. `layers`: names of features.py, "albedo", "normal", "depth", for channels such as "albedo.R".
 
     Ctrl-C, or `cancel()` of the integrator, returns the image of the finished passes. Without a finished pass Ctrl-C
     raises KeyboardInterrupt and `cancel()` RuntimeError. A second Ctrl-C raises KeyboardInterrupt.
@@ -124,7 +123,7 @@ def render(
             scene, integrator, error=error, time=time, spp=spp, seed=seed, denoise=denoise, progress=progress,
             pass_spp=pass_spp, layers=layers,
         )  # fmt: skip
-    check(error=error, time=time, spp=spp, pass_spp=pass_spp)
+    error, time, spp, pass_spp = checked(error=error, time=time, spp=spp, pass_spp=pass_spp)
     doubt_percentage("error", error or 0)
     if not 0 <= sensor < len(scene.sensors()):
         raise ValueError(f"sensor must be from 0 to {len(scene.sensors()) - 1}, got {sensor!r}")
@@ -186,14 +185,16 @@ def render_passes(progressive, sizes, ending, begin, progress=None, denoiser=Non
     return running.result(denoiser)
 
 
-def check(**values):
-    """Raise ValueError for limits of a render, by name, that are neither positive nor None."""
+def checked(**values):
+    """Return limits of a render by name as numbers of Python, as those of NumPy would overflow. Raises ValueError for
+    limits that are neither positive nor None."""
+    numbers = []
     for name, value in values.items():
-        if value is None:
-            continue
-        whole = name.endswith("spp")
-        if not isinstance(value, Integral if whole else Real) or not 0 < value < float("inf"):
-            raise ValueError(f"{name} must be a positive {'whole ' if whole else ''}number, got {value!r}")
+        kind, number = (Integral, int) if name.endswith("spp") else (Real, float)
+        if value is not None and not (isinstance(value, kind) and 0 < value < float("inf")):
+            raise ValueError(f"{name} must be a positive {'whole ' if kind is Integral else ''}number, got {value!r}")
+        numbers.append(None if value is None else number(value))
+    return numbers
 
 
 def _scene(scene):

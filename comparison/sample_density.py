@@ -18,7 +18,7 @@ import numpy as np
 from vpl.split.pixel_rays import MULTIPLE, PixelRays
 
 from .convergence import relative_squares, smoothed
-from .images import colour
+from .images import colour, colour_indices
 
 QUALITY = "fast"  # of the denoiser: a quarter of the time of "high", and the same error in three scenes
 LEAST_SAMPLES = 8  # of a pass that determines the density: fewer leave too much noise in its halves
@@ -79,7 +79,7 @@ class SampleDensity:
 
     def _learn(self, image, half, channels):
         whole = colour(image, channels)
-        if "R" not in channels:
+        if len(colour_indices(channels)) == 1:
             half = half @ np.float32(LUMINANCE)[:, None]
         half = np.broadcast_to(half, whole.shape)
         halves = half, 2 * whole - half

@@ -7,7 +7,7 @@ from ..denoising import Denoiser, quality_of
 from ..ending import Ending
 from ..features import check_layers, hides_emitters, layers_of
 from ..pass_sizes import PassSizes
-from ..render import check, render_passes
+from ..render import checked, render_passes
 from .passes import DistributedPasses, samples_of_a_pass
 from .pool import TASKS_PER_WORKER
 from .scene_travel import bundle
@@ -24,7 +24,7 @@ class DistributedRender:
     def __init__(
         self, pool, scene, sensor=0, *, error=None, time=None, spp=None, seed=0, pass_spp=None, checkpoint=None,
     ):  # fmt: skip
-        check(error=error, time=time, spp=spp, pass_spp=pass_spp)
+        error, time, spp, pass_spp = checked(error=error, time=time, spp=spp, pass_spp=pass_spp)
         pixels, sampler = scene.file.sampling(sensor)
         if error is None and time is None and spp is None:
             spp = sampler.sample_count()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import manylights
-from comparison import features, images
+from comparison import features, fine_film, images
 from comparison.features import FEATURES
 from tests.support.paths import CORNELL
 from tests.support.scenes import cornell, sensor, wall
@@ -138,17 +138,16 @@ def test_features_of_more_samples_are_those_of_fewer_with_less_noise(monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("pixels", "least", "sizes"),
-    [
-        (256 * 144, 4, [64, 64]),
-        (1920 * 1080, 4, [16] * 8),
-        (3840 * 2160, 4, [4] * 32),
-        (7680 * 4320, 1, [1] * 128),
-    ],
+    ("pixels", "sizes"),
+    [(256 * 144, [64, 64]), (1920 * 1080, [16] * 8), (3840 * 2160, [4] * 32), (7680 * 4320, [1] * 128)],
 )
-def test_features_of_large_images_need_bounded_memory(pixels, least, sizes):
-    assert features._sizes(128, pixels, least) == sizes
-    assert sum(features._sizes(31, pixels, least)) == 16
+def test_features_of_large_images_need_bounded_memory(pixels, sizes):
+    assert features._sizes(128, pixels) == sizes
+    assert sum(features._sizes(31, pixels)) == 16
+
+
+def test_features_of_fine_films_have_a_sample_in_each_pixel():
+    assert min(features._sizes(128, fine_film.LARGEST // 4)) >= 4
 
 
 @pytest.mark.parametrize(

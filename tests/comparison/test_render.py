@@ -238,7 +238,7 @@ def test_bad_values_are_refused(scene, arguments, message):
 
 
 def test_limits_may_be_numbers_of_numpy(scene):
-    _, took = manylights.render(scene, "path", spp=np.int64(4), time=np.float32(100), sensor=np.int32(0))
+    _, took = manylights.render(scene, "path", spp=np.int16(4), time=np.float32(100), sensor=np.int32(0))
     assert took.spp == 4
 
 

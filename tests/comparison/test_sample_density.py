@@ -9,6 +9,7 @@ import pytest
 import manylights
 from comparison import fine_film, rendering, single_pass
 from comparison.checkpoint import Checkpoint
+from comparison.images import with_colour
 from comparison.pass_sizes import PROBE
 from comparison.sample_density import LEAST_SAMPLES, SampleDensity
 from comparison.timed_sizes import PASS_SECONDS, TimedSizes
@@ -96,6 +97,16 @@ def test_films_of_one_channel_have_the_luminance_of_the_halves():
     half[..., 1] = 1 + corner(0.4) / 2  # green alone
     density.learn(np.full((SIZE, SIZE, 1), 0.71516, np.float32), half, ["Y"])
     assert same(density, learned(corner(0.4)))
+
+
+def test_films_of_xyz_have_the_samples_of_others():
+    """Halves are in RGB."""
+    image = np.broadcast_to(np.float32([1, 0.2, 0.1]), (SIZE, SIZE, 3))
+    half, found = image * np.float32(1 + corner(0.4) / 2)[..., None], []
+    for names in ("RGB", "XYZ"):
+        found.append(SampleDensity(lambda image, names, quality: image))
+        found[-1].learn(with_colour(image, names, image), half, names)
+    assert same(*found) and not same(found[0], learned(corner(0.1)))
 
 
 def passes_of(monkeypatch, scene, integrator, **limits):

@@ -236,7 +236,8 @@ def test_a_room_on_a_plane_ten_thousand_times_its_size(light):
     }[light]()
     box = closed_box(emitters, 16)
     del box["left"]
-    # Mitsuba 3.9.1 leaves rectangles out of the scene's box, beyond which its shadow rays do not reach: not a rectangle
+    # Mitsuba 3.9.1 leaves rectangles of equal materials out of the scene's box, beyond which its shadow rays do not
+    # reach: not a rectangle
     flat = mi.ScalarTransform4f().translate([0, -1.02, 0]).scale([1e4, 0.01, 1e4])
     box["ground"] = {"type": "cube", "to_world": flat, "bsdf": {"type": "diffuse"}}
     assert_image_of_path(box, max_depth=5)
@@ -248,7 +249,8 @@ def test_a_room_lit_through_a_window():
     for number, y in enumerate((-0.6, 0.6)):
         transform = mi.ScalarTransform4f().translate([-1, y, 0]).rotate([0, 1, 0], 90).scale([1, 0.4, 1])
         box[f"wall{number}"] = {"type": "rectangle", "to_world": transform, "bsdf": {"type": "diffuse"}}
-    # Mitsuba 3.9.1 leaves rectangles out of the scene's box, beyond which its shadow rays do not reach
+    # Mitsuba 3.9.1 leaves rectangles of equal materials out of the scene's box, beyond which its shadow rays do not
+    # reach
     hidden = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([60, 0, 0]).scale(0.01)}
     assert_image_of_path(box, finds=0.03, of=box | {"hidden": hidden}, max_depth=6)
 
