@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.catalogue import EMITTERS, MATERIALS, ONE_PIXEL, SENSORS, film, one_of, stage
 from tests.support.marks import not_on_cuda, stress
-from tests.support.rendering import render, render_with_statistics
+from tests.support.rendering import plugin_with_model, render, render_with_statistics
 from tests.support.rooms import bulb, lamp_behind_the_camera, smooth_octahedron, sunny, veiled_room
 from tests.support.scenes import area_light, closed_box, image, rgb, sensor, wall
 from tests.support.statistics import assert_same_mean
@@ -79,7 +79,10 @@ def test_a_turned_sphere_with_a_texture():
 
 @pytest.mark.stress
 def test_a_glowing_mesh_with_vertex_normals():
-    assert_image_of_path(closed_box(smooth_octahedron(), 16), max_depth=4)
+    """With as many emitter samples as `path`: for these meshes, Mitsuba's samples of emitters and of BSDFs have
+    different means (decisions.md)."""
+    with plugin_with_model(pays_below=1e30, fewest_light_paths=4000, most_emitter_samples=1):
+        assert_image_of_path(closed_box(smooth_octahedron(), 16), max_depth=4)
 
 
 def test_a_sun_of_one_texel():
