@@ -33,6 +33,7 @@ UNSURE = 1.1  # cost over a predicted one, usually at most: measured are 0.67 to
 DOUBT = 0.5  # fraction of the remaining time for a second pass, which may have lights and cost more than expected
 DIFFERENT = 1.08  # usual cost of a sample where pixels have different numbers: there are more at edges and on glass
 LAST_SHARE = 0.75  # minimum fraction of the remaining time of a pass that will probably end the render
+OVERRUN = 0.15  # largest fraction of the limit by which a pass may be expected to exceed it
 LONGEST = 2.0  # times the wanted seconds: longer passes shrink
 CHANGED = 1.5  # ratio of the times of two passes of equal size at which earlier times are discarded
 MOST_GROWTH = 4  # maximum ratio of sizes: of unsafe growth, and of extrapolated times
@@ -147,8 +148,8 @@ class TimedSizes(PassSizes):
     def _in_time(self, size, left):
         """Return the size, about `size` samples, of a pass within `left` seconds.
 
-        If there is none, return the least size if `left` is at least half of its time, otherwise 0; also 0 if a last
-        pass in parts would be far smaller than usual.
+        If there is none, return the least size if `left` is at least half of its time and the limit of the render will
+        hardly be exceeded, otherwise 0; also 0 if a last pass in parts would be far smaller than usual.
         """
         least = size if self._fixed else min(size, self._least)
         whole, predicted = left, 0
@@ -167,7 +168,7 @@ class TimedSizes(PassSizes):
                 return certain
         while size > least and self._expected(size) > left:
             size = max(least, power_of_two(size - 1))
-        return size if self._expected(size) <= max(2 * left, whole) else 0
+        return size if self._expected(size) <= max(min(2 * left, whole + OVERRUN * self._time), whole) else 0
 
     def _is_last(self, filling, size, left):
         """Return whether the next pass is the last one, of about `filling` samples that the `left` seconds allow: after

@@ -427,6 +427,15 @@ def test_in_parts_time_for_kernels_is_left_if_the_first_pass_compiled_or_was_not
 
 
 @pytest.mark.parametrize("in_parts", [False, True])
+def test_a_costly_pass_does_not_begin_if_it_would_exceed_the_time_by_far(in_parts):
+    for time, size in ((19, 4), (15, "time")):
+        sizes = TimedSizes(SQUARE, time, in_parts=in_parts, least=4)
+        assert sizes.next([], 0.0) == 4
+        first = Pass(0, 4, 10.0, {"seconds": {Stage.TRACED: 9.9, Stage.CUTS: 0.0}} if in_parts else {})
+        assert sizes.next([first], 10.0) == size
+
+
+@pytest.mark.parametrize("in_parts", [False, True])
 def test_a_pass_of_a_given_size_begins_if_half_of_it_fits(in_parts):
     for time, size in ((8, 8), (6, "time")):
         sizes = TimedSizes(SQUARE, time, fixed=8, in_parts=in_parts)
