@@ -39,7 +39,7 @@ DEEPEST = 16  # interactions with mirrors, panes and masks
 # Channels of each feature; the names are those of Cycles' layers
 FEATURES = {"albedo": ("R", "G", "B"), "normal": ("X", "Y", "Z"), "depth": ("Z",)}
 # Least and largest value of each; a filter with negative weights goes beyond those of samples
-LIMITS = {"albedo": (0, 1), "normal": (-1, 1), "depth": (0, np.finfo(np.float32).max)}
+RANGES = {"albedo": (0, 1), "normal": (-1, 1), "depth": (0, np.finfo(np.float32).max)}
 
 
 def channels_of(names):
@@ -171,7 +171,7 @@ def _rendered(scene, sensor, spp, key, hide_emitters):
 def _within(planes, first, name):
     """Return the feature of this name, whose channels begin with the `first` of `planes`, with finite values."""
     # Slices, as a list of indices takes three times as long
-    found = np.clip(planes[..., first : first + len(FEATURES[name])], *LIMITS[name])
+    found = np.clip(planes[..., first : first + len(FEATURES[name])], *RANGES[name])
     found[np.isnan(found)] = 0
     return found
 

@@ -122,35 +122,35 @@ def planes_of(bitmap):
     return planes.reshape(rows, columns, -1), [field.name for field in bitmap.struct_()]
 
 
+def _colour_names(channels, layer=""):
+    """Return the names of the channels of the colour, one of `COLOURS`. Raises ValueError if there are none."""
+    for names in COLOURS:
+        if {layer + name for name in names} <= set(channels):
+            return names
+    raise ValueError(f"no colour channels among {', '.join(channels)}")
+
+
 def colour_indices(channels, layer=""):
     """Return the indices of the channels of the colour (of a layer such as "se."), as `COLOURS` names them. Raises
     ValueError if there are none."""
-    channels = list(channels)
-    for names in COLOURS:
-        if {layer + name for name in names} <= set(channels):
-            return [channels.index(layer + name) for name in names]
-    raise ValueError(f"no colour channels among {', '.join(channels)}")
+    return [list(channels).index(layer + name) for name in _colour_names(channels, layer)]
 
 
 def colour(image, channels, layer=""):
     """Return the colour (height, width, 3) of an image: channels R, G and B (of a layer such as "se."), computed from
     X, Y and Z, or three times Y. Raises ValueError if the image has none of them."""
-    where = colour_indices(channels, layer)
-    if len(where) == 1:
-        return image[..., where * 3]
-    found = image[..., where]
-    is_rgb = list(channels)[where[0]] == layer + "R"
-    return found if is_rgb else (found @ RGB_OF_XYZ.T).astype(found.dtype)
+    names, found = _colour_names(channels, layer), image[..., colour_indices(channels, layer)]
+    if names == "XYZ":
+        return (found @ RGB_OF_XYZ.T).astype(found.dtype)
+    return found if names == "RGB" else np.repeat(found, 3, axis=-1)
 
 
 def with_colour(image, channels, rgb):
     """Return an image (height, width, channels) with another colour `rgb` (height, width, 3)."""
-    where, image = colour_indices(channels), np.array(image)
-    if len(where) == 1:
-        rgb = rgb.mean(axis=-1, keepdims=True)
-    elif list(channels)[where[0]] == "X":
+    names, image = _colour_names(channels), np.array(image)
+    if names == "XYZ":
         rgb = rgb @ np.linalg.inv(RGB_OF_XYZ).T
-    image[..., where] = rgb
+    image[..., colour_indices(channels)] = rgb.mean(axis=-1, keepdims=True) if names == "Y" else rgb
     return image
 
 

@@ -20,7 +20,7 @@ MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the 
 MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
 # Stages of `manylights` with times that grow with the samples, by the parts of a predicted cost: paths, lights, cuts
 PER_SAMPLE = (Stage.TRACED,), (Stage.LIGHTS, Stage.TREE), (Stage.CLUSTERS, Stage.CUTS)
-LEAST_SECONDS = 1e-9  # below the resolution of the clock
+LEAST_SECONDS = 1e-6  # below the time of any pass, so that no cost is 0
 
 
 def pass_seed(seed, index):
@@ -97,7 +97,7 @@ class Pass:
         elif self.statistics.get("measured", 0):
             shared = [Stage.PILOT]
         not_repeated = (self.compile_seconds or 0.0) + sum(stages.get(stage, 0.0) for stage in shared)
-        return max(self.seconds - not_repeated, 0.0)
+        return max(self.seconds - not_repeated, LEAST_SECONDS)
 
     @property
     def start_seconds(self):

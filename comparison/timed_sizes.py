@@ -119,7 +119,7 @@ class TimedSizes(PassSizes):
         self._seconds[self._asked] = min(seconds, self._seconds.get(self._asked, math.inf))
         if not is_first:
             before = self._known.get(self._asked, seconds)
-            if not 1 / CHANGED < seconds / max(before, 1e-6) < CHANGED:
+            if not 1 / CHANGED < seconds / before < CHANGED:
                 self._known.clear()  # the speed of the machine has changed
             self._known[self._asked] = seconds
         if self._fixed or self._asked != self._current:
@@ -138,7 +138,7 @@ class TimedSizes(PassSizes):
         if line:
             filling = self._filling(wanted)
             return self._kept(filling) if self._any_size else min(power_of_two(filling), MOST_GROWTH * self._current)
-        grown = power_of_two(self._current * wanted / max(seconds, 1e-6))
+        grown = power_of_two(self._current * wanted / seconds)
         if repeated and seconds < wanted:
             # Without this, a pass with a dominant start would never grow
             times = MOST_GROWTH if seconds < wanted / 2 else 2
@@ -168,7 +168,8 @@ class TimedSizes(PassSizes):
                 return certain
         while size > least and self._expected(size) > left:
             size = max(least, power_of_two(size - 1))
-        return size if self._expected(size) <= max(min(2 * left, whole + OVERRUN * self._time), whole) else 0
+        longest = min(2 * left, whole + OVERRUN * self._time)
+        return size if self._expected(size) <= max(longest, whole) else 0
 
     def _is_last(self, filling, size, left):
         """Return whether the next pass is the last one, of about `filling` samples that the `left` seconds allow: after
@@ -205,7 +206,7 @@ class TimedSizes(PassSizes):
     def _filling(self, seconds):
         """Return the largest size of a pass of some `seconds`, by its expected cost."""
         start, each = self._line()
-        affordable = (seconds - self._kernel_seconds - start) / (self._dearer * max(each, 1e-9))
+        affordable = (seconds - self._kernel_seconds - start) / (self._dearer * each)
         found = before = 0
         for cost in self._costs:
             size = int(min((affordable - cost.fixed) / cost.each, cost.most))

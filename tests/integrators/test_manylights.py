@@ -252,8 +252,7 @@ def test_a_room_lit_through_a_window():
     for number, y in enumerate((-0.6, 0.6)):
         transform = mi.ScalarTransform4f().translate([-1, y, 0]).rotate([0, 1, 0], 90).scale([1, 0.4, 1])
         box[f"wall{number}"] = {"type": "rectangle", "to_world": transform, "bsdf": {"type": "diffuse"}}
-    # Mitsuba 3.9.1 leaves rectangles of equal materials out of the scene's box, beyond which its shadow rays do not
-    # reach
+    # Beyond the scene's box, which is small without this cube, shadow rays of `path` do not reach (decisions.md)
     hidden = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([60, 0, 0]).scale(0.01)}
     assert_image_of_path(box, finds=0.03, of=box | {"hidden": hidden}, max_depth=6)
 

@@ -121,8 +121,8 @@ def ray_to_emitter(si, direction: mi.Vector3f, point: mi.Point3f, is_infinite: m
     """Shadow ray from each surface ``si`` to an emitter: to its ``point``, or, where the emitter ``is_infinite``, in a
     ``direction``.
 
-    Mitsuba 3.9.1 places infinite emitters outside of the scene's bounding box, and the box
-    ignores rectangles of equal materials.
+    Mitsuba 3.9.1 places infinite emitters outside of the scene's bounding box, and the box ignores rectangles of equal
+    materials.
     """
     return dr.select(is_infinite, si.spawn_ray(direction), si.spawn_ray_to(point))
 
