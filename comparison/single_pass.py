@@ -90,7 +90,7 @@ class Pass:
     @property
     def repeated_seconds(self):
         """Seconds without compilation, and without the work that later passes share: preparing emitters, the pilot, and
-        measurements by the pilot's paths."""
+        measurements by the pilot's paths; at least `LEAST_SECONDS`."""
         shared, stages = [], self.statistics.get("seconds", {})
         if self.statistics.get("pilots", 0):
             shared = [Stage.SCENE, Stage.PILOT]
