@@ -36,7 +36,8 @@ class AdaptiveDirectIntegrator(DirectLightIntegrator):
       results relative to the unoccluded contribution.
     - The weights that combine passes are independent of the results, which avoids bias; the paper uses estimated
       variances.
-    - Each half of a pixel's samples decides whether the second half continues, so that no pixel stops early by chance.
+    - Each half of a pixel's samples decides whether the other half continues, so that no pixel stops early by chance.
+      Sums over few emitters (``lights``) end when their two halves agree.
     - Dark pixels need only reach the error at a fraction of the image's mean (``dark_floor``).
     - BSDF samples complement emitter samples on glossy surfaces and near emitters (``bsdf_share``).
     - Variances come from neighbouring strata.

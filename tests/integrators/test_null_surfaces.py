@@ -10,12 +10,15 @@ from tests.support.many_emitters import bulbs, panels
 from tests.support.marks import stress
 from tests.support.rendering import render
 from tests.support.rooms import sunny, veiled_room
-from tests.support.scenes import area_light, closed_box, image, rgb, wall
+from tests.support.scenes import area_light, closed_box, image, rgb, sensor, wall
 from tests.support.statistics import assert_same_mean
 from vpl.points.camera_paths import scene_traits
 from vpl.split.emitters import emitter_sampler
 from vpl.split.emitters.base import EmitterSample
+from vpl.transport.contribution import passage
 
+BLACK = {"type": "diffuse", "reflectance": rgb(0.0)}
+NINE_TENTHS = {"type": "mask", "opacity": 0.1, "nested": BLACK}  # of the light pass
 TORN = {"type": "mask", "opacity": image([[[0.0], [1.0]], [[0.7], [0.2]]]), "nested": {"type": "diffuse"}}
 BUMPS = image(np.random.default_rng(5).random((8, 8, 1)))
 SHEETS = {
@@ -66,7 +69,7 @@ def test_a_black_mask_dims_light(light, lights_cost_nothing):
     box = closed_box(sunny() if light == "sunny" else {"lamp": area_light()}, 12)
     if light == "sunny":
         del box["ceiling"]
-    black = {"type": "mask", "opacity": 0.4, "nested": {"type": "diffuse", "reflectance": rgb(0.0)}}
+    black = {"type": "mask", "opacity": 0.4, "nested": BLACK}
     masked = box | {"mask": wall([0, 0.5, 0], [1, 0, 0], -90, 1.0, bsdf=black)}
     clear, masked = mi.load_dict(box), mi.load_dict(masked)
 
@@ -84,6 +87,49 @@ def test_many_emitters_above_a_torn_sheet(max_depth, lights_cost_nothing):
     scene = mi.load_dict(closed_box(panels(90, rng) | bulbs(10, rng), 12, **sheets("torn")))
     # With ten pairs, the bound of the spread is missed
     assert_image_of_prb(scene, max_depth, seeds=16)
+
+
+def test_paths_that_find_large_emitters_close_above_glass():
+    """Seen from the floor, the glass is far from the vertex, and close to the emitters."""
+    turned = mi.ScalarTransform4f().rotate([1, 0, 0], 90).scale(0.11)
+    places = [[x, 0.95, z] for x in np.linspace(-0.8, 0.8, 8) for z in np.linspace(-0.8, 0.8, 8)]
+    tiles = {
+        f"tile{i}": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate(place) @ turned,
+            "emitter": {"type": "area", "radiance": rgb(1.0)},
+        }
+        for i, place in enumerate(places)
+    }
+    glass = wall([0, 0.9, 0], [1, 0, 0], -90, 1.0, bsdf={"type": "thindielectric"})
+    assert_image_of_prb(mi.load_dict(closed_box(tiles, 12, glass=glass)), 3, finds=0.03)
+
+
+@pytest.mark.parametrize("offset", [0, 60])
+def test_shadow_rays_end_before_the_emitter_behind_many_surfaces(offset):
+    """Mitsuba moves the origins of rays by a distance that grows with the coordinates."""
+    masks = {f"mask{i}": wall([0, offset + 0.8 - 0.05 * i, 0], [1, 0, 0], 90, 1.0, bsdf=NINE_TENTHS) for i in range(8)}
+    lamp = wall([0, offset + 1, 0], [1, 0, 0], 90, 1.0) | {"emitter": {"type": "area", "radiance": rgb(1.0)}}
+    scene = mi.load_dict({"type": "scene", "lamp": lamp, **masks})
+    surface = dr.zeros(mi.SurfaceInteraction3f)
+    surface.p, surface.n = mi.Point3f(0.1, float(offset), 0.2), mi.Normal3f(0, 1, 0)
+    ray = surface.spawn_ray_to(mi.Point3f(0.1, float(offset + 1), 0.2))
+    passed, crossings = passage(scene, scene_traits(scene), ray, mi.UInt32(20), mi.Bool(True))
+    assert crossings[0] == 8
+    np.testing.assert_allclose(np.array(passed)[0], 0.9**8, rtol=1e-5)
+
+
+def test_an_emitter_behind_a_mask_behind_a_hidden_emitter():
+    """All camera rays pass the hidden lamp, and nine tenths of their light the mask."""
+    scene = mi.load_dict({
+        "type": "scene",
+        "sensor": sensor(8, 4, fov=20),
+        "lamp": wall([0, 0, 1], [0, 1, 0], 0, 4.0) | {"emitter": {"type": "area", "radiance": rgb(5.0)}},
+        "mask": wall([0, 0, 0], [0, 1, 0], 0, 4.0, bsdf=NINE_TENTHS),
+        "sky": {"type": "constant", "radiance": rgb(2.0)},
+    })  # fmt: skip
+    image = render(scene, "manylights", 256, max_depth=4, hide_emitters=True)
+    np.testing.assert_allclose(image.mean(), 0.9 * 2, rtol=0.02)
 
 
 def test_shadow_rays_pass_as_many_surfaces_as_allowed():

@@ -45,7 +45,8 @@ class SceneShapes:
             return cls(own, [])
         groups = [shape for shape in children_of(scene, mi.Shape) if shape.class_name().startswith("ShapeGroup")]
         # Mitsuba tells the group of an instance in its printed form alone
-        of_group = {group: [row for row in instances if f'name = "{group.id()}"' in str(row[1])] for group in groups}
+        printed = [(row, str(row[1])) for row in instances]
+        of_group = {group: [row for row, text in printed if f'name = "{group.id()}"' in text] for group in groups}
         return cls(own, [ShapeGroup(_children(group), found) for group, found in of_group.items()])
 
     @property

@@ -71,7 +71,7 @@ class ExtendedEmitters:
         density = dr.zeros(mi.Float, dr.width(si.p))
         areas = self.emitters.area.count
         ds = dr.zeros(mi.DirectionSample3f, dr.width(si.p))
-        ds.p, ds.n, ds.uv, ds.d = hit.p, hit.n, hit.uv, direction
+        ds.p, ds.n, ds.uv, ds.d = hit.p, hit.sh_frame.n, hit.uv, direction
         ds.dist = dr.norm(hit.p - si.p)
         if areas:
             row = self.emitters.area.row(hit, active & hit.is_valid())

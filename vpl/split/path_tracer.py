@@ -334,6 +334,7 @@ def _pass_hidden(path: Path, hit: Hit, first: FirstEdge) -> None:
     """Let paths continue behind emitters hidden from the camera, without scattering."""
     passes = hit.hidden & hit.si.is_valid()
     path.active |= passes
+    path.density = dr.select(passes, first.density, path.density)
     path.throughput = dr.select(passes, first.throughput, path.throughput)
     path.delta, path.eta = path.delta | passes, dr.select(passes, 1, path.eta)
     if path.state is not None:

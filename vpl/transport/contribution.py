@@ -87,9 +87,10 @@ def _through_null_surfaces(scene, traits, ray, most, active):
     """Walk from surface to surface while surfaces let light pass unscattered, past ``most`` surfaces: (fraction of the
     light, number of surfaces passed)."""
     ray, left = mi.Ray3f(ray), mi.UInt32(most)
-    active = mi.Bool(active)
+    active, ends = mi.Bool(active), dr.isfinite(ray.maxt) & (ray.maxt < dr.largest(mi.Float))
+    end = ray(dr.select(ends, ray.maxt, 0))
     passed = dr.select(active, mi.UnpolarizedSpectrum(1), 0)
-    while dr.hint(active, exclude=[traits]):
+    while dr.hint(active, exclude=[traits, ends, end]):
         hit = scene.ray_intersect_preliminary(ray, active=active)
         # Surfaces are usually opaque: only the remaining surfaces need a full intersection record
         crossed = active & hit.is_valid() & (left > 0) & traits.is_null(hit)
@@ -98,7 +99,7 @@ def _through_null_surfaces(scene, traits, ray, most, active):
         passed = dr.select(crossed, passed * traits.transmission(si, crossed), passed)
         active = crossed & dr.any(passed > 0)
         left -= dr.select(crossed, mi.UInt32(1), 0)
-        onward = si.spawn_ray(ray.d)
-        onward.maxt = ray.maxt - si.t
+        # Mitsuba moves the origin off the surface, and the shortest rays behind many surfaces would pass their end
+        onward = dr.select(ends, si.spawn_ray_to(end), si.spawn_ray(ray.d))
         ray = dr.select(active, onward, ray)
     return passed, most - left

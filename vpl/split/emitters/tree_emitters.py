@@ -178,7 +178,7 @@ class TreeEmitters(CellEmitters):
         group = mi.UInt32(0)
         if self.groups:
             group = dr.gather(mi.UInt32, self._group, dr.select(near, row, self._tree.count + index), active)
-        return EmitterSample(toward, weight, density, is_point, ray, group, nearness)
+        return EmitterSample(toward, weight, density, is_point, ray, group, nearness if self.lights else None)
 
     def _nearness(self, row, normal, direction, distance, active):
         """See :class:`vpl.split.emitters.base.EmitterSample`, of area emitters."""
@@ -199,7 +199,8 @@ class TreeEmitters(CellEmitters):
         origin = dr.zeros(mi.Interaction3f)
         origin.p = vertex
         ds = dr.zeros(mi.DirectionSample3f)
-        ds.p, ds.n, ds.uv, ds.d, ds.dist = si.p, si.n, si.uv, ray.d, si.t
+        # From the vertex, as null surfaces have divided the ray, and with the normal of `sample`, that of the shading
+        ds.p, ds.n, ds.uv, ds.d, ds.dist = si.p, si.sh_frame.n, si.uv, ray.d, dr.norm(si.p - vertex)
         density, nearness = mi.Float(0), mi.Float(dr.inf)
         if self._areas:
             after = self._emitters.area.row(si, active & has_density & si.is_valid())
@@ -215,4 +216,5 @@ class TreeEmitters(CellEmitters):
             pdf = finite_or_zero(self._environment.pdf_direction(origin, ds, here))
             probability = self._distant_probability(mi.UInt32(self._distant - 1), cell, here)
             density = dr.select(here, pdf * probability, density)
-        return MetEmitter(emitted_towards(self._emitters, si, active), density, self._group_met(si), nearness)
+        emitted = emitted_towards(self._emitters, si, active)
+        return MetEmitter(emitted, density, self._group_met(si), nearness if self.lights else None)
