@@ -5,7 +5,10 @@ created; a scene may therefore name an integrator that does not exist here, if i
 """
 
 import hashlib
+import os
+import time
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 
 import drjit as dr
@@ -23,6 +26,9 @@ KEPT_PARAMETERS = ("max_depth", "rr_depth", "hide_emitters")
 FILE_PROPERTIES = ("filename",)
 DEFAULT_PARTS = {"Film": "hdrfilm", "Sampler": "independent"}  # of Mitsuba's sensors, by type
 GIVEN_TO_RENDER = ("sample_count", "seed")  # sampler parameters overridden by each render
+# Nanoseconds after its last change from which on the hash of a file is kept: another change within the steps in which
+# the file system counts time, two seconds at most, would not be seen
+SETTLED = 3 * 10**9
 
 
 def short_name(path):
@@ -161,7 +167,7 @@ class SceneFile:
                         del properties[name]
             digest.update(repr(properties).encode())
             for file in self._named(node):
-                digest.update(hashlib.sha256(file.read_bytes()).digest())
+                digest.update(bytes.fromhex(file_hash(file)))
         return digest.hexdigest()
 
     def _named(self, node):
@@ -235,6 +241,25 @@ def known_parameters(name, parameters):
     with suppress(RuntimeError, ValueError):
         mi.PluginManager.instance().create_object(tried)
     return {key for key in parameters if tried.was_queried(key)}
+
+
+def file_hash(path):
+    """Return a hash (hexadecimal) of the content of a file, which is read again only after a change. Raises OSError for
+    an unreadable file."""
+    status = os.stat(path)
+    if time.time_ns() - status.st_mtime_ns < SETTLED:
+        return _hash(path)
+    return _hash_as_of(os.path.abspath(path), status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(4096)
+def _hash_as_of(path, modified, size):
+    return _hash(path)
+
+
+def _hash(path):
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _axes(film):

@@ -1,6 +1,7 @@
-"""Scene files: sensors and their parts, image sizes and crop windows, nested integrators."""
+"""Scene files: sensors and their parts, image sizes and crop windows, nested integrators, hashes of files."""
 
 import json
+import os
 
 import mitsuba as mi
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 import compare
 import manylights
 from comparison import images
-from comparison.scene_files import SceneFile
+from comparison.one_image import LazyScene
+from comparison.scene_files import SceneFile, file_hash
 
 FILM = ("width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
 BATCH = '<sensor type="batch"><sensor type="perspective"/><sensor type="perspective"/></sensor>'
@@ -166,3 +168,53 @@ def test_the_command_sets_parameters_of_nested_integrators(tmp_path, capsys):
     )
     image, channels, _ = images.read_exr(output)
     assert "dd.T" in channels and images.colour(image, channels).max() > 0.9
+
+
+# --- Hashes of files ---
+
+
+def written(path, content, age):
+    """Write a file that was last changed `age` seconds before a fixed time in nanoseconds, which is returned."""
+    path.write_bytes(content)
+    changed = int(path.stat().st_mtime_ns - age * 1e9)
+    os.utime(path, ns=(changed, changed))
+    return changed
+
+
+def sky(folder, more=""):
+    bitmap = mi.Bitmap(np.full((2, 4, 3), 0.5, np.float32))
+    bitmap.write(str(folder / "light.exr"))
+    emitter = '<emitter type="envmap"><string name="filename" value="light.exr"/></emitter>'
+    return scene_file(folder, camera(8, 6) + emitter + more)
+
+
+def test_files_are_read_once_for_the_fingerprints_of_a_scene(tmp_path):
+    file, light = sky(tmp_path), tmp_path / "light.exr"
+    changed = written(light, b"one", 10)
+    before = file.fingerprint()
+    light.write_bytes(b"two")
+    os.utime(light, ns=(changed, changed))  # as if it had not been changed
+    assert file.fingerprint() == before
+    os.utime(light, ns=(changed + 1, changed + 1))
+    assert file.fingerprint() != before
+
+
+def test_a_file_that_was_just_changed_is_read_again(tmp_path):
+    """Another change may have the same time."""
+    changed = written(tmp_path / "a", b"one", 0)
+    before = file_hash(tmp_path / "a")
+    (tmp_path / "a").write_bytes(b"two")
+    os.utime(tmp_path / "a", ns=(changed, changed))
+    assert file_hash(tmp_path / "a") != before
+
+
+@pytest.mark.parametrize("changes", [False, True])
+def test_kept_lights_end_with_the_files_of_the_frame_before(tmp_path, changes):
+    keeps = '<integrator type="manylights"><boolean name="keep_lights" value="true"/></integrator>'
+    first = LazyScene(sky(tmp_path, keeps))
+    first.get()
+    if changes:
+        mi.Bitmap(np.ones((2, 4, 3), np.float32)).write(str(tmp_path / "light.exr"))
+    second = LazyScene(SceneFile(first.file.path), before=first)
+    second.get()
+    assert (second.integrator is first.integrator) != changes
