@@ -337,7 +337,7 @@ def main(arguments=None):
     return command_line.exit_status(
         "compare",
         lambda: run(options, command),
-        f"finished runs are in {options.out}; --resume continues",
+        lambda: f"finished runs are in {options.out}; --resume continues",
         options.verbose,
     )
 

@@ -233,7 +233,7 @@ def main(arguments=None):
     options = parser.parse_args(arguments)
     options.command = shlex.join(["python", "-m", "comparison.references", *arguments])
     kept = "the cache keeps the samples so far, and the same command goes on"
-    return command_line.exit_status("references", lambda: _run(options), kept, options.verbose)
+    return command_line.exit_status("references", lambda: _run(options), lambda: kept, options.verbose)
 
 
 def _run(options):
