@@ -140,12 +140,7 @@ def _add_reference(parser):
 def _add_scene(parser):
     add = parser.add_argument
     add("--max-depth", type=int, metavar="N", help="maximum path depth (default: of the scene)")
-    add(
-        "--width",
-        type=positive(int),
-        metavar="N",
-        help="width of the images, or of their crop window (default: of the scene)",
-    )
+    add("--width", type=positive(int), metavar="N", help="width of the image, or crop window (default: of the scene)")
     add("--sampler", metavar="PLUGIN",
         help="sampler of the images and references, such as multijitter, by which all integrators stratify "
              "(default: of the scene)")  # fmt: skip
