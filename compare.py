@@ -140,7 +140,7 @@ def _add_reference(parser):
 def _add_scene(parser):
     add = parser.add_argument
     add("--max-depth", type=int, metavar="N", help="maximum path depth (default: of the scene)")
-    add("--width", type=positive(int), metavar="N", help="width of the images (default: of the scene)")
+    add("--width", type=positive(int), metavar="N", help="width of the image, or crop window (default: of the scene)")
     add("--sampler", metavar="PLUGIN",
         help="sampler of the images and references, such as multijitter, by which all integrators stratify "
              "(default: of the scene)")  # fmt: skip
@@ -332,7 +332,7 @@ def main(arguments=None):
     return command_line.exit_status(
         "compare",
         lambda: run(options, command),
-        f"finished runs are in {options.out}; --resume continues",
+        lambda: f"finished runs are in {options.out}; --resume continues",
         options.verbose,
     )
 

@@ -58,6 +58,7 @@ from comparison.command_line import UsageError, parameter, positive
 from comparison.denoising import QUALITIES, for_denoising, import_oidn
 from comparison.features import FEATURES
 from comparison.images import check_exposure, check_extension, write
+from comparison.interruption import interruptions_kept
 from comparison.one_image import INTERRUPTED, Failed, Image, LazyScene
 from comparison.render import Took, render
 from comparison.scene_files import SceneFile
@@ -205,9 +206,9 @@ def chosen_integrator(asked, file):
     return own
 
 
-def run(options):
+def run(options, written):
     """Render and write all images; return the highest exit status. The failure of an image among several is printed,
-    and the remaining images are rendered."""
+    and the remaining images are rendered. `written`: a list to which the file of each complete image is added."""
     if options.denoise:
         import_oidn()
     wanted = batch.images(options)
@@ -225,6 +226,8 @@ def run(options):
                     traceback.print_exc()
                 print(f"manylights: {image.path}: {command_line.explain(error)}", file=sys.stderr)
                 found = 1
+            if found == 0:
+                written.append(image.path)
             status = max(status, found)
             if found == INTERRUPTED:
                 break
@@ -237,7 +240,8 @@ def _images(wanted, options, stack):
     pool = scene = None
     for one in wanted:
         try:
-            file, described = parse_scene(one)
+            with interruptions_kept():
+                file, described = parse_scene(one)
         except Exception as error:
             yield Failed(batch.output(one, 0), error)
             continue
@@ -256,8 +260,12 @@ def _images(wanted, options, stack):
 
 def main(arguments=None):
     """Run the command; return its exit status."""
-    options = parse(arguments)
-    return command_line.exit_status("manylights", lambda: run(options), "nothing was written", options.verbose)
+    options, written = parse(arguments), []
+
+    def interrupted():
+        return f"complete images: {len(written)}, the last one {written[-1]}" if written else "nothing was written"
+
+    return command_line.exit_status("manylights", lambda: run(options, written), interrupted, options.verbose)
 
 
 if __name__ == "__main__":

@@ -113,10 +113,11 @@ def check_integrator(name):
 
 
 def check_output(file):
-    """Raise UsageError if the folder of an output file does not exist."""
+    """Raise UsageError if the folder of an output file does not exist or is not writable."""
     folder = file.absolute().parent
     if not folder.is_dir():
         raise UsageError(f"no folder '{folder}' for the output")
+    make_folder(folder)
 
 
 def check_sampler(name):
@@ -207,13 +208,14 @@ def failure(error):
 def exit_status(program, run, interrupted, verbose):
     """Run a command and return its exit status; an exception becomes one line on the standard error.
 
-    `run`: returns the status; `interrupted`: message about the state after Ctrl-C; `verbose`: raise exceptions.
+    `run`: returns the status; `interrupted`: returns a message about the state after Ctrl-C; `verbose`: raise
+    exceptions.
     """
     try:
         with interruptions_kept():
             return run()
     except KeyboardInterrupt:
-        print(f"\n{program}: interrupted; {interrupted}", file=sys.stderr)
+        print(f"\n{program}: interrupted; {interrupted()}", file=sys.stderr)
         return 130
     except Exception as error:
         if verbose:

@@ -25,7 +25,7 @@ class LazyScene:
     def __init__(self, file, threads=None, before=None):
         self.file, self.seconds, self._threads, self._scene = file, 0.0, threads, None
         self._before = before if self.keeps_lights else None
-        self.integrator = None
+        self.integrator = self._without_camera = None
 
     @property
     def keeps_lights(self):
@@ -38,8 +38,11 @@ class LazyScene:
         if self._scene is None:
             begin = time.perf_counter()
             before, self._before = self._before, None  # frees the scene of that frame
-            if before and before.file.fingerprint(camera=False) == self.file.fingerprint(camera=False):
-                self.integrator = before.integrator
+            if self.keeps_lights:
+                self._without_camera = self.file.fingerprint(camera=False)
+                # As loaded: the files of that frame may have changed since
+                if before and before._without_camera == self._without_camera:
+                    self.integrator = before.integrator
             del before
             self._scene = SceneFile(self.file.path, self.file.defines, self.file.changes).load(self._threads)
             self.integrator = self.integrator or self._scene.integrator()

@@ -220,7 +220,11 @@ def main(arguments=None):
         prog="python -m comparison.references", description="Make a path-traced reference."
     )
     parser.add_argument("scene", help="scene file (XML)")
-    parser.add_argument("--width", type=command_line.positive(int), help="width of the image (default: the scene's)")
+    parser.add_argument(
+        "--width",
+        type=command_line.positive(int),
+        help="width of the image, or of its crop window (default: the scene's)",
+    )
     parser.add_argument("--spp", type=command_line.positive(int), required=True, help="samples per pixel")
     parser.add_argument("--cache", type=Path, default=default_cache(), help="default: ~/.cache/manylights")
     parser.add_argument("--output", type=Path, required=True, help="EXR file")
@@ -229,7 +233,7 @@ def main(arguments=None):
     options = parser.parse_args(arguments)
     options.command = shlex.join(["python", "-m", "comparison.references", *arguments])
     kept = "the cache keeps the samples so far, and the same command goes on"
-    return command_line.exit_status("references", lambda: _run(options), kept, options.verbose)
+    return command_line.exit_status("references", lambda: _run(options), lambda: kept, options.verbose)
 
 
 def _run(options):

@@ -200,8 +200,8 @@ class SceneComparison:
             vpl_folder=str(options.out) if with_vpl else None,
             variant=options.mode,
             defines=dict(options.define),
-            # Defaults to the width of the reference; a width given by the user must match, or the comparison fails
-            width=options.width or (self._reference.size[0] if self._reference else None),
+            # Defaults to the width of a file; a width given by the user must match, or the comparison fails
+            width=options.width or (self._reference.size[0] if options.reference.kind == "file" else None),
             max_depth=options.max_depth,
             sampler=options.sampler,
             seed=seed,

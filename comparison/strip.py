@@ -90,7 +90,7 @@ def main(arguments=None):
     parser.add_argument("--scene", nargs="+", help="names of scenes (default: the only one)")
     parser.add_argument("--output", type=Path, required=True, help="PNG file")
     options = parser.parse_args(arguments)
-    return command_line.exit_status("strip", lambda: _run(options), "nothing was written", verbose=False)
+    return command_line.exit_status("strip", lambda: _run(options), lambda: "nothing was written", verbose=False)
 
 
 def _run(options):

@@ -9,13 +9,12 @@ import hashlib
 import os
 import shutil
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import mitsuba as mi
 
 from ..images import replacing
-from ..scene_files import SceneFile
+from ..scene_files import SceneFile, file_hash
 from .scene_names import named_files
 
 
@@ -60,7 +59,7 @@ def bundle(scene_file):
     named = named_files(main, scene_file.defines) | {main: True}
     folder = os.path.commonpath([os.path.dirname(file) for file, is_relative in named.items() if is_relative])
     files = [
-        TravellingFile(file, os.path.relpath(file, folder) if is_relative else None, _hash(file))
+        TravellingFile(file, os.path.relpath(file, folder) if is_relative else None, file_hash(file))
         for file, is_relative in named.items()
     ]
     files.sort(key=lambda file: (file.path != main, file.relative is None, file.path))
@@ -124,17 +123,6 @@ def read(bundle, hash):
 def is_there(path, hash):
     """Return whether a path is a file with the given hash."""
     try:
-        return _hash(path) == hash
+        return file_hash(path) == hash
     except OSError:
         return False
-
-
-def _hash(path):
-    status = os.stat(path)
-    return _hash_as_of(path, status.st_mtime_ns, status.st_size)
-
-
-@lru_cache(4096)
-def _hash_as_of(path, modified, size):
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

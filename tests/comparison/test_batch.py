@@ -106,6 +106,27 @@ def test_what_fails_does_not_keep_others_from_being_rendered(tmp_path, capsys):
     assert "no scene file 'nosuch.xml'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("while creating: KeyboardInterrupt: ")])
+@pytest.mark.parametrize("complete", [0, 2])
+def test_an_interruption_between_images_names_what_is_complete(tmp_path, monkeypatch, capsys, error, complete):
+    """Mitsuba replaces an interruption while a plugin is created."""
+    parse, parsed = manylights.parse_scene, []
+
+    def interrupted(options):
+        if len(parsed) == complete:
+            raise error
+        parsed.append(1)
+        return parse(options)
+
+    monkeypatch.setattr(manylights, "parse_scene", interrupted)
+    frames = ["--frames", "1..3", "-D", "resx={frame}", "-D", "resy=4", "--spp", "1", "-o", str(tmp_path)]
+    assert manylights.main([CORNELL, *frames]) == 130
+    written = sorted(tmp_path.iterdir())
+    assert len(written) == complete
+    said = f"complete images: 2, the last one {written[-1]}" if complete else "nothing was written"
+    assert f"manylights: interrupted; {said}\n" in capsys.readouterr().err
+
+
 def test_each_of_several_failures_is_told_with_its_traceback_if_that_is_asked_for(capsys):
     assert manylights.main(["nosuch.xml", "nobody.xml", "-v"]) == 1
     said = capsys.readouterr().err

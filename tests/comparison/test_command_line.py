@@ -257,7 +257,17 @@ def test_errors_are_one_line(tmp_path, monkeypatch, capsys, arguments, status, m
     assert not list(tmp_path.glob("*.exr"))
 
 
-def test_message_of_an_integrator_is_not_hidden(capsys):
+def test_a_folder_that_refuses_files_is_told_before_the_render(tmp_path, monkeypatch, capsys):
+    def refuse(**_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(command_line.tempfile, "TemporaryFile", refuse)
+    monkeypatch.setattr(one_image, "render", None)
+    assert run(CORNELL, *TINY, "-o", tmp_path / "a.exr", "--spp", 1) == 2
+    assert f"cannot write to the folder '{tmp_path}': Permission denied" in capsys.readouterr().err
+
+
+def test_message_of_an_integrator_is_not_hidden(tmp_path, capsys):
     class Failing(mi.SamplingIntegrator):
         def sample(self, *_):
             raise ValueError("too many lights to count")
@@ -266,7 +276,7 @@ def test_message_of_an_integrator_is_not_hidden(capsys):
             return "Failing"
 
     mi.register_integrator("failing", Failing)
-    assert run(CORNELL, *TINY, "-i", "failing", "-o", os.devnull + ".exr") in (1, 2)
+    assert run(CORNELL, *TINY, "-i", "failing", "-o", tmp_path / "a.exr") in (1, 2)
     assert "too many lights to count" in capsys.readouterr().err
 
 
@@ -431,5 +441,5 @@ def raising(error, cause=None, cleaning=None):
     ids=["itself", "in a message", "as a cause", "another cause", "an error in the clean-up"],
 )
 def test_status_after_an_interruption(run, status, capsys):
-    assert command_line.exit_status("name", run, "all is well", False) == status
+    assert command_line.exit_status("name", run, lambda: "all is well", False) == status
     assert ("interrupted; all is well" in capsys.readouterr().err) == (status == 130)
