@@ -115,6 +115,8 @@ def write_rows(path: Path | None, part: str, settings: dict, growing: Iterable[d
             pass
         return
     partial, made_by = path.with_name(path.name + ".partial"), origin()
+    # Of an interrupted run, which would become the result of a run without rows
+    partial.unlink(missing_ok=True)
     for rows in growing:
         write_results(partial, part, settings, rows, made_by)
     if partial.exists():
