@@ -44,7 +44,7 @@ UNITS = {
     "loss": "mean squared error of an image, over its squared target plus a hundredth of the squared mean",
     "memory": "GiB at the peak, above the loaded scene where `path` has none",
     "new_scene_seconds": "s of the first render with the compiled kernels of another scene",
-    "not_reached": "whether the error of the other method was not reached",
+    "not_reached": "whether the error of the other method was not reached, so that ratios are bounds",
     "plain_speedup": "as speedup, by the variances of all pixels",
     "product": "relative variance times s",
     "product_ratio": "product over that with the chosen value",
