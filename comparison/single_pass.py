@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from vpl.core.compilation import compilation_measured
+from vpl.core.exclusive import exclusive
 from vpl.core.garbage import garbage_kept
 from vpl.core.stages import Stage
 from vpl.split.film_cells import HALF
@@ -155,6 +156,14 @@ def render_pass(
     rest = [index for index, name in enumerate(channels) if not name.startswith(HALF)]
     of_half = colour(planes, channels, f"{HALF}.")
     return PassImage(planes[..., rest], [channels[index] for index in rest], taken, of_half)
+
+
+def expected_channels(sensor, integrator):
+    """Return the names of the channels of images by an integrator for a `mi.Sensor`, before a render. Empties the film.
+    Raises RuntimeError if another thread uses the sensor."""
+    with exclusive(sensor=sensor):
+        sensor.film().prepare(integrator.aov_names())
+        return planes_of(sensor.film().bitmap())[1]
 
 
 def _render(scene, sensor, integrator, spp, seed, parts):
