@@ -297,7 +297,7 @@ def _compare(options, settings, command, runner):
     made_by = {"versions": machine.software(), "machine": machine.identity()}
     store = Runs(options.out, made_by | ({"workers": True} if options.workers else {}))
     progress = Progress(options.scenes, sweeps.order(settings, options.seeds))
-    done = []
+    done, sections = [], []
     if options.workers:
         runner.save = store.save
     comparisons = [SceneComparison(path, settings, options, store, progress, runner) for path in options.scenes]
@@ -317,7 +317,7 @@ def _compare(options, settings, command, runner):
                 done.append(comparison)
                 progress.write(report.text(comparison.result) + "\n")  # first, because a full disk cannot prevent it
                 results = report.describe(command, options, [one.result for one in done], complete)
-                report.write(options.out, results, [one.pictures for one in done])
+                sections = report.write(options.out, results, [one.pictures for one in done], sections)
         return results
     finally:
         progress.close()

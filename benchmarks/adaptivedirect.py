@@ -12,8 +12,9 @@ cold    first render in a new process with an empty kernel cache.
 Images are rendered with 64 camera rays a pixel (256 by ``direct`` and ``path``) from a multijitter sampler, and
 compared, where they see no emitter, with the mean of four renders by ``adaptivedirect`` at 1.5%, whose own noise is
 taken off: path-traced references of these scenes are noisier than what they would judge (10% a pixel after 2048 samples
-in the kitchen). That its mean is that of ``direct`` is tested (tests/integrators/test_adaptivedirect.py). Variance
-falls as 1 / time, so a method's time for another error is its own time, scaled; ``all`` is stopped after 15 seconds.
+in the kitchen). Where this noise hides an error, marked by <, times at equal relMSE are unknown. That the mean of
+``adaptivedirect`` is that of ``direct`` is tested (tests/integrators/test_adaptivedirect.py). Variance falls as
+1 / time, so a method's time for another error is its own time, scaled; ``all`` is stopped after 15 seconds.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from statistics import geometric_mean
+from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -38,7 +40,7 @@ from benchmarks import results, scenes  # noqa: E402
 from benchmarks.printed_passes import as_printed  # noqa: E402
 from comparison import machine, references  # noqa: E402
 from comparison.command_line import positive  # noqa: E402
-from comparison.metrics import compare  # noqa: E402
+from comparison.metrics import compare, detection_threshold  # noqa: E402
 from comparison.scene_files import SceneFile  # noqa: E402
 
 NAMES = (
@@ -50,6 +52,35 @@ RAYS, REFERENCE_ERROR, REFERENCE_RENDERS = 64, 0.015, 4
 PRINTED = "adaptivedirect, printed"
 # Files that determine an image by ``adaptivedirect``
 SOURCES = ("vpl/**/*.py", "integrators/*.py")
+METRIC = "relmse_trimmed"
+
+
+class Raced(NamedTuple):
+    """Seconds, relMSE without the largest 0.1%, and shadow rays per pixel of an integrator; ``hidden``: whether the
+    noise of the reference exceeds the error, which is then that noise."""
+
+    seconds: float
+    relmse: float
+    rays: float
+    hidden: bool
+
+    @classmethod
+    def of(cls, runs: list) -> Raced:
+        """Median seconds and mean errors and rays of (seconds, errors as of ``metrics.compare``, rays)."""
+        seconds, errors, rays = zip(*runs, strict=True)
+        # Single errors, corrected for the noise, may be 0 where the mean is not
+        error = float(np.mean([one[METRIC] for one in errors]))
+        noise = float(np.mean([detection_threshold(METRIC, one["noise"]) for one in errors]))
+        return cls(float(np.median(seconds)), max(error, noise), float(np.mean(rays)), error <= noise)
+
+    def times_of(self, other: Raced) -> float | None:
+        """Seconds of ``other`` over the own ones at equal error; None if the noise hides one of the errors."""
+        if self.hidden or other.hidden:
+            return None
+        return other.seconds * other.relmse / (self.seconds * self.relmse)
+
+    def __str__(self) -> str:
+        return f"{self.seconds:.2f}, {self.rays:.0f}, {'< ' if self.hidden else ''}{self.relmse:.5f}"
 
 
 class Problem:
@@ -81,17 +112,15 @@ class Problem:
         file.parent.mkdir(parents=True, exist_ok=True)
         batches.write(file, {"integrator": "adaptivedirect", "error": REFERENCE_ERROR, **machine.software()})
 
-    def error(self, image) -> float:
-        """relMSE over pixels without emitters, without the largest 0.1%, corrected for the reference's noise."""
+    def errors(self, image) -> dict:
+        """Errors as of ``metrics.compare``, over pixels without emitters, corrected for the reference's noise."""
         known = self.reference
         parts = (x[self.lit][None] for x in (np.array(image, np.float64)[..., :3], known.image, known.standard_error))
-        return compare(*parts)["relmse_trimmed"]
+        return compare(*parts)
 
     def race(self, ours: str, methods: dict) -> dict:
-        """Render with {label: (plugin, properties, samples)}; runs of ``ours`` are interleaved and come last.
-
-        Returns {label: (median seconds, mean relMSE, mean rays per pixel)}.
-        """
+        """Render with {label: (plugin, properties, samples)}; runs of ``ours`` are interleaved and come last. Returns
+        {label: :class:`Raced`}."""
         for kind, more, samples in methods.values():
             # Kernels of Mitsuba's integrators depend on the number of samples
             few = samples if kind in ("direct", "path") else 2
@@ -109,11 +138,8 @@ class Problem:
                     lambda: mi.render(self.scene, integrator=integrator, spp=samples, seed=number)  # noqa: B023
                 )
             rays = getattr(integrator, "statistics", {}).get("shadow_rays", 0) / self.pixels
-            found[label].append((seconds, self.error(image), rays))
-        return {
-            label: (float(np.median([r[0] for r in runs])), *(float(np.mean([r[k] for r in runs])) for k in (1, 2)))
-            for label, runs in found.items()
-        }
+            found[label].append((seconds, self.errors(image), rays))
+        return {label: Raced.of(runs) for label, runs in found.items()}
 
 
 def plugin(name: str, **more):
@@ -145,19 +171,16 @@ def table(names, options) -> Iterator[dict]:
     ratios = {label: [] for label in ("faster", "fewer", *AGAINST)}
     for name in names:
         found = Problem(name, options.width).race("adaptive", chosen)
-        seconds, error, rays = found["adaptive"]
-        slower = {label: one[0] * one[1] / (seconds * error) for label, one in found.items()}
-        if "unoccluded" in found:
-            slower |= {"faster": found["unoccluded"][0] / seconds, "fewer": found["unoccluded"][2] / rays}
-        rows[name] = {label: _numbers(one) | {"speedup": slower[label]} for label, one in found.items()}
-        if "unoccluded" in found:
+        ours = found["adaptive"]
+        times = {label: ours.times_of(one) for label, one in found.items()}
+        slower = {label: value for label, value in times.items() if value is not None}
+        rows[name] = {label: _row(one, slower.get(label)) for label, one in found.items()}
+        if other := found.get("unoccluded"):
+            slower |= {"faster": other.seconds / ours.seconds, "fewer": other.rays / ours.rays}
             rows[name]["same rule"] = {"speedup": slower["faster"], "fewer_rays": slower["fewer"]}
         for label in ratios.keys() & slower.keys():
             ratios[label].append(slower[label])
-        columns = [
-            f"{found[label][0]:.2f}, {found[label][2]:.0f}, {found[label][1]:.5f}" if label in found else "-"
-            for label in ("adaptive", "unoccluded")
-        ]
+        columns = [str(found.get(label, "-")) for label in ("adaptive", "unoccluded")]
         columns += [f"{slower[label]:.1f}" if label in slower else "-" for label in ratios]
         print(f"{name} | {' | '.join(columns)}", flush=True)
         yield rows
@@ -165,9 +188,13 @@ def table(names, options) -> Iterator[dict]:
     print("geometric means:", ", ".join(f"{label} {value}" for label, value in means.items()))
 
 
-def _numbers(found: tuple) -> dict:
-    """Quantities of a race, for a result file."""
-    return dict(zip(("seconds", "relmse", "rays"), found, strict=True))
+def _row(found: Raced, speedup: float | None) -> dict:
+    """Quantities of a race and the speed-up, if it is known, for a result file."""
+    return found._asdict() | ({} if speedup is None else {"speedup": speedup})
+
+
+def _ratio_text(ratio: float | None, digits: int) -> str:
+    return "-" if ratio is None else f"{ratio:.{digits}f}"
 
 
 def departures(names, options) -> Iterator[dict]:
@@ -188,15 +215,11 @@ def departures(names, options) -> Iterator[dict]:
             with method(kind):
                 image = np.array(mi.render(problem.scene, integrator=plugin(kind, **more), spp=samples, seed=7))
             bias[label] = 100 * (image.mean() / problem.reference.image.mean() - 1)
-        columns = [
-            ", ".join([f"{found[label][0]:.2f}", f"{found[label][2]:.0f}", f"{found[label][1]:.5f}",
-                       f"{bias[label]:+.2f}%"])
-            for label in ("ours", "printed")
-        ]  # fmt: skip
-        ratio = found["printed"][0] * found["printed"][1] / (found["ours"][0] * found["ours"][1])
-        rows[name] = {label: _numbers(one) | {"bias": bias[label] / 100} for label, one in found.items()}
-        rows[name]["speedup"] = ratio
-        print(f"{name} | {columns[0]} | {columns[1]} | {ratio:.1f}", flush=True)
+        columns = [f"{found[label]}, {bias[label]:+.2f}%" for label in ("ours", "printed")]
+        ratio = found["ours"].times_of(found["printed"])
+        rows[name] = {label: one._asdict() | {"bias": bias[label] / 100} for label, one in found.items()}
+        rows[name] |= {} if ratio is None else {"speedup": ratio}
+        print(f"{name} | {columns[0]} | {columns[1]} | {_ratio_text(ratio, 1)}", flush=True)
         yield rows
 
 
@@ -222,15 +245,12 @@ def number_of_lights(options) -> Iterator[dict]:
             mi.render(scene, integrator=integrator, spp=RAYS, seed=1)
             image, seconds = scenes.timed(lambda: mi.render(scene, integrator=integrator, spp=RAYS, seed=0))  # noqa: B023
             rays = integrator.statistics["shadow_rays"] / pixels
-            found[lights] = seconds, rays, compare(np.array(image, np.float64), exact)["relmse_trimmed"]
-        shown = [", ".join(f"{x:.3g}" for x in found[k]) if k in found else "-" for k in ("auto", "all")]
-        ratio = "-"
-        rows[count] = {"load_seconds": load}
-        rows[count] |= {k: dict(zip(("seconds", "rays", "relmse"), one, strict=True)) for k, one in found.items()}
-        if "all" in found:
-            rows[count]["speedup"] = found["all"][0] * found["all"][2] / (found["auto"][0] * found["auto"][2])
-            ratio = f"{rows[count]['speedup']:.2f}"
-        print(f"{count} | {load:.1f} | {shown[0]} | {shown[1]} | {ratio}", flush=True)
+            found[lights] = Raced.of([(seconds, compare(np.array(image, np.float64), exact), rays)])
+        shown = [str(found.get(lights, "-")) for lights in ("auto", "all")]
+        rows[count] = {"load_seconds": load} | {lights: one._asdict() for lights, one in found.items()}
+        ratio = found["auto"].times_of(found["all"]) if "all" in found else None
+        rows[count] |= {} if ratio is None else {"speedup": ratio}
+        print(f"{count} | {load:.1f} | {shown[0]} | {shown[1]} | {_ratio_text(ratio, 2)}", flush=True)
         yield rows
 
 

@@ -161,21 +161,25 @@ def compare(names, width: int, seconds: float, passes: int) -> Iterator[dict]:
 
 
 def _warm_denoiser(scene, seconds: float, parts: int) -> Denoiser:
-    """A denoiser that has denoised an image of ``seconds``, after another one that compiled; see :class:`Denoiser`."""
-    denoiser = [Denoiser(scene, time_limit=seconds, parts=parts) for _ in range(2)][-1]
-    denoiser.denoise_passes(passes_of(scene, 0, parts, LEAST_SAMPLES, *[denoiser.features["albedo"]] * 2))
+    """A denoiser that has denoised an image of ``seconds``, after another one that compiled and decided; see
+    :class:`Denoiser`.  Its images have fewer ``parts`` if the denoiser would take too long otherwise."""
+    first = Denoiser(scene, time_limit=seconds, parts=parts)
+    denoiser = Denoiser(scene, time_limit=seconds, like=first)
+    denoiser.denoise_passes(passes_of(scene, 0, denoiser.parts, LEAST_SAMPLES, *[denoiser.features["albedo"]] * 2))
     return denoiser
 
 
 def compare_one(name: str, width: int, seconds: float, passes: int) -> dict:
     """Print the denoised errors of a scene, and the relative times of ``path`` for equal error; returns the row."""
     scene = load(name, width)
-    denoisers = {parts: _warm_denoiser(scene, seconds, parts) for parts in (1, PARTS)}
+    usual, fine = (_warm_denoiser(scene, seconds, parts) for parts in (1, PARTS))
     # Each later image adds to the seconds of its denoiser
-    fixed = {parts: denoiser.seconds for parts, denoiser in denoisers.items()}
+    chosen = [
+        (sampler, one, one.seconds) for sampler, one in (*((one, usual) for one in SAMPLERS), (SAMPLERS[-1], fine))
+    ]
     ways = [
-        Way(Several(name, scene, sampler, width, seconds - fixed[parts], parts), denoisers[parts], fixed[parts])
-        for sampler, parts in (*((sampler, 1) for sampler in SAMPLERS), (SAMPLERS[-1], PARTS))
+        Way(Several(name, scene, sampler, width, seconds - fixed, denoiser.parts), denoiser, fixed)
+        for sampler, denoiser, fixed in chosen
     ]
     # manylights stratifies the samples of this sampler
     ours = Timed(scene, "manylights", "independent", seconds, denoise=True, denoised=True)

@@ -106,6 +106,7 @@ def _equal_error_row(found: dict, problem: Problem) -> dict:
             numbers |= {"rate": _rate(one, problem.pixels), "columns": one.cut / SAMPLES}
         else:
             numbers |= {"fewer_rays": one.rays / ours.rays, "speedup": one.seconds / ours.seconds}
+            numbers["not_reached"] = one.misses(ours.absolute)
         row[label.split(",")[0]] = numbers
     return row
 

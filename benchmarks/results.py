@@ -44,7 +44,7 @@ UNITS = {
     "loss": "mean squared error of an image, over its squared target plus a hundredth of the squared mean",
     "memory": "GiB at the peak, above the loaded scene where `path` has none",
     "new_scene_seconds": "s of the first render with the compiled kernels of another scene",
-    "not_reached": "whether the error of the other method was not reached",
+    "not_reached": "whether the error of the other method was not reached, so that ratios are bounds",
     "plain_speedup": "as speedup, by the variances of all pixels",
     "product": "relative variance times s",
     "product_ratio": "product over that with the chosen value",
@@ -115,6 +115,8 @@ def write_rows(path: Path | None, part: str, settings: dict, growing: Iterable[d
             pass
         return
     partial, made_by = path.with_name(path.name + ".partial"), origin()
+    # Of an interrupted run, which would become the result of a run without rows
+    partial.unlink(missing_ok=True)
     for rows in growing:
         write_results(partial, part, settings, rows, made_by)
     if partial.exists():

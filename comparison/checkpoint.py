@@ -35,10 +35,11 @@ def file_of(image):
 
 class Checkpoint:
     """Checkpoint file of a render, which continues from it if `resume`. `made_by`: everything that the image depends on
-    except the number and sizes of passes, a dict for JSON. The checkpoint of another render is refused."""
+    except the number and sizes of passes, a dict for JSON. The checkpoint of another render is refused. `stays`:
+    whether the file of a finished render stays until `remove`, as the image could not be written."""
 
-    def __init__(self, path, made_by, resume=True):
-        self.path, self._made_by, self._resume = Path(path), made_by, resume
+    def __init__(self, path, made_by, resume=True, stays=False):
+        self.path, self._made_by, self._resume, self._stays = Path(path), made_by, resume, stays
         self._passes, self._kept, self._saved = None, None, None
         self._writer = OccasionalWriter("The checkpoint", CHECKPOINT_SECONDS)
 
@@ -106,12 +107,18 @@ class Checkpoint:
         self._saved = kept
 
     def leave(self):
-        """Write the file at the end of an unfinished render; return whether that succeeded. A failure is logged, as the
-        image is not lost."""
+        """Write the file after the last pass; return whether that succeeded. A failure is logged, as the passes are not
+        lost."""
         return self._writer.write(self.save)
 
+    def finish(self):
+        """End a render that has reached a limit and made its image: remove the file, unless it stays."""
+        if not self._stays:
+            self.remove()
+
     def remove(self):
-        """Remove the file of a finished render. A failure is logged, as the image is not lost."""
+        """Remove the file, as the image is safe. A failure is logged, as the image is not lost."""
+        self._saved = None
         try:
             self.path.unlink(missing_ok=True)
         except OSError as error:

@@ -157,11 +157,13 @@ class ErrorGoal:
         return self._is_due(progressive.estimate.effective_passes, progressive.spp)
 
     def resume(self, passes):
-        """Skip the estimates that were made for a list of passes (`Pass`) from a checkpoint."""
-        spp, weight, squared = 0, 0.0, 0.0
+        """Skip the estimates that were made for a list of passes (`Pass`) from a checkpoint; return whether there was
+        one after the last pass."""
+        spp, weight, squared, is_due = 0, 0.0, 0.0, False
         for one in passes:
             spp, weight, squared = spp + one.spp, weight + one.weight, squared + one.weight**2
-            self._is_due(effective_number(weight, squared), spp)
+            is_due = self._is_due(effective_number(weight, squared), spp)
+        return is_due
 
     def _is_due(self, effective, spp):
         if round(effective) < LEAST_PASSES or spp < self._next:

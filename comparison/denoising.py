@@ -91,26 +91,33 @@ class Denoiser:
     by default the one that leaves the least error, as the time that it saves is for samples. With `parts` of 1 and no
     time limit it is the best one. `copies`: number of denoised copies, 1 by networks other than the best one.
     `hide_emitters`: of the integrator. `restores`: whether the limits allow detail (detail.py); `has_detail`: whether
-    the last image of `denoise_passes` has it.
+    the last image of `denoise_passes` has it. `like`: another `Denoiser` of such images, whose decisions this one
+    takes: `parts`, `quality`, `copies` and `restores`. It measures all the same, so that it takes as long.
     """
 
-    def __init__(self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None, parts=1, hide_emitters=False):
+    def __init__(
+        self, scene, sensor=0, seed=0, spp=None, time_limit=None, quality=None, parts=1, hide_emitters=False, like=None,
+    ):  # fmt: skip
         self._oidn, begin = import_oidn(), time.perf_counter()
         self._networks = {name: getattr(self._oidn.Quality, name.capitalize()) for name in QUALITIES}
         self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
         one = scene.sensors()[sensor]
         self._filter, self._size = one.film().rfilter(), np.array(one.film().crop_size(), np.int64)
-        self.parts, self._known = parts, {}  # (parts, quality) -> expected seconds
+        self.parts = parts = like.parts if like else parts
+        self._known = {}  # (parts, quality) -> expected seconds
         if parts > 1 and time_limit is not None:
             # The time of a network is that of its tiles at the resolution of `parts`
             is_quick = self._expected(quality or QUALITIES[-1]) <= FINE_SHARE * time_limit
-            self.parts = parts if is_quick else 1
+            self.parts = parts if is_quick or like else 1
         self.features, self.feature_spp = features_of(scene, one, seed, spp, time_limit, self.parts, hide_emitters)
         ways = [way for way in WAYS if quality in (None, way[0])]
         self.quality, self.copies = self._usual_way(ways, spp, time_limit)
         if time_limit is not None:
             self._choose(ways, time_limit - (time.perf_counter() - begin))
         self._reserve(spp, time_limit)
+        if like:
+            self.quality, self.copies, self.restores = like.quality, like.copies, like.restores
+            self.expected_seconds = like.expected_seconds
         self.seconds = self.start_seconds = time.perf_counter() - begin
 
     @property

@@ -1,6 +1,7 @@
 """Limits of a render, and the expected time until its end."""
 
 from bisect import bisect_right
+from numbers import Integral, Real
 from operator import itemgetter
 
 from .convergence import ErrorGoal
@@ -45,3 +46,15 @@ class Ending:
         after = bisect_right(self._marks, last[0] / 2, earliest, len(self._marks) - 1, key=itemgetter(0))
         first = self._marks[max(after - 1, earliest)]
         return (last[1] - first[1]) / (last[0] - first[0])
+
+
+def checked(**values):
+    """Return limits of a render by name as numbers of Python, as those of NumPy would overflow. Raises ValueError for
+    limits that are neither positive nor None."""
+    numbers = []
+    for name, value in values.items():
+        kind, number = (Integral, int) if name.endswith("spp") else (Real, float)
+        if value is not None and not (isinstance(value, kind) and 0 < value < float("inf")):
+            raise ValueError(f"{name} must be a positive {'whole ' if kind is Integral else ''}number, got {value!r}")
+        numbers.append(None if value is None else number(value))
+    return numbers

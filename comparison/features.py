@@ -21,6 +21,7 @@ from vpl.core.shapes import SceneShapes
 
 from .fine_film import fine_film
 from .images import planes_of
+from .single_pass import sample_count
 
 # Fewest and most samples per pixel. 144 instead of 16: denoised error 4, 6 and 10% less in images of 4, 16 and 64
 # samples, both without a filter (decisions.md)
@@ -161,7 +162,8 @@ def _rendered(scene, sensor, spp, key, hide_emitters):
     # The module belongs to the variant
     from integrators.camera_samples import stratified
 
-    with stratified(sensor, spp) as wrapper, garbage_kept():
+    # The scene's own sensor, unless its sampler is `independent`, keeps its samples
+    with stratified(sensor, spp) as wrapper, sample_count(wrapper.sampler(), spp), garbage_kept():
         integrator = _feature_integrator(mi.variant(), hide_emitters)
         mi.render(scene, sensor=wrapper, integrator=integrator, spp=spp, seed=seed)
         planes, names = planes_of(sensor.film().bitmap())

@@ -136,6 +136,15 @@ def colour_indices(channels, layer=""):
     return [list(channels).index(layer + name) for name in _colour_names(channels, layer)]
 
 
+def check_colour(channels, purpose):
+    """Raise ValueError if there are no channels of a colour among `channels`, which the `purpose` needs."""
+    try:
+        _colour_names(channels)
+    except ValueError as error:
+        allowed = ", ".join(COLOURS)
+        raise ValueError(f"{purpose} needs an image with colour ({allowed}), such as of a hdrfilm: {error}") from None
+
+
 def colour(image, channels, layer=""):
     """Return the colour (height, width, 3) of an image: channels R, G and B (of a layer such as "se."), computed from
     X, Y and Z, or three times Y. Raises ValueError if the image has none of them."""

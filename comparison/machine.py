@@ -14,7 +14,7 @@ SOURCES = (
     "comparison/worker.py", "comparison/rendering.py", "comparison/single_pass.py", "comparison/measuring.py",
     "comparison/pass_sizes.py", "comparison/timed_sizes.py", "comparison/sample_density.py", "comparison/features.py",
     "comparison/fine_film.py", "comparison/denoising.py", "comparison/detail.py", "comparison/scene_files.py",
-    "comparison/convergence.py",
+    "comparison/convergence.py", "comparison/images.py", "comparison/counters.py",
 )  # fmt: skip
 
 

@@ -33,7 +33,7 @@ def measure(progressive, job):
         _render_in_time(progressive, job.budget)
         return cold
     if job.spp:
-        sizes = pass_sizes(job.spp, job.pass_spp or progressive.largest_pass)
+        sizes = _sizes_of_samples(progressive, job)
         cold = _compile(progressive, sizes, unused)
         progressive.restart()
         for spp in sizes:
@@ -53,6 +53,15 @@ def measure(progressive, job):
     return cold
 
 
+def _sizes_of_samples(progressive, job):
+    """Return the sizes of the passes of a job with a number of samples per pixel: the largest that the sampler keeps,
+    as samples that it adds would not be those of the job."""
+    largest, least = job.pass_spp or progressive.largest_pass, progressive.parts**2
+    while not job.pass_spp and least < largest < job.spp and not progressive.accepts(largest):
+        largest -= 1
+    return pass_sizes(job.spp, largest)
+
+
 def _render_in_time(progressive, budget, seeds=None):
     """Render passes in parts within a `budget` in seconds, of the sizes that `render` uses with a limit of time."""
     sizes = sizes_of(progressive, time=budget)
@@ -64,7 +73,7 @@ def _render_in_time(progressive, budget, seeds=None):
 def _render_cold(progressive, job):
     """Render the passes of a job from the first; with a time budget, double their sizes while the budget allows."""
     if job.spp:
-        for spp in pass_sizes(job.spp, job.pass_spp or progressive.largest_pass):
+        for spp in _sizes_of_samples(progressive, job):
             progressive.render(spp)
         return
     first = WARM_SPP if WARM_SPP * progressive.pixels <= FIRST_SAMPLES else 1
@@ -120,18 +129,15 @@ def _samples_of_a_pass(progressive, budget, seeds):
     """Return the samples per pixel of each pass of a budget, from trial passes, and the seconds to start a pass.
 
     Aims at `PASSES_IN_BUDGET` passes, or fewer if starting them (each pass traces VPLs and builds trees) would take
-    more than `START_SHARE` of the budget. If one sample already takes half of the budget, returns one sample and an
-    unknown start of 0 s.
+    more than `START_SHARE` of the budget. If one sample already takes half of the budget, or a pass may have no more,
+    returns one sample and an unknown start of 0 s.
     """
-    largest = progressive.largest_pass
-    if largest < WARM_SPP * progressive.parts**2:
-        return progressive.parts**2, 0.0
-    one = progressive.render(1, next(seeds))
-    if one.seconds > budget / 2:
-        return one.spp, 0.0
+    largest, one = progressive.largest_pass, progressive.render(1, next(seeds))
     # A fine film has more than one sample for a pixel
-    few = WARM_SPP * one.spp
-    for spp in (few, few + 1):
+    few = min(WARM_SPP * one.spp, largest)
+    if one.seconds > budget / 2 or few <= one.spp:
+        return one.spp, 0.0
+    for spp in dict.fromkeys((few, min(few + 1, largest))):
         progressive.render(spp, next(seeds))  # compiles
     more = progressive.render(few, next(seeds))
     each = max(more.seconds - one.seconds, 0.01 * one.seconds) / (more.spp - one.spp)

@@ -13,6 +13,7 @@ from .occasional import OccasionalWriter
 from .progress import ImageBar
 from .render import DENOISING, render
 from .scene_files import SceneFile
+from .single_pass import expected_channels
 
 WRITE_SECONDS = 10.0  # between writes of the unfinished image
 INTERRUPTED = 130  # exit status
@@ -70,7 +71,8 @@ class Image:
                 "seed": options.seed,
                 **machine.software(),
             }
-            self._checkpoint = Checkpoint(file_of(self.path), made_by, options.resume)
+            # Until the image is written
+            self._checkpoint = Checkpoint(file_of(self.path), made_by, options.resume, stays=True)
         if pool:
             from .cluster.render import DistributedRender
 
@@ -87,7 +89,7 @@ class Image:
         try:
             with interruptions_kept():
                 if not self._remote:
-                    self._scene.get()
+                    self._check_file(self._scene.get())
                 output.metadata = self._described | {"load_seconds": self._scene.seconds, **command_line.versions()}
                 image, took = self._render(output)
         except KeyboardInterrupt:
@@ -98,6 +100,8 @@ class Image:
         if took.ended_by == "interruption":
             return output.end_early()
         output.write()
+        if self._checkpoint:
+            self._checkpoint.remove()
         print(
             f"{self.path}: {self._name}, {took.spp} samples per pixel, {took.seconds:.2f} s{self._error(took)}, ended "
             f"by {took.ended_by}"
@@ -109,6 +113,12 @@ class Image:
         if took.error is None:
             return ", error unknown (one pass)" if self._options.error else ""
         return f", error {took.error:.2%}"
+
+    def _check_file(self, scene):
+        """Raise ValueError before the render if its images have no colour for a PNG file."""
+        if self.path.suffix == ".png":
+            channels = expected_channels(scene.sensors()[self._sensor], self._scene.integrator)
+            images.check_colour(channels, f"'{self.path}'")
 
     def _limits(self):
         return {name: getattr(self._options, name) for name in ("error", "time", "spp", "seed", "pass_spp")}
@@ -157,7 +167,10 @@ class Output:
         self._writer = OccasionalWriter("The image so far", WRITE_SECONDS)
 
     def keep(self, took, image):
-        """Take an image, and write it from time to time."""
+        """Take an image, and write it from time to time. Raises ValueError for a PNG file without colour."""
+        if self.path.suffix == ".png":
+            # The first image by workers, as only they have the scene
+            images.check_colour(took.channels, f"'{self.path}'")
         self._image, self._took = np.array(image), took
         self._writer.offer(self.write)
 

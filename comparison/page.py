@@ -17,21 +17,28 @@ SCRIPTS = ("pixels.js", "pointer.js", "tiles.js", "viewer.js", "keys.js")
 KINDS = {"relative": "relative error", "signed": "signed error", "distance": "distance × 16", "flip": "FLIP"}
 
 
-def render(results, pictures, reference_text):
-    """Return the page for the content of `results.json` and the `Pictures` (or None) of each scene."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(PARTS), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.get_template("report.html.jinja").render(
+def section(scene, pictures, results, reference_text):
+    """Return the section of a scene, whose entry in the content of `results.json` is `scene`. `pictures`: its
+    `Pictures`, or None."""
+    return _template("scene.html.jinja").render(
         results=results,
-        summary=_summary(results),
-        warnings=_warnings(results),
-        scenes=[_scene(*pair, results) for pair in zip(results["scenes"], pictures, strict=True)],
+        scene=_scene(scene, pictures, results),
         columns=tables.COLUMNS,
-        explanation=tables.EXPLANATION,
         reference_text=reference_text,
         embedded=embedded,
         kinds=KINDS,
+        metric=plots.ERRORS[results["metrics"]["compared"]],
+    )
+
+
+def render(results, sections):
+    """Return the page for the content of `results.json` and the `section` of each scene."""
+    return _template("report.html.jinja").render(
+        results=results,
+        sections=sections,
+        summary=_summary(results),
+        warnings=_warnings(results),
+        explanation=tables.EXPLANATION,
         metric=plots.ERRORS[results["metrics"]["compared"]],
         error_range=[f"{value:.0%}" for value in images.ERROR_RANGE],
         false_colours=", ".join(f"rgb{tuple(map(int, stop))}" for stop in images.FALSE_COLOURS),
@@ -39,6 +46,12 @@ def render(results, pictures, reference_text):
         script="\n".join((PARTS / name).read_text() for name in SCRIPTS),
         style=(PARTS / "report.css").read_text(),
     )
+
+
+def _template(name):
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(PARTS), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    ).get_template(name)
 
 
 def _scene(scene, pictures, results):

@@ -7,7 +7,6 @@ import time as clock
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from numbers import Integral, Real
 from typing import Any
 
 import mitsuba as mi
@@ -21,12 +20,14 @@ from .batch import ALL
 from .checkpoint import Checkpoint
 from .counters import TotalStatistics
 from .denoising import Denoiser, for_denoising, quality_of
-from .ending import Ending
+from .ending import Ending, checked
 from .features import channels_of, check_layers, hides_emitters, layers_of
 from .fine_film import usual_parts
+from .images import check_colour
 from .interruption import Interruption, is_interruption
 from .rendering import Progressive
 from .scene_files import SceneFile
+from .single_pass import expected_channels
 from .timed_sizes import sizes_of
 
 LIMITS = ("spp", "time")  # end a render regardless of its error
@@ -100,17 +101,18 @@ def render(
     `progress`: called after each pass with the cost and the image so far, and before denoising with None for the image;
     integrators of this project also call it so at the start of each stage of a pass. If it returns False, no other pass
     begins; an exception ends the render at once. `pass_spp`: samples per pixel of a pass. `checkpoint`: a
-    `checkpoint.Checkpoint` of the same render with one sensor, whose samples and seconds count; it is kept unless a
-    limit ends the render. `layers`: names of features.py, "albedo", "normal", "depth", for channels such as "albedo.R".
+    `checkpoint.Checkpoint` of the same render with one sensor, whose samples and seconds count; it is removed at the
+    end of a render that reaches a limit. `layers`: names of features.py, "albedo", "normal", "depth", for channels such
+    as "albedo.R".
 
     Ctrl-C, or `cancel()` of the integrator, returns the image of the finished passes. Without a finished pass Ctrl-C
     raises KeyboardInterrupt and `cancel()` RuntimeError. A second Ctrl-C raises KeyboardInterrupt.
 
-    Raises ValueError for limits that are not positive, for another `denoise` or other `layers`, for a sensor that does
-    not exist, for a scene without an integrator, for a participating medium that the integrator does not support, and
-    for channels in `layers` that the integrator has; FileNotFoundError for a missing scene file; ModuleNotFoundError if
-    the package for `denoise` is missing; RuntimeError if another thread renders with the same sensor, or if no variant
-    is set.
+    Raises ValueError for limits that are not positive, for another `denoise` or other `layers`, for `denoise` with a
+    film without colour, for a sensor that does not exist, for a scene without an integrator, for a participating medium
+    that the integrator does not support, and for channels in `layers` that the integrator has; FileNotFoundError for a
+    missing scene file; ModuleNotFoundError if the package for `denoise` is missing; RuntimeError if another thread
+    renders with the same sensor, or if no variant is set.
     """
     quality, _ = quality_of(denoise), channels_of(layers)
     scene = _scene(scene)
@@ -130,6 +132,8 @@ def render(
     if error is None and time is None and spp is None:
         spp = scene.sensors()[sensor].sampler().sample_count()
     begin = clock.perf_counter()
+    if denoise:
+        check_colour(expected_channels(scene.sensors()[sensor], integrator), "denoise")
     # Passes of a checkpoint have the usual resolution, as the choice depends on times
     parts = 1 if checkpoint or not denoise else usual_parts(scene.sensors()[sensor], integrator, spp)
     of_image = {"seed": seed, "spp": spp, "time_limit": time, "hide_emitters": hides_emitters(integrator)}
@@ -182,19 +186,10 @@ def render_passes(progressive, sizes, ending, begin, progress=None, denoiser=Non
         running.run(sizes, interruption)
     if not progressive.passes:
         raise KeyboardInterrupt if interruption.asked else RuntimeError("cancelled before the first pass was finished")
-    return running.result(denoiser)
-
-
-def checked(**values):
-    """Return limits of a render by name as numbers of Python, as those of NumPy would overflow. Raises ValueError for
-    limits that are neither positive nor None."""
-    numbers = []
-    for name, value in values.items():
-        kind, number = (Integral, int) if name.endswith("spp") else (Real, float)
-        if value is not None and not (isinstance(value, kind) and 0 < value < float("inf")):
-            raise ValueError(f"{name} must be a positive {'whole ' if kind is Integral else ''}number, got {value!r}")
-        numbers.append(None if value is None else number(value))
-    return numbers
+    image, took = running.result(denoiser)
+    if checkpoint and took.ended_by in (*LIMITS, "error"):
+        checkpoint.finish()
+    return image, took
 
 
 def _scene(scene):
@@ -234,17 +229,16 @@ class _Render:
         self._checkpoint, self._layers = checkpoint, layers
         self._error, self._ended_by, self._statistics = None, None, TotalStatistics()
         self._raised = None
-        if ending.goal:
-            ending.goal.resume(progressive.passes)
+        if ending.goal and ending.goal.resume(progressive.passes):
+            # The checkpoint may be of a render that reached its error, and whose image was lost
+            self._judge()
 
     def run(self, sizes, interruption):
-        """Render passes until the end; leave a checkpoint of an unfinished render."""
+        """Render passes until the end; leave a checkpoint, as there is no image yet."""
         try:
             self._run(sizes, interruption)
         finally:
-            if self._checkpoint and self._ended_by in (*LIMITS, "error"):
-                self._checkpoint.remove()
-            elif self._checkpoint:
+            if self._checkpoint:
                 self._checkpoint.leave()
 
     def _run(self, sizes, interruption):
@@ -304,12 +298,16 @@ class _Render:
         if self._checkpoint:
             self._checkpoint.keep(self._elapsed())
         if goal and goal.is_due(self.progressive):
-            self._error = self.progressive.error()
-            self._ending.look(self._error, spp)
-            if goal.is_reached(self._error):
-                self._ended_by = "error"
+            self._judge()
         if self._progress:
             self._tell(self._took(), self._image())
+
+    def _judge(self):
+        """Estimate the error, which may end the render."""
+        self._error = self.progressive.error()
+        self._ending.look(self._error, self.progressive.spp)
+        if self._ending.goal.is_reached(self._error):
+            self._ended_by = "error"
 
     def result(self, denoiser):
         """Return the image and the cost; warn if the error was not reached."""

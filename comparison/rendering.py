@@ -243,8 +243,11 @@ class Progressive(Passes):
 
     @property
     def largest_pass(self):
-        """Maximum samples per pixel of a pass."""
-        return largest_pass(self.pixels, self.in_parts)
+        """Maximum samples per pixel of a pass, whatever its time."""
+        # Plugins of this project tell how they render, and most of them store what the samples share. The others are
+        # Mitsuba's; in comparisons, whose integrators have no nested ones, their passes are single kernels
+        in_one_kernel = not hasattr(self.integrator, "renders_in_parts")
+        return largest_pass(self.pixels, self.in_parts, in_one_kernel)
 
     @property
     def pixels(self):

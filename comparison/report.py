@@ -73,15 +73,18 @@ def _limit_text(scene):
     return ""
 
 
-def write(folder, results, pictures):
-    """Write `results.json` and `report.html` to a folder. `pictures`: the `Pictures` (or None) of each scene."""
+def write(folder, results, pictures, finished=()):
+    """Write `results.json` and `report.html` to a folder; return the sections of the page. `pictures`: the `Pictures`
+    (or None) of each scene; `finished`: sections of the first scenes, as an earlier call returned them."""
     from . import page  # needs matplotlib, an optional package
 
-    folder = Path(folder)
+    folder, scenes = Path(folder), list(zip(results["scenes"], pictures, strict=True))
     with images.replacing(folder / "results.json") as file:
         file.write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
+    sections = [*finished, *(page.section(*one, results, reference_text) for one in scenes[len(finished) :])]
     with images.replacing(folder / "report.html") as file:
-        file.write_text(page.render(results, pictures, reference_text), encoding="utf-8")
+        file.write_text(page.render(results, sections), encoding="utf-8")
+    return sections
 
 
 def _has_vpl(render):

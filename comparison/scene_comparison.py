@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from . import analysis, images, metrics, paper_tables, references, tables, worker
-from .command_line import failure, own_integrators
+from .command_line import failure
 from .pictures import REFERENCE, Pictures
-from .scene_files import SceneFile, short_name
+from .scene_files import SceneFile, known_parameters, short_name
 from .sweeps import order
 from .verdict import denoised_label
 
@@ -185,9 +185,8 @@ class SceneComparison:
 
     def _job(self, setting, seed):
         options, name = self.options, self.result["name"]
-        # `vpl` cannot share the lights of Mitsuba's integrators, which have none, or of `manylights`
-        shares = setting.integrator in own_integrators() and setting.integrator != "manylights"
-        with_vpl = options.reference.kind == "vpl" and shares
+        # Other integrators have no lights that `vpl` could share, or, as `manylights`, choose them by themselves
+        with_vpl = options.reference.kind == "vpl" and known_parameters(setting.integrator, {"vpl_count": 1})
         of_seed = f".seed{seed}" if len(options.seeds) > 1 else ""
         denoised = options.out / f"{name}.{setting.file_name}.denoised{of_seed}.exr"
         job = worker.Job(

@@ -178,24 +178,25 @@ def render(job):
     return result | {"vpl_output": _render_vpl(job, progressive, described) if job.vpl_folder else None}
 
 
-def _denoiser(scene, job, parts):
-    """Return the `Denoiser` for the image of a job; `parts`: see there."""
+def _denoiser(scene, job, parts, like=None):
+    """Return the `Denoiser` for the image of a job; `parts`, `like`: see there."""
     return Denoiser(
         scene, seed=job.seed, spp=None if job.budget else job.spp, time_limit=job.budget, parts=parts,
-        hide_emitters=hides_emitters(scene.integrator()),
+        hide_emitters=hides_emitters(scene.integrator()), like=like,
     )  # fmt: skip
 
 
 def _denoise(job, scene, progressive, denoiser, described):
-    """Write the image denoised by a `denoiser`, if requested; return the times of this and of another denoiser."""
+    """Write the image denoised by another denoiser that decides as a `denoiser` did, if requested; return the times of
+    both, as the first one compiles."""
     if not denoiser:
         return {"denoise_seconds": None, "cold_denoise_seconds": None}
     seconds = []
-    for one in (denoiser, _denoiser(scene, job, denoiser.parts)):
+    for one in (denoiser, _denoiser(scene, job, denoiser.parts, denoiser)):
         begin = time.perf_counter()
         image = one.denoise_passes(progressive)
         seconds.append(one.start_seconds + time.perf_counter() - begin)
-    described = described | {"run": job.run or "", "denoise_seconds": seconds[1]} | denoiser.description
+    described = described | {"run": job.run or "", "denoise_seconds": seconds[1]} | one.description
     images.write_exr(job.denoised_output, image, progressive.channels, described)
     return {"denoise_seconds": seconds[1], "cold_denoise_seconds": seconds[0]}
 

@@ -199,10 +199,10 @@ class GatheringIntegrator(mi.SamplingIntegrator):
         if emitters.count == 0:
             mi.Log(mi.LogLevel.Warn, "The scene has no emitters: the image will be black.")
         clock.begin(Stage.GATHER)
-        skip = self.skip_area_emitters if self.hide_emitters else None
         paths = follow_camera_rays(
-            scene, emitters, traits, sampler, seed, ray, active, self.max_depth, self.rr_depth, skip, self.along_curve
-        )
+            emitters, traits, sampler, seed, ray, active, self.max_depth, self.rr_depth, self.hide_emitters,
+            self.along_curve,
+        )  # fmt: skip
         clock.stop()
         sky = emitters.environment is not None and not self.hide_emitters
         return CameraPass(seed, emitters, traits, paths, paths.valid | (active & sky), clock)

@@ -4,10 +4,12 @@ import math
 import time as clock
 
 from ..denoising import Denoiser, quality_of
-from ..ending import Ending
+from ..ending import Ending, checked
 from ..features import check_layers, hides_emitters, layers_of
+from ..images import check_colour
 from ..pass_sizes import PassSizes
-from ..render import checked, render_passes
+from ..render import render_passes
+from ..single_pass import expected_channels
 from .passes import DistributedPasses, samples_of_a_pass
 from .pool import TASKS_PER_WORKER
 from .scene_travel import bundle
@@ -55,6 +57,8 @@ class DistributedRender:
             scene = self._scene.get() if denoise or layers else None
             if layers:
                 check_layers(layers, self._scene.integrator)
+            if denoise:
+                check_colour(expected_channels(scene.sensors()[self._sensor], self._scene.integrator), "denoise")
             of_image = {"seed": self._seed, "spp": self.spp, "time_limit": self._time}
             if scene:
                 of_image["hide_emitters"] = hides_emitters(self._scene.integrator)

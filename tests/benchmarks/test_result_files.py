@@ -94,6 +94,12 @@ def test_parts_write_their_rows(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
 
 
+def test_rows_of_an_interrupted_run_become_no_result(tmp_path):
+    (tmp_path / "a.json.partial").write_text("{}")
+    results.run_parts(parsed("--json", tmp_path / "a.json", "--parts", "cold"), {"cold": lambda: iter(())}, {})
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_variance_needs_two_passes():
     """The benchmark tells before it renders."""
     file = results.ROOT / "benchmarks" / "manylights.py"

@@ -1,16 +1,20 @@
 """compare.py and its parts: scene files, passes, workers, the command."""
 
+import ast
 import html
 import json
 import re
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
 import compare
-from comparison import counters, images, rendering, single_pass, worker
+from comparison import counters, images, machine, rendering, single_pass, worker
+from comparison.scene_comparison import SceneComparison
 from comparison.scene_files import SceneFile
+from integrators import PLUGINS
 from tests.support.paths import CORNELL, ROOT
 from tests.support.scenes import cornell
 
@@ -303,6 +307,32 @@ def test_manylights_shares_no_lights_with_vpl(tmp_path, capsys):
     assert status == 0, capsys.readouterr().out
     ours, vpl = json.loads((tmp_path / "results.json").read_text())["scenes"][0]["renders"]
     assert "errors" not in ours and vpl["errors"]["relative_l1"] < 1e-4
+
+
+def test_runs_depend_on_every_module_of_a_worker():
+    """Modules that make no image: the command line, and what describes the machine."""
+    found, seen = ["worker"], set()
+    while found:
+        name = found.pop()
+        seen.add(name)
+        for node in ast.walk(ast.parse((ROOT / "comparison" / f"{name}.py").read_text())):
+            if isinstance(node, ast.ImportFrom) and node.level == 1:
+                names = [node.module] if node.module else [alias.name for alias in node.names]
+                found += {*names} - seen
+    others = {"command_line", "interruption", "machine"}
+    assert {f"comparison/{name}.py" for name in seen - others} <= set(machine.SOURCES)
+    assert others <= seen and all(list(ROOT.glob(pattern)) for pattern in machine.SOURCES)
+
+
+def test_only_integrators_with_virtual_lights_share_them_with_vpl(tmp_path):
+    """Direct light is not judged by global illumination."""
+    named = ",".join(("path", *PLUGINS))
+    options = compare.parse([CORNELL, "-i", named, "--spp", "1", "--reference", "vpl", "-o", str(tmp_path)])
+    store = SimpleNamespace(kernels=tmp_path, key=lambda *_: "run")
+    comparison = SceneComparison(CORNELL, compare.chosen_settings(options), options, store, None)
+    comparison.result["hash"] = "scene"
+    sharing = {label for label, (one,) in comparison.settings.items() if comparison._job(one, 0).vpl_folder}
+    assert sharing == {"vpl", "lightcuts", "mdlightcuts", "lightslice", "matrixrecovery", "illuminationcut"}
 
 
 def test_demo_compares_path_and_manylights():

@@ -11,7 +11,8 @@ import pytest
 
 import compare
 import manylights
-from comparison import images
+from benchmarks.denoised import _warm_denoiser
+from comparison import images, worker
 from comparison import render as rendering_module
 from comparison.denoising import Denoiser
 from tests.support.comparisons import results_of
@@ -339,6 +340,43 @@ def test_copies_are_mirrored_back_and_averaged(monkeypatch):
         # A network that is asked for has one copy
         alone = found.denoise(image, ["R", "G", "B"], "fast")
         np.testing.assert_allclose(alone, np.roll(given, moves[0], (0, 1)), rtol=1e-5)
+
+
+def slower_from_the_second_on(monkeypatch):
+    """Let denoisers after the first one measure that networks take a thousand times as long."""
+    denoisers, seconds_of = [], Denoiser._seconds_of
+
+    def measured(self, inputs, quality):
+        if self not in denoisers:
+            denoisers.append(self)
+        return seconds_of(self, inputs, quality) * (1 if self is denoisers[0] else 1000)
+
+    monkeypatch.setattr(Denoiser, "_seconds_of", measured)
+
+
+def test_a_denoiser_may_decide_as_another_one(monkeypatch):
+    slower_from_the_second_on(monkeypatch)
+    scene = cornell(64).load()
+    first = Denoiser(scene, time_limit=1.0, parts=2)
+    like, alone = Denoiser(scene, time_limit=1.0, like=first), Denoiser(scene, time_limit=1.0, parts=2)
+    decisions = [(one.parts, one.quality, one.copies, one.restores) for one in (first, like, alone)]
+    assert first.parts == 2 and decisions[0] == decisions[1] != decisions[2]
+    assert like.features["albedo"].shape == (128, 128, 3)
+
+
+def test_a_run_is_denoised_as_its_first_denoiser_decided(tmp_path, monkeypatch):
+    """The second one, whose time is told, makes the image."""
+    slower_from_the_second_on(monkeypatch)
+    files = [str(tmp_path / name) for name in ("a.exr", "a.denoised.exr")]
+    job = worker.Job("p", "path", CORNELL, files[0], width=64, budget=1.0, denoised_output=files[1])
+    worker.render(job)
+    found = images.read_exr_metadata(files[1])
+    assert found["denoise_resolution"] == 2 and found["denoise_quality"] == "high"
+
+
+def test_the_benchmark_denoises_as_its_first_denoiser_decided(monkeypatch):
+    slower_from_the_second_on(monkeypatch)
+    assert _warm_denoiser(cornell(64).load(), 1.0, 2).parts == 2
 
 
 def test_the_smallest_image_in_the_shortest_time():

@@ -137,6 +137,18 @@ def test_features_of_more_samples_are_those_of_fewer_with_less_noise(monkeypatch
         assert max(others) < 0.5 * first < 0.05
 
 
+@pytest.mark.parametrize("kind", ["independent", "multijitter"])
+def test_features_leave_the_scenes_samples_as_they_were(kind):
+    """Those of its own sampler, and of a sensor that is not replaced."""
+    file = cornell(16)
+    file.set_sampler(kind)
+    scene = file.load()
+    sampler = scene.sensors()[0].sampler()
+    before = sampler.sample_count()
+    features.auxiliary_features(scene, scene.sensors()[0], 16, 0)
+    assert sampler.sample_count() == before != 16
+
+
 @pytest.mark.parametrize(
     ("pixels", "sizes"),
     [(256 * 144, [64, 64]), (1920 * 1080, [16] * 8), (3840 * 2160, [4] * 32), (7680 * 4320, [1] * 128)],

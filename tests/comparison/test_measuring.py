@@ -1,5 +1,8 @@
 """Passes of an image for a time budget or a number of samples, and the measured passes among them."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import mitsuba as mi
 import pytest
 
@@ -15,7 +18,7 @@ class Recorded(rendering.Progressive):
         self._pixels, self._seconds, self._start, self.asked = pixels, list(seconds), start, []
         self.restart()
 
-    pixels, integrator = property(lambda self: self._pixels), None
+    pixels, integrator = property(lambda self: self._pixels), SimpleNamespace(renders_in_parts=False)
     _denoise, _rays, differs, parts = None, {}, False, 1
 
     def render(self, spp, seed=None, is_probe=False, is_last=False):
@@ -23,6 +26,9 @@ class Recorded(rendering.Progressive):
         seconds = self._seconds.pop(0) if self._seconds else self._start + spp
         self.passes.append(single_pass.Pass(seed or 0, spp, seconds))
         return self.passes[-1]
+
+    def accepts(self, spp):
+        return True
 
 
 def test_kernels_of_every_size_of_pass_are_compiled_before_the_clock_runs():
@@ -37,9 +43,6 @@ class InParts(Recorded):
     """The same in parts, with a pilot of two seconds in the first pass after a restart."""
 
     in_parts = True
-
-    def accepts(self, spp):
-        return True
 
     def render(self, spp, seed=None, is_probe=False, is_last=False):
         self.asked.append((spp, seed is not None))
@@ -134,6 +137,48 @@ def test_passes_are_as_large_as_the_cost_of_starting_one_asks_for(budget, start,
     progressive = Recorded(single_pass.MAXIMUM_PASS_SAMPLES // 2048, start=float(start))
     measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget))
     assert [one.spp for one in progressive.passes] == passes and abs(progressive.seconds - budget) <= 2
+
+
+def test_integrators_of_mitsuba_have_larger_passes_than_those_that_store_points():
+    scene = cornell(16).load()
+    largest = {
+        name: rendering.Progressive(scene, 0, integrator=mi.load_dict({"type": name})).largest_pass
+        for name in ("path", "volpath", "manylights", "lightcuts")
+    }
+    assert largest == {"path": 2**16, "volpath": 2**16, "manylights": 2**15, "lightcuts": 2**13}
+
+
+class InOneKernel(Recorded):
+    """The same by an integrator of Mitsuba."""
+
+    integrator = None
+
+
+@pytest.mark.parametrize(("budget", "start", "passes"), [(60, 0, [18, 18, 18, 6]), (30, 4, [11, 11]), (30, 15, [1, 1])])
+def test_passes_of_large_images_by_mitsuba_have_many_samples(budget, start, passes):
+    """Those of a single sample would not be stratified, and pay each start."""
+    progressive = InOneKernel(1280 * 720, start=float(start))
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=budget))
+    assert [one.spp for one in progressive.passes] == passes
+
+
+@pytest.mark.parametrize(("largest", "passes"), [(3, [3, 3, 3]), (2, [2, 2, 2, 2]), (1, [1, 1, 1, 1, 1])])
+def test_passes_that_memory_limits_to_few_samples_have_all_of_them(largest, passes):
+    progressive = Recorded(single_pass.MAXIMUM_PASS_SAMPLES // largest, start=2.0)
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", budget=15.0))
+    assert [one.spp for one in progressive.passes] == passes
+    assert max(spp for spp, _ in progressive.asked) == largest
+
+
+def test_passes_of_a_number_of_samples_have_sizes_that_the_sampler_keeps():
+    file = cornell(16)
+    file.set_sampler("multijitter")
+    progressive = rendering.Progressive(file.load(), 0)
+    job = worker.Job("p", "path", "s.xml", "a.exr", spp=64)
+    for largest, sizes in ((18, [16] * 4), (64, [64]), (100, [64])):
+        progressive.__class__ = type("Limited", (rendering.Progressive,), {"largest_pass": largest})
+        assert measuring._sizes_of_samples(progressive, job) == sizes
+    assert measuring._sizes_of_samples(progressive, replace(job, pass_spp=18)) == [18, 18, 18, 10]
 
 
 def test_passes_may_turn_out_to_be_slower_or_faster():

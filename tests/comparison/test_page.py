@@ -5,12 +5,17 @@ import json
 import re
 import xml.etree.ElementTree
 import zlib
+from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from comparison import images, page_images, report
+import compare
+from comparison import images, page_images, report, worker
+from comparison import page as page_module
 from tests.support import chromium
+from tests.support.paths import CORNELL
 
 
 def results_of(out):
@@ -94,6 +99,24 @@ def test_page_escapes_what_it_is_given(tmp_path, swept):
     results["command"] = "compare.py </script><script>alert(1)</script>"
     report.write(tmp_path, results, [None])
     assert "alert(1)</script>" not in (tmp_path / "report.html").read_text()
+
+
+def test_sections_of_finished_scenes_are_made_once(tmp_path, monkeypatch):
+    """The page is written after each scene."""
+    made, shown = [], page_module._scene
+    monkeypatch.setattr(page_module, "_scene", lambda scene, *more: made.append(scene["name"]) or shown(scene, *more))
+    failed = {"error": "no renderer", "traceback": "", "load_average": 0.0}
+    monkeypatch.setattr(worker, "run", lambda job, tick: asdict(job) | failed)
+    for name in ("a.xml", "b.xml"):
+        (tmp_path / name).write_text(Path(CORNELL).read_text())
+    scenes = [str(tmp_path / name) for name in ("a.xml", "b.xml")]
+    assert compare.main([*scenes, "-i", "path", "--spp", "1", "--reference", "vpl", "-o", str(tmp_path)]) == 1
+    assert made == ["a", "b"]
+    written = (tmp_path / "report.html").read_text()
+    assert re.findall(r"<h2>(\w)</h2>", written) == made and written.count("Failed: no renderer") == 2
+    results = results_of(tmp_path)
+    report.write(tmp_path, results, [None, None])
+    assert (tmp_path / "report.html").read_text() == written
 
 
 @pytest.fixture(scope="module")

@@ -137,6 +137,24 @@ def test_time_left_is_that_of_the_same_settings(monkeypatch):
     progress.close()
 
 
+def test_time_left_is_found_by_sums_and_only_where_somebody_watches(monkeypatch):
+    """The progress is updated twice a second beside a measured run."""
+    found = settings("path:spp=1,2", "cuts:error=0.2")
+    progress = Progress(["a.xml"], sweeps.order(found, range(1000)))
+    for seed in range(500):
+        for setting in (*found["path"], *found["cuts"]):
+            progress.begin("a.xml", setting)
+            progress.end(kept=seed % 2 > 0)
+    asked, expected = [], progress._expected
+    monkeypatch.setattr(progress, "_expected", lambda run: asked.append(run) or expected(run))
+    progress.seconds_left()
+    assert len(asked) == 3 and len(progress._took) == 6
+    asked.clear()
+    progress.tick()
+    assert progress._bar.disable and not asked
+    progress.close()
+
+
 # --- Runs that are kept ---
 
 

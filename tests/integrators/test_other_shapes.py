@@ -9,7 +9,7 @@ import pytest
 from tests.support.catalogue import EMITTERS, stage
 from tests.support.marks import stress
 from tests.support.rendering import render
-from tests.support.scenes import area_light, closed_box
+from tests.support.scenes import area_light, closed_box, rgb, sensor, wall
 from tests.support.statistics import relative_error
 
 
@@ -71,3 +71,14 @@ def test_another_scene_is_lit_while_a_curve_is_alive(name, tmp_path):
     found, expected = (render(scene, plugin, 256, max_depth=2, hide_emitters=True).mean() for plugin in (name, "path"))
     assert found == pytest.approx(expected, rel=0.03)
     assert len(alive.shapes()) == 3
+
+
+@pytest.mark.parametrize("name", ["manylights", "vpl", "adaptivedirect"])
+def test_balls_behind_hidden_emitters_keep_their_place(name):
+    """The distance to the ball is that from the camera, not from the hidden lamp."""
+    bulb = {"type": "point", "position": [3, 3, 3], "intensity": rgb(20.0)}
+    scene = {"type": "scene", "sensor": sensor(12, 4, fov=40), "ball": {"type": "sphere", "radius": 0.8}, "bulb": bulb}
+    lamp = wall([0, 0, 1.5], [0, 1, 0], 0, 0.3) | {"emitter": {"type": "area", "radiance": rgb(1e-6)}}
+    plugin = mi.load_dict({"type": name, "max_depth": 2, "hide_emitters": True})
+    found, expected = (render(mi.load_dict(one), plugin, 64) for one in (scene | {"lamp": lamp}, scene))
+    assert relative_error(found, expected) < 0.1

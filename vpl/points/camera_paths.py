@@ -201,36 +201,53 @@ def emitted_towards(emitters: Emitters, si, active=True):
     return emission
 
 
-def _surfaces(scene, traits: SceneTraits, ray, coherent, skip, active):
-    """The nearest surfaces on rays; ``skip``: see :func:`follow_camera_rays`."""
-    if skip is None:
-        return traits.interactions.meet(ray, active, coherent)
-    return traits.interactions.at(skip(scene, ray, True, active), ray, active)
+def _surfaces(traits: SceneTraits, ray, coherent, hides: bool, active):
+    """The nearest surfaces on rays; ``hides``: the nearest ones that are no emitters."""
+    return _behind_emitters(traits, ray, active) if hides else traits.interactions.meet(ray, active, coherent)
+
+
+@dr.syntax
+def _behind_emitters(traits: SceneTraits, ray, active):
+    """The nearest surfaces on rays that are no emitters.
+
+    Mitsuba's `skip_area_emitters` returns distances from the last emitter.  With the camera's ray, as `path` of Mitsuba
+    3.9.1 uses them, spheres, disks and cylinders behind emitters have wrong positions.
+    """
+    ray, going = mi.Ray3f(ray), mi.Bool(active)
+    found = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
+    while dr.hint(going, exclude=[traits]):
+        si = traits.interactions.meet(ray, going)
+        found = dr.select(going, si, found)
+        going &= si.is_valid() & si.shape.is_emitter()
+        ray = dr.select(going, si.spawn_ray(ray.d), ray)
+    return found
 
 
 def _wave(
-    scene, emitters: Emitters, traits: SceneTraits, random, ray, throughput, depth, limits: PathLimits, skip, active
+    emitters: Emitters, traits: SceneTraits, random, ray, throughput, eta, depth, limits: PathLimits, hides: bool,
+    active,
 ):  # fmt: skip
     """One edge of the camera paths, evaluated in one kernel.
 
-    ``skip``: None, or a function that intersects rays with non-emitting surfaces only (hidden emitters).  Returns
-    emission, hit mask, mask of hits that may be passed unscattered, (gather mask, surface interaction, weight), (mask,
-    ray, throughput) of continuing paths.
+    ``hides``: whether emitters are hidden; ``eta``: product of the relative indices of refraction of the edges before.
+    Returns emission, hit mask, mask of hits that may be passed unscattered, (gather mask, surface interaction, weight),
+    (mask, ray, throughput, product of the indices) of continuing paths.
     """
-    si = _surfaces(scene, traits, ray, depth == 1, skip, active)
+    si = _surfaces(traits, ray, depth == 1, hides, active)
     hit = active & si.is_valid()
     emission = dr.zeros(mi.UnpolarizedSpectrum, dr.width(ray.d))
-    if skip is None:
+    if not hides:
         emission = throughput * emitted_towards(emitters, si, active)
 
     bsdf = si.bsdf(ray)
     flags = bsdf.flags()
     goes_on, stays, smooth_weight = mi.Bool(False), mi.Bool(True), mi.Float(1)
-    direction, following, eta = mi.Vector3f(0, 0, 1), mi.UnpolarizedSpectrum(0), mi.Float(1)
+    direction, following = mi.Vector3f(0, 0, 1), mi.UnpolarizedSpectrum(0)
     if traits.delta:
         # The next surface is too deep to gather, so following both costs no additional gather point
         both = depth + 1 == limits.max_depth
-        goes_on, stays, direction, following, eta, smooth_weight = _follow_delta(si, bsdf, flags, both, *random[:3])
+        goes_on, stays, direction, following, own, smooth_weight = _follow_delta(si, bsdf, flags, both, *random[:3])
+        eta *= own
     gathered = hit & mi.has_flag(flags, mi.BSDFFlags.Smooth) & stays & (depth < limits.max_depth)
     weight = throughput * smooth_weight
     if traits.delta:
@@ -242,18 +259,18 @@ def _wave(
     # Widen uniform fields, which have a single entry, because points are gathered and scattered by index
     si = dr.select(gathered, si, dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d)))
     passable = hit & mi.has_flag(flags, mi.BSDFFlags.Null) if traits.null else mi.Bool(False)
-    dr.eval(emission, hit, passable, gathered, si, weight, goes_on, next_ray.o, next_ray.d, following)
-    return emission, hit, passable, (gathered, si, weight), (goes_on, next_ray, following)
+    dr.eval(emission, hit, passable, gathered, si, weight, goes_on, next_ray.o, next_ray.d, following, eta)
+    return emission, hit, passable, (gathered, si, weight), (goes_on, next_ray, following, eta)
 
 
 def follow_camera_rays(
-    scene, emitters, traits, sampler, seed, ray, active, max_depth, rr_depth, skip=None, along_curve=True
+    emitters, traits, sampler, seed, ray, active, max_depth, rr_depth, hides=False, along_curve=True
 ):
     """Trace camera rays to their gather points: :class:`CameraPaths`.
 
     ``ray``: a wavefront of camera rays; inactive rays return zero; ``max_depth``, ``rr_depth``: defined by Mitsuba's
-    ``path`` (math.inf: no limit); ``skip``: with ``hide_emitters``, Mitsuba's intersection method that skips area
-    emitters, for the first edge only; ``along_curve``: whether to sort points along a Morton curve instead of by ray.
+    ``path`` (math.inf: no limit); ``hides``: whether the first edge passes area emitters; ``along_curve``: whether to
+    sort points along a Morton curve instead of by ray.
     """
     count = dr.width(ray.d)
     ray.time += dr.zeros(mi.Float, count)
@@ -261,19 +278,19 @@ def follow_camera_rays(
     lane = dr.arange(mi.UInt32, count)
     active = mi.Bool(active) & (lane < dr.opaque(mi.UInt32, count))
     limits = PathLimits.of(max_depth, rr_depth)
-    throughput, depth = ones(count), 1
+    throughput, eta, depth = ones(count), dr.ones(mi.Float, count), 1
     found = None
     while True:
         random = (sampler.next_1d(), sampler.next_2d(), sampler.next_1d(), sampler.next_1d()) if traits.delta else None
         # Opaque: the waves of all depths share one kernel
-        dr.make_opaque(ray, active, throughput, random)
+        dr.make_opaque(ray, active, throughput, eta, random)
         emitted, hit, passable, gathered, going = _wave(
-            scene, emitters, traits, random, ray, throughput, dr.opaque(mi.UInt32, depth), limits, skip, active
+            emitters, traits, random, ray, throughput, eta, dr.opaque(mi.UInt32, depth), limits, hides, active
         )
         if found is None:
             emission, valid = emitted, hit
             if traits.null:
-                _open_masks(scene, traits, ray, skip, limits, derived_seed(seed, 4), valid, passable)
+                _open_masks(traits, ray, hides, limits, derived_seed(seed, 4), valid, passable)
             mask, si, weight = gathered
             found = (mask, si, weight, dr.full(mi.UInt32, 1, count))
             dr.eval(found)
@@ -282,13 +299,13 @@ def follow_camera_rays(
             # A ray that continued beside a gather point finds no second one
             for target, value in zip(found, (*gathered, mi.UInt32(depth)), strict=True):
                 dr.scatter(target, value, lane, gathered[0])
-        skip = None
+        hides = False
         if not traits.delta:
             break
         onward = dr.compress(going[0])
         if len(onward) == 0:
             break
-        lane, throughput = (dr.gather(type(x), x, onward) for x in (lane, going[2]))
+        lane, throughput, eta = (dr.gather(type(x), x, onward) for x in (lane, *going[2:]))
         time = dr.gather(mi.Float, ray.time, onward)
         ray = mi.Ray3f(*(dr.gather(type(x), x, onward) for x in (going[1].o, going[1].d)), time)
         ray.maxt = dr.full(mi.Float, dr.largest(mi.Float), len(onward))
@@ -297,14 +314,14 @@ def follow_camera_rays(
     return CameraPaths(emission, valid, _collect(*found, along_curve))
 
 
-def _open_masks(scene, traits, ray, skip, limits: PathLimits, seed: int, valid, passable) -> None:
+def _open_masks(traits, ray, hides: bool, limits: PathLimits, seed: int, valid, passable) -> None:
     """Clear the mask ``valid`` for the rays that pass unscattered what they meet; ``passable``: those that may."""
     lanes = dr.compress(passable)
     if len(lanes) == 0:
         return
     first = mi.Ray3f(*(dr.gather(type(x), x, lanes) for x in (ray.o, ray.d, ray.time)))
     first.maxt = dr.gather(mi.Float, ray.maxt, lanes)
-    si = _surfaces(scene, traits, first, mi.Bool(True), skip, dr.full(mi.Bool, True, len(lanes)))
+    si = _surfaces(traits, first, mi.Bool(True), hides, dr.full(mi.Bool, True, len(lanes)))
     dr.scatter(valid, opaque_rays(traits, si, limits, independent_sampler(seed, len(lanes))), lanes)
 
 
