@@ -17,12 +17,12 @@ light paths by glossy lobes under bump and normal maps is approximated as diffus
 
 - Surfaces only: a scene with a participating medium raises an error.
 - ``*_rgb`` and ``*_mono`` variants only. Not differentiable.
-- Emitters: point, spot, directional, area on any shape, envmap, constant, sunsky; projectors and textured spot
-  emitters with ``direct="nee"``.
+- Emitters: point, spot, directional, area on shapes that Mitsuba can sample, envmap, constant, sunsky; projectors,
+  and spot emitters with a texture or an oval cone, with any ``direct`` but ``"vpl"``.
 - Shadow rays pass surfaces that do not scatter (masks, thin glass) with their transmission; each is an edge of the
   path, as in ``path``. They block direct light of point, spot and directional emitters.
 - Values that are negative, not a number or above 1e30 count as zero; dropped lights and samples are counted. A scene
-  of infinite size and an environment map with such values raise an error.
+  of infinite size and an environment map with such values, except negative ones, raise an error.
 """,
     "direct estimate": """\
 What is estimated: emission and direct light, over the paths that ``path`` counts for ``max_depth`` 2. With larger
@@ -31,9 +31,9 @@ surface before it reaches the visible point.
 
 - Surfaces only: a scene with a participating medium raises an error.
 - ``*_rgb`` and ``*_mono`` variants only. Not differentiable.
-- Every emitter of Mitsuba. The size of kernels is independent of the number of point and spot emitters, and of area
-  emitters of constant colour on meshes, rectangles, disks and spheres. It grows with the number of textured emitters
-  and projectors.
+- Every emitter of Mitsuba, area emitters on shapes that Mitsuba can sample. The size of kernels is independent of the
+  number of point and spot emitters, and of area emitters of constant colour on meshes, rectangles, disks and spheres.
+  It grows with the number of textured emitters and projectors.
 - Masks and thin glass block point, spot and directional emitters, as in ``path``.
 - The camera rays of a pixel share the incident light at surfaces of similar orientation, and each point reflects it
   with its own BSDF. With a box filter the expected image is that of independent rays. Wider filters preserve textures,

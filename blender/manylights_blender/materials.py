@@ -113,8 +113,12 @@ class Materials:
         if passes:
             bsdf = {"type": "mask", "opacity": alpha, "bsdf": bsdf}
         strength = self._constant(material, node, "Emission Strength")
-        radiance = self._colour(material, node, "Emission Color", scale=strength) if strength else None
-        return Surface(bsdf, radiance, passes)
+        return Surface(bsdf, self._radiance(material, node, "Emission Color", strength), passes)
+
+    def _radiance(self, material, node, name, strength):
+        """Colour of an input times the strength; None if it is black everywhere."""
+        radiance = self._colour(material, node, name, scale=strength) if strength else None
+        return None if radiance and radiance["type"] == "rgb" and not any(radiance["value"]) else radiance
 
     def _principled_bsdf(self, material, node):
         """Blender weakens the diffuse part by what the interface reflects, and Mitsuba's `principled` does not: the
@@ -177,7 +181,7 @@ class Materials:
 
     def _emission(self, material, node):
         strength = self._constant(material, node, "Strength")
-        return Surface(None, self._colour(material, node, "Color", scale=strength) if strength else None)
+        return Surface(None, self._radiance(material, node, "Color", strength))
 
     def _mix(self, material, node):
         share = self._number(material, node, "Fac")

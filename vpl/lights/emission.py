@@ -219,7 +219,7 @@ def emitter_samplers(scene, emitters: Emitters, focus: Focus | None = None) -> l
     sphere = bounding_sphere(scene)
     rays = ParallelRays(sphere, focus)
     samplers = []
-    if emitters.points.count + emitters.spots.count:
+    if emitters.points.count + np.count_nonzero(emitters.spots.cone[:, 0]):
         samplers.append(OmniSampler(emitters.points, emitters.spots))
     if emitters.area.power.sum() > 0:
         samplers.append(AreaSampler(emitters.area))

@@ -2,7 +2,7 @@
 
 A virtual call on emitter pointers makes Dr.Jit trace every emitter instance of the process: a minute of compilation
 for some thousands of lights.  Here point, spot, directional and area emitters become rows of arrays.  Environment maps,
-projectors and textured spot emitters keep their objects, which kernels call one by one.
+projectors, and spot emitters with a texture or an oval cone keep their objects, which kernels call one by one.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from .virtual_lights import VirtualLights
 SAMPLED_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
 # Time to record a call of one shape object, in calls of one shape by pointer
 _SHAPES_BY_POINTER = 4
+# Relative error of products of columns, from single precision and from angles in files
+_ROUND = 1e-3
 # Least and largest number of samples of a textured emitter along each axis: as many as texels, up to a million in all
 _GRID = 64, 1024
 
@@ -149,9 +151,17 @@ def _constant_rgb(parameters, name):
 
 
 def _frame_of(to_world):
-    """Origin and z axis of an emitter's frame, as float64 vectors."""
+    """Origin, direction and length of the z axis of an emitter's frame, as float64 values."""
     axis, origin = matrix_of(to_world, (2, 3))[:3].T
-    return origin, axis / np.linalg.norm(axis)
+    length = np.linalg.norm(axis)
+    return origin, axis / length, length
+
+
+def _keeps_cones(to_world) -> bool:
+    """Whether a transformation keeps round cones round: Mitsuba's spot emitters have the scale of their frame."""
+    linear = np.stack(matrix_of(to_world, (0, 1, 2))[:3].T)
+    products, square = linear @ linear.T, np.sum(linear[2] ** 2)
+    return np.allclose(products, square * np.eye(3), atol=_ROUND * square)
 
 
 def _textured_radiance(emitter, shape) -> np.ndarray:
@@ -278,6 +288,11 @@ def _lights_nothing(emitter) -> bool:
     return emitter.class_name() == "DirectionalArea" or (is_delta and emitter.sampling_weight() == 0)
 
 
+def _is_round_spot(parameters, intensity) -> bool:
+    """Whether a spot emitter has a constant ``intensity``, not None, within a round cone."""
+    return intensity is not None and "texture.value" in parameters and _keeps_cones(parameters["to_world"])
+
+
 @unrecorded()
 def _read_unbound(scene, group_of: Callable, known: list[mi.Emitter]) -> tuple[list, list, list, list]:
     """Rows of (point, spot, directional emitters), and (class name, emitter) of the remaining ones that are not
@@ -291,11 +306,14 @@ def _read_unbound(scene, group_of: Callable, known: list[mi.Emitter]) -> tuple[l
         intensity = _constant_rgb(parameters, "irradiance" if name == "DirectionalEmitter" else "intensity")
         if name == "PointLight" and intensity is not None:
             points.append([*numbers(parameters["position"]), *intensity, group_of(emitter)])
-        elif name == "SpotLight" and intensity is not None and "texture.value" in parameters:
+        elif name == "SpotLight" and _is_round_spot(parameters, intensity):
             cone = np.deg2rad([*numbers(parameters["cutoff_angle"]), *numbers(parameters["beam_width"])])
-            spots.append([*np.concatenate(_frame_of(parameters["to_world"])), *intensity, *cone, group_of(emitter)])
+            origin, axis, _ = _frame_of(parameters["to_world"])
+            spots.append([*origin, *axis, *intensity, *cone, group_of(emitter)])
         elif name == "DirectionalEmitter" and intensity is not None:
-            suns.append([*_frame_of(parameters["to_world"])[1], *intensity, group_of(emitter)])
+            # Mitsuba 3.9.1 does not normalise the direction, so that cosines have the scale of the frame
+            _, axis, length = _frame_of(parameters["to_world"])
+            suns.append([*axis, *(length * np.array(intensity)), group_of(emitter)])
         elif not any(emitter is one for one in known):
             others.append((name, emitter))
     return points, spots, suns, others

@@ -96,7 +96,9 @@ def scatter_perturbed(si, sampler, throughput, lobe_limit: float, active) -> Sca
     context = mi.BSDFContext()
     smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     by_cosine = smooth & (sampler.next_1d() < _COSINE_SHARE)
-    sample, weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), active)
+    # The weight of a delta lobe is one of flux; the direction is the same in both modes
+    flux_context = mi.BSDFContext(mi.TransportMode.Importance)
+    sample, weight = bsdf.sample(flux_context, si, sampler.next_1d(), sampler.next_2d(), active)
     drawn = mi.Frame3f(outward).to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
     direction = dr.select(by_cosine, drawn, si.to_world(sample.wo))
     delta = ~by_cosine & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)

@@ -99,6 +99,18 @@ def test_every_plugin_knows_where_its_lights_shine(plugin):
     assert_indirect_light_of_path(sunlit(turned(45), [0.2, -1, 0]), plugin, 8, **PLUGINS[plugin])
 
 
+def test_light_below_waves_is_that_below_a_smooth_surface():
+    """Light that is refracted keeps its flux, although its radiance grows by the square of the index."""
+    water, images = {"type": "dielectric", "int_ior": 1.33}, []
+    for material in (turned(0, water), water):
+        scene = sunlit(WHITE, [0.2, -1, 0])
+        scene["sun"] = wall([0, 5, 0], [1, 0, 0], 90, 2.0) | {"emitter": {"type": "area", "radiance": rgb(5.0)}}
+        scene["water"] = wall([0, 3, 0], [1, 0, 0], -90, 4.0, bsdf=material)
+        settings = {"direct": "none", "clamping": 0.0, "vpl_count": 8000, "max_depth": 6}
+        images.append(np.mean([render(mi.load_dict(scene), "vpl", 4, seed, **settings) for seed in range(4)]))
+    assert images[0] == pytest.approx(images[1], rel=0.03) and images[1] > 0
+
+
 @pytest.mark.parametrize("nested", ["roughplastic", *stress("plastic", "principled")])
 def test_glossy_light_is_spread_and_none_is_lost(nested):
     """The light of glossy lobes is spread evenly, so only its sum is correct."""

@@ -5,6 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.rendering import render
+from tests.support.scenes import rgb, sensor, wall
 from vpl.core.arrays import download, upload
 from vpl.lights.emitters import read_emitters
 from vpl.lights.virtual_lights import DeviceLights, VirtualLights, geometry
@@ -25,7 +27,11 @@ def scene_with(emitter):
     return mi.load_dict({"type": "scene", "emitter": emitter, "shape": {"type": "sphere", "radius": 0.1}})
 
 
-@pytest.mark.parametrize("emitter", [SPOT, POINT, SUN], ids=["spot", "point", "directional"])
+def scaled_spot(scale):
+    return SPOT | {"to_world": lambda: SPOT["to_world"]() @ mi.ScalarTransform4f().scale(scale)}
+
+
+@pytest.mark.parametrize("emitter", [SPOT, scaled_spot(3), POINT, SUN], ids=["spot", "scaled", "point", "directional"])
 def test_flat_lights_equal_mitsubas_emitters(emitter):
     scene = scene_with(emitter)
     emitters = read_emitters(scene)
@@ -42,6 +48,24 @@ def test_flat_lights_equal_mitsubas_emitters(emitter):
     lit = expected.sum(1) > 0
     directions = [np.broadcast_to(download(vector), positions.shape)[lit] for vector in (to_light, ds.d)]
     np.testing.assert_allclose(*directions, atol=1e-5)
+
+
+def test_spots_with_an_oval_cone_are_left_to_mitsuba():
+    emitters = read_emitters(scene_with(scaled_spot([2, 1, 1])))
+    assert emitters.spots.count == 0 and [name for name, _ in emitters.others] == ["SpotLight"]
+
+
+@pytest.mark.parametrize("name", ["vpl", "adaptivedirect", "manylights"])
+@pytest.mark.parametrize("lamps", [1, 70])
+def test_the_scale_of_a_directional_emitter_counts_as_in_path(name, lamps):
+    """With many lamps, `manylights` has no emitters of Mitsuba."""
+    turned = mi.ScalarTransform4f().look_at([0, 0, 0], [0.2, -1, -0.3], [0, 0, 1]).scale(2)
+    sun = {"sun": {"type": "directional", "to_world": turned, "irradiance": rgb(1.0)}}
+    dim = {f"lamp{i}": POINT | {"position": [0.1 * i, 1, 0], "intensity": rgb(1e-6)} for i in range(lamps)}
+    scene = {"type": "scene", "sensor": sensor(8, 4), "floor": wall([0, 0, 0], [1, 0, 0], -60), **sun}
+    expected = render(mi.load_dict(scene), "path", 64, max_depth=2).mean()
+    found = render(mi.load_dict(scene | dim), name, 64, max_depth=2).mean()
+    assert found == pytest.approx(expected, rel=0.02) and expected > 0
 
 
 def oriented(position, direction):

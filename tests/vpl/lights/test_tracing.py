@@ -120,6 +120,16 @@ EMITTERS = {
 }
 
 
+def test_a_spot_with_a_cone_of_size_zero_sends_no_light():
+    spot = EMITTERS["spot"] | {"cutoff_angle": 0.0, "beam_width": 0.0}
+    box = {"ball": {"type": "sphere"}, "lamp": area_light(), "spot": spot}
+    scenes = [
+        mi.load_dict({"type": "scene", **box}),
+        mi.load_dict({"type": "scene", "spot": spot, "ball": box["ball"]}),
+    ]
+    assert [len(emitter_samplers(scene, read_emitters(scene))) for scene in scenes] == [1, 0]
+
+
 @pytest.mark.parametrize("name", EMITTERS)
 def test_emitted_power_and_directions_equal_mitsubas(name):
     emitter = dict(EMITTERS[name])
