@@ -2,7 +2,7 @@
 
 A pair of many points and a cluster of lights is probed with 8 or 16 shadow rays to the cluster's representative.  If
 every probe is unoccluded, every point counts as lit; if every probe is occluded, none.  A mixed pair is divided, and
-its parts are probed.  Small parts trace a ray from every point.
+its parts are probed.  Small parts, and pairs of a single light, trace a ray from every point.
 
 The result is biased: occluders between the probes are missed.  The points of a pair are adjacent along a curve, hence
 only an occluder smaller than the distance between probes, or the edge of an occluder, can be missed.

@@ -86,7 +86,7 @@ def limited_cuts(lights: LightSet, batch: Batch, threshold, max_cut: int, stores
 
     Refinement of the worst cluster up to ``max_cut`` nodes ([LC] section 4.2) is equivalent to a larger threshold.
     Growing steps bracket the threshold; they end because the roots form the cut at an infinite threshold.  Bisection of
-    the logarithm narrows the bracket.  Returns (threshold, sizes, nodes visited per point).
+    the logarithm narrows the bracket.
     """
     max_cut = max(max_cut, len(lights.groups)) if max_cut else 0  # the roots of the groups form the coarsest cut
     sizes = cuts_at(lights, batch, threshold, max_cut, stores)

@@ -42,7 +42,7 @@ def _walk(
     group: LightGroup, receiver: Receiver, threshold, smallest_distance: float, start, stored, most, nodes, offset
 ):  # fmt: skip
     """Traverse a group's tree for every point from the node ``start`` on, until ``most`` nodes of the cut are found:
-    (next node, nodes found, nodes visited).
+    (next node, nodes found, nodes visited, whether the tree goes on behind ``most`` nodes).
 
     Writes the first ``stored`` nodes found to ``nodes``, from the index ``offset`` on.
     """
