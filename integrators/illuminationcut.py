@@ -48,10 +48,11 @@ class IlluminationCutIntegrator(ManyLightIntegrator):
     of its points (eq. 4, Algorithm 1). A bound is computed once for many points, and the shadow rays of a pair have
     close origins and a common light. A first, approximate image (Phase I) estimates the radiance of the points.
 
-    With ``visibility="adaptive"`` (Algorithm 2, "IlluminationCut-Sampling") a pair of 32 points or more, and of several
-    lights, is probed with 8 or 16 shadow rays. If every probe is unoccluded, or every probe is occluded, the result counts for the whole
-    pair; otherwise the pair is divided and its parts are probed. An occluder between the probes is missed: the result
-    is biased at small shadows and at shadow edges between probes, by amounts that the error bound does not cover.
+    With ``visibility="adaptive"`` (Algorithm 2, "IlluminationCut-Sampling") a pair of 32 points or more, and of
+    several lights, is probed with 8 or 16 shadow rays. If every probe is unoccluded, or every probe is occluded,
+    the result counts for the whole pair; otherwise the pair is divided and its parts are probed. An occluder
+    between the probes is missed: the result is biased at small shadows and at shadow edges between probes, by
+    amounts that the error bound does not cover.
 
     {estimate}
 
