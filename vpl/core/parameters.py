@@ -133,3 +133,12 @@ def _reader():
             self.members.append((name, value, cpptype))
 
     return Reader
+
+
+def constant_rgb(parameters, name) -> list[float] | None:
+    """RGB value of a spectrum parameter without spatial variation, else None."""
+    value = parameters.get(f"{name}.value")
+    if value is None:
+        return None
+    components = numbers(value)
+    return components * 3 if len(components) == 1 else components[:3]

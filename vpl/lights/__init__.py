@@ -6,6 +6,7 @@ Data flow and reading order::
                                                                   (clustering)
 
 - ``emitters``: a scene's emitters in flat arrays (``Emitters``), because kernels must not call emitter objects
+- ``unbound_emitters``: those that are no shapes and no environment
 - ``emitter_groups``: named groups of emitters, for images of the light of each group
 - ``focus``: the part of the scene that the camera sees, and the distances between lights there
 - ``spheres``: corrections of Mitsuba's samples on spheres

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..core.arrays import download, finite_or_zero, rgb_to_spectrum, upload
 from ..core.meshes import positions_of
+from ..core.parameters import matrix_of, parameters_of
 from ..core.sampling import Choice, independent_sampler
 from .emitters import Emitters
 from .focus import Focus
@@ -72,16 +73,20 @@ def bounding_sphere(scene):
     return sphere
 
 
+def _power_of_omni(lights: VirtualLights) -> np.ndarray:
+    """Power of point and spot emitters (n,) float64, of a spot within its whole cone."""
+    solid_angle = 2 * np.pi * (1 - np.cos(lights.cone[:, 0].astype(np.float64)))
+    return lights.intensity.mean(1, dtype=np.float64) * solid_angle
+
+
 class OmniSampler:
     """Rays from point and spot emitters."""
 
     # Whether scattered rays never hit these emitters: only next-event estimation reaches them
     delta = True
 
-    def __init__(self, points: VirtualLights, spots: VirtualLights):
-        lights = VirtualLights.concatenate([points, spots])
-        solid_angle = 2 * np.pi * (1 - np.cos(lights.cone[:, 0].astype(np.float64)))
-        self.power = lights.intensity.mean(1, dtype=np.float64) * solid_angle
+    def __init__(self, lights: VirtualLights):
+        self.power = _power_of_omni(lights)
         self._choice = Choice(self.power)
         self._position = upload(mi.Float, lights.position)
         self._axis = upload(mi.Float, lights.direction)
@@ -207,11 +212,19 @@ class OtherSampler:
         self._emitter = emitter
         self.delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
         self.power = np.array([other_power(emitter, sphere)])
+        self._volume = None
+        if emitter.class_name() == "SpotLight":
+            frame = matrix_of(parameters_of(emitter)["to_world"])[:3, :3]
+            self._volume = dr.opaque(mi.Float, abs(np.linalg.det(frame)))
 
     def sample(self, stratified, position_sample, direction_sample):
         """Ray and weight (power per path)."""
         ray, weight = self._emitter.sample_ray(0.0, stratified, position_sample, direction_sample)
-        return mi.Ray3f(ray.o, ray.d), weight
+        length = dr.norm(ray.d)
+        if self._volume is not None:
+            # Mitsuba's density is one of directions in the frame, which a scale of the frame spreads
+            weight *= self._volume / (length * dr.square(length))
+        return mi.Ray3f(ray.o, ray.d / length), weight
 
 
 def emitter_samplers(scene, emitters: Emitters, focus: Focus | None = None) -> list:
@@ -219,8 +232,9 @@ def emitter_samplers(scene, emitters: Emitters, focus: Focus | None = None) -> l
     sphere = bounding_sphere(scene)
     rays = ParallelRays(sphere, focus)
     samplers = []
-    if emitters.points.count + np.count_nonzero(emitters.spots.cone[:, 0]):
-        samplers.append(OmniSampler(emitters.points, emitters.spots))
+    omni = VirtualLights.concatenate([emitters.points, emitters.spots])
+    if _power_of_omni(omni).sum() > 0:
+        samplers.append(OmniSampler(omni))
     if emitters.area.power.sum() > 0:
         samplers.append(AreaSampler(emitters.area))
     if emitters.directional.count:

@@ -15,20 +15,18 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import LARGEST_VALUE, download, finite_or_zero, rgb_to_spectrum, upload, usable
-from ..core.compilation import unrecorded
-from ..core.parameters import matrix_of, numbers, parameters_of
+from ..core.parameters import constant_rgb, parameters_of
 from ..core.registry import RegistryTable
 from ..core.sampling import independent_sampler
 from ..core.shapes import registered_shapes
 from .spheres import SphereRows
+from .unbound_emitters import lights_nothing, read_unbound
 from .virtual_lights import VirtualLights
 
 # Shapes, besides meshes, that Mitsuba can sample by area (curves, for example, cannot)
 SAMPLED_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
 # Time to record a call of one shape object, in calls of one shape by pointer
 _SHAPES_BY_POINTER = 4
-# Relative error of products of columns, from single precision and from angles in files
-_ROUND = 1e-3
 # Least and largest number of samples of a textured emitter along each axis: as many as texels, up to a million in all
 _GRID = 64, 1024
 
@@ -141,29 +139,6 @@ class Emitters:
         )  # fmt: skip
 
 
-def _constant_rgb(parameters, name):
-    """RGB value of a spectrum parameter without spatial variation, else None."""
-    value = parameters.get(f"{name}.value")
-    if value is None:
-        return None
-    components = numbers(value)
-    return components * 3 if len(components) == 1 else components[:3]
-
-
-def _frame_of(to_world):
-    """Origin, direction and length of the z axis of an emitter's frame, as float64 values."""
-    axis, origin = matrix_of(to_world, (2, 3))[:3].T
-    length = np.linalg.norm(axis)
-    return origin, axis / length, length
-
-
-def _keeps_cones(to_world) -> bool:
-    """Whether a transformation keeps round cones round: Mitsuba's spot emitters have the scale of their frame."""
-    linear = np.stack(matrix_of(to_world, (0, 1, 2))[:3].T)
-    products, square = linear @ linear.T, np.sum(linear[2] ** 2)
-    return np.allclose(products, square * np.eye(3), atol=_ROUND * square)
-
-
 def _textured_radiance(emitter, shape) -> np.ndarray:
     """Mean radiance of a textured area emitter, from random surface samples in a grid as fine as its textures."""
     shapes = [getattr(value, "shape", ()) for value in parameters_of(emitter).values()]
@@ -194,7 +169,7 @@ def _read_areas(scene, group_of: Callable) -> tuple[AreaEmitters, int, list]:
         if emitter.class_name() != "AreaLight":
             unusual.append((emitter.class_name(), emitter))
             continue
-        radiance = _constant_rgb(parameters_of(emitter), "radiance")
+        radiance = constant_rgb(parameters_of(emitter), "radiance")
         _require_supported(shape, constant=radiance is not None)
         if radiance is None:
             textured.append((len(indices), emitter))
@@ -266,7 +241,7 @@ def _read_environment(scene):
             "variants cannot evaluate it; use sunsky"
         )
     parameters = parameters_of(environment)
-    radiance = _constant_rgb(parameters, "radiance")
+    radiance = constant_rgb(parameters, "radiance")
     if radiance is not None and not usable(np.array(radiance)).all():
         return None, 1
     if "data" in parameters:
@@ -282,43 +257,6 @@ def _read_environment(scene):
     return environment, 0
 
 
-def _lights_nothing(emitter) -> bool:
-    """Whether Mitsuba's ``path`` can neither hit nor sample an emitter."""
-    is_delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
-    return emitter.class_name() == "DirectionalArea" or (is_delta and emitter.sampling_weight() == 0)
-
-
-def _is_round_spot(parameters, intensity) -> bool:
-    """Whether a spot emitter has a constant ``intensity``, not None, within a round cone."""
-    return intensity is not None and "texture.value" in parameters and _keeps_cones(parameters["to_world"])
-
-
-@unrecorded()
-def _read_unbound(scene, group_of: Callable, known: list[mi.Emitter]) -> tuple[list, list, list, list]:
-    """Rows of (point, spot, directional emitters), and (class name, emitter) of the remaining ones that are not
-    ``known``."""
-    points, spots, suns, others = [], [], [], []
-    for emitter in scene.emitters():
-        name = emitter.class_name()
-        if emitter.is_environment() or name == "AreaLight" or _lights_nothing(emitter):
-            continue
-        parameters = parameters_of(emitter)
-        intensity = _constant_rgb(parameters, "irradiance" if name == "DirectionalEmitter" else "intensity")
-        if name == "PointLight" and intensity is not None:
-            points.append([*numbers(parameters["position"]), *intensity, group_of(emitter)])
-        elif name == "SpotLight" and _is_round_spot(parameters, intensity):
-            cone = np.deg2rad([*numbers(parameters["cutoff_angle"]), *numbers(parameters["beam_width"])])
-            origin, axis, _ = _frame_of(parameters["to_world"])
-            spots.append([*origin, *axis, *intensity, *cone, group_of(emitter)])
-        elif name == "DirectionalEmitter" and intensity is not None:
-            # Mitsuba 3.9.1 does not normalise the direction, so that cosines have the scale of the frame
-            _, axis, length = _frame_of(parameters["to_world"])
-            suns.append([*axis, *(length * np.array(intensity)), group_of(emitter)])
-        elif not any(emitter is one for one in known):
-            others.append((name, emitter))
-    return points, spots, suns, others
-
-
 def read_emitters(scene, group_of: Callable[[mi.Emitter], int] = lambda _: 0) -> Emitters:
     """Read the emitters of ``scene`` that contribute in Mitsuba's ``path``.
 
@@ -330,7 +268,7 @@ def read_emitters(scene, group_of: Callable[[mi.Emitter], int] = lambda _: 0) ->
     environment, dropped = _read_environment(scene)
     area, bad_areas, others_on_shapes = _read_areas(scene, group_of)
     dropped += bad_areas
-    points, spots, suns, others = _read_unbound(scene, group_of, [known for _, known in others_on_shapes])
+    points, spots, suns, others = read_unbound(scene, group_of, [known for _, known in others_on_shapes])
     points, spots, suns = (_sorted_rows(rows, n) for rows, n in ((points, 7), (spots, 12), (suns, 7)))
     omni = VirtualLights.of("point", points[:, :3], np.tile([0, 0, 1], (len(points), 1)), points[:, 3:6])
     spot = VirtualLights.of("spot", spots[:, :3], spots[:, 3:6], spots[:, 6:9], 0, spots[:, 9:11])
@@ -347,6 +285,6 @@ def read_emitters(scene, group_of: Callable[[mi.Emitter], int] = lambda _: 0) ->
             mi.LogLevel.Warn,
             f"Dropped {dropped} emitter(s) with values that are negative, not finite, or above {LARGEST_VALUE:.0e}.",
         )
-    others += [row for row in others_on_shapes if not _lights_nothing(row[1])]
+    others += [row for row in others_on_shapes if not lights_nothing(row[1])]
     others.sort(key=lambda row: (row[0], row[1].id(), str(row[1])))
     return Emitters(*kept, area, environment, others, dropped)

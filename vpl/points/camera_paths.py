@@ -16,6 +16,7 @@ import numpy as np
 
 from ..core.arrays import add_at, channel_mean, download, finite_or_zero, ones, upload
 from ..core.interactions import Interactions
+from ..core.loops import recorded_once
 from ..core.materials import Materials
 from ..core.morton import morton_order
 from ..core.path_limits import PathLimits
@@ -202,21 +203,19 @@ def emitted_towards(emitters: Emitters, si, active=True):
 
 
 def _surfaces(traits: SceneTraits, ray, coherent, hides: bool, active):
-    """The nearest surfaces on rays; ``hides``: the nearest ones that are no emitters."""
+    """The nearest surfaces on rays; ``hides``: whether rays pass area emitters."""
     return _behind_emitters(traits, ray, active) if hides else traits.interactions.meet(ray, active, coherent)
 
 
+@recorded_once
 @dr.syntax
 def _behind_emitters(traits: SceneTraits, ray, active):
-    """The nearest surfaces on rays that are no emitters.
-
-    Mitsuba's `skip_area_emitters` returns distances from the last emitter.  With the camera's ray, as `path` of Mitsuba
-    3.9.1 uses them, spheres, disks and cylinders behind emitters have wrong positions.
-    """
+    """The nearest surfaces on rays that are no emitters: `path` of Mitsuba 3.9.1 counts the distances from the last
+    emitter as distances from the camera, so that spheres, disks and cylinders behind emitters have wrong positions."""
     ray, going = mi.Ray3f(ray), mi.Bool(active)
     found = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
     while dr.hint(going, exclude=[traits]):
-        si = traits.interactions.meet(ray, going)
+        si = traits.interactions.meet(ray, going, mi.Bool(True))
         found = dr.select(going, si, found)
         going &= si.is_valid() & si.shape.is_emitter()
         ray = dr.select(going, si.spawn_ray(ray.d), ray)

@@ -99,7 +99,8 @@ def _through_null_surfaces(scene, traits, ray, most, active):
         passed = dr.select(crossed, passed * traits.transmission(si, crossed), passed)
         active = crossed & dr.any(passed > 0)
         left -= dr.select(crossed, mi.UInt32(1), 0)
-        # Mitsuba moves the origin off the surface, and the shortest rays behind many surfaces would pass their end
+        # Mitsuba moves the origin off the surface: a ray of the old direction and length would pass the end
         onward = dr.select(ends, si.spawn_ray_to(end), si.spawn_ray(ray.d))
+        onward.maxt = dr.select(dr.dot(onward.d, ray.d) > 0, onward.maxt, 0)
         ray = dr.select(active, onward, ray)
     return passed, most - left

@@ -130,6 +130,26 @@ def test_a_spot_with_a_cone_of_size_zero_sends_no_light():
     assert [len(emitter_samplers(scene, read_emitters(scene))) for scene in scenes] == [1, 0]
 
 
+def test_rays_of_an_oval_spot_have_its_intensity():
+    """Sums over the rays of a sampler, and over directions on the sphere with the emitter's intensity."""
+    frame = mi.ScalarTransform4f().rotate([0, 1, 0], 40).scale([2, 1, 0.5])
+    spot = {"type": "spot", "cutoff_angle": 35.0, "beam_width": 20.0, "to_world": frame}
+    scene = mi.load_dict({"type": "scene", "shape": {"type": "sphere"}, "spot": spot})
+    count = 200_000
+    numbers = mi.load_dict({"type": "independent"})
+    numbers.seed(3, count)
+    (sampler,) = emitter_samplers(scene, read_emitters(scene))
+    ray, weight = sampler.sample(numbers.next_1d(), numbers.next_2d(), numbers.next_2d())
+    reference = dr.zeros(mi.SurfaceInteraction3f, count)
+    reference.p = mi.warp.square_to_uniform_sphere(numbers.next_2d())
+    _, intensity = scene.emitters()[0].sample_direction(reference, mi.Point2f(0.5))
+    found, expected = (
+        np.mean(download(mi.Color3f(value))[:, :1] * np.c_[np.ones(count), download(direction)], axis=0)
+        for value, direction in ((weight, ray.d), (4 * np.pi * intensity, reference.p))
+    )
+    np.testing.assert_allclose(found, expected, atol=0.02 * expected[0])
+
+
 @pytest.mark.parametrize("name", EMITTERS)
 def test_emitted_power_and_directions_equal_mitsubas(name):
     emitter = dict(EMITTERS[name])
