@@ -73,6 +73,16 @@ def test_another_scene_is_lit_while_a_curve_is_alive(name, tmp_path):
     assert len(alive.shapes()) == 3
 
 
+@pytest.mark.parametrize("name", ["manylights", "lightcuts"])
+def test_a_scene_in_memory_with_instances_does_not_disturb_another_one(tmp_path, name):
+    other = mi.load_dict(closed_box({"lamp": area_light()}, 8, **OTHERS["instance"](tmp_path)))
+    lamps = {f"lamp{i}": wall([0.02 * i - 0.7, 0.9, 0], [1, 0, 0], 90, 0.008) for i in range(70)}
+    lamps = {key: lamp | {"emitter": {"type": "area", "radiance": rgb(50.0)}} for key, lamp in lamps.items()}
+    box = closed_box(lamps, 8)
+    found, expected = (render(mi.load_dict(box), plugin, 64, max_depth=2) for plugin in (name, "path"))
+    assert other is not None and found.mean() == pytest.approx(expected.mean(), rel=0.05)
+
+
 @pytest.mark.parametrize("name", ["manylights", "vpl", "adaptivedirect"])
 def test_balls_behind_hidden_emitters_keep_their_place(name):
     """The distance to the ball is that from the camera, not from the hidden lamp."""

@@ -8,6 +8,7 @@ projectors, and spot emitters with a texture or an oval cone keep their objects,
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
@@ -216,7 +217,9 @@ def _surface_areas(scene, shape_index: np.ndarray, shapes: list[mi.Shape]):
     by_pointer = _SHAPES_BY_POINTER * len(shapes) > len(all_shapes)
     if by_pointer and all(_can_be_sampled(shape) for shape in all_shapes):
         pointers = dr.reinterpret_array(mi.ShapePtr, upload(mi.UInt32, shape_index))
-        return download(pointers.surface_area()), None
+        # Dr.Jit records the call for the shapes of all scenes in memory, and curves and instances have no area
+        with suppress(RuntimeError):
+            return download(pointers.surface_area()), None
     row = dr.arange(mi.UInt32, len(shapes))
     return download(dr.switch(row, [shape.surface_area for shape in shapes])), shapes
 
