@@ -14,6 +14,7 @@ import numpy as np
 from benchmarks import scenes
 from comparison.fine_film import fine_film
 from comparison.render import render
+from vpl.direct.environment_regions import forget_regions
 from vpl.split import estimator
 
 KINDS, SAMPLERS = ("path", "manylights"), ("independent", "multijitter")
@@ -165,6 +166,8 @@ class Timed(Rival):
 
     def render(self, seed: int):
         """Render: (image, float64; seconds)."""
+        # A new process would have to make them
+        forget_regions()
         # A render has a seed for each of its passes
         image, took = render(
             self._scene, self.integrator, sensor=self.sensor, time=self._wanted, seed=1000 * seed, denoise=self._denoise

@@ -47,6 +47,12 @@ def regions_of(environment, count: int, most_columns: int = _LARGEST_WIDTH) -> E
     return found[1]
 
 
+def forget_regions() -> None:
+    """Forget the regions of the previous call, so that the time of a render includes them."""
+    global _previous
+    _previous = None
+
+
 class EnvironmentRegions:
     """``count`` regions of an environment, all arrays float64.
 
