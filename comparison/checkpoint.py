@@ -36,7 +36,8 @@ def file_of(image):
 class Checkpoint:
     """Checkpoint file of a render, which continues from it if `resume`. `made_by`: everything that the image depends on
     except the number and sizes of passes, a dict for JSON. The checkpoint of another render is refused. `stays`:
-    whether the file of a finished render stays until `remove`, as the image could not be written."""
+    whether the file stays after the end of a render, until `remove`, which the caller calls once the image is
+    written."""
 
     def __init__(self, path, made_by, resume=True, stays=False):
         self.path, self._made_by, self._resume, self._stays = Path(path), made_by, resume, stays
@@ -107,8 +108,8 @@ class Checkpoint:
         self._saved = kept
 
     def leave(self):
-        """Write the file after the last pass; return whether that succeeded. A failure is logged, as the passes are not
-        lost."""
+        """Write the passes so far to the file; return whether that succeeded. A failure is logged, as the passes are
+        not lost."""
         return self._writer.write(self.save)
 
     def finish(self):

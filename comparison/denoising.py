@@ -92,7 +92,8 @@ class Denoiser:
     time limit it is the best one. `copies`: number of denoised copies, 1 by networks other than the best one.
     `hide_emitters`: of the integrator. `restores`: whether the limits allow detail (detail.py); `has_detail`: whether
     the last image of `denoise_passes` has it. `like`: another `Denoiser` of such images, whose decisions this one
-    takes: `parts`, `quality`, `copies` and `restores`. It measures all the same, so that it takes as long.
+    takes: `parts`, `quality`, `copies` and `restores`. It measures what that one measured, so that it takes as long.
+    The argument `parts` then does not count.
     """
 
     def __init__(
@@ -103,12 +104,14 @@ class Denoiser:
         self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
         one = scene.sensors()[sensor]
         self._filter, self._size = one.film().rfilter(), np.array(one.film().crop_size(), np.int64)
-        self.parts = parts = like.parts if like else parts
+        self.parts = self._asked_parts = parts = like._asked_parts if like else parts
         self._known = {}  # (parts, quality) -> expected seconds
         if parts > 1 and time_limit is not None:
             # The time of a network is that of its tiles at the resolution of `parts`
             is_quick = self._expected(quality or QUALITIES[-1]) <= FINE_SHARE * time_limit
-            self.parts = parts if is_quick or like else 1
+            self.parts = parts if is_quick else 1
+        if like:
+            self.parts = like.parts
         self.features, self.feature_spp = features_of(scene, one, seed, spp, time_limit, self.parts, hide_emitters)
         ways = [way for way in WAYS if quality in (None, way[0])]
         self.quality, self.copies = self._usual_way(ways, spp, time_limit)

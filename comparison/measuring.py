@@ -54,8 +54,8 @@ def measure(progressive, job):
 
 
 def _sizes_of_samples(progressive, job):
-    """Return the sizes of the passes of a job with a number of samples per pixel: the largest that the sampler keeps,
-    as samples that it adds would not be those of the job."""
+    """Return the sizes of the passes of a job with a number of samples per pixel: `job.pass_spp`, or the largest size
+    that the sampler does not round up. Otherwise the image would have more samples than the job asks for."""
     largest, least = job.pass_spp or progressive.largest_pass, progressive.parts**2
     while not job.pass_spp and least < largest < job.spp and not progressive.accepts(largest):
         largest -= 1
@@ -96,13 +96,13 @@ def _render_cold(progressive, job):
 
 def _compile(progressive, sizes, seeds):
     """Render warm-up passes that compile the kernels for passes of `sizes` (samples per pixel); return the seconds of
-    the first. Small passes come first. Full-size passes follow if they take at most `LONG_PASS`, because integrators
-    may use other kernels for more samples."""
+    the first. Small passes come first. Full-size passes follow if they take at most `LONG_PASS`, unless they have the
+    kernels of the small ones."""
     least = progressive.parts**2  # samples of a pass of a fine film
     # Keeps "is a power of two"
     small = {spp: min(spp, least * (WARM_SPP + (spp & (spp - 1) != 0))) for spp in sizes}
     cold, *_ = [progressive.render(spp, next(seeds)).seconds for spp in dict.fromkeys(small.values())]
-    for spp in sorted({*sizes} - {*small.values()}):
+    for spp in [] if progressive.shares_kernels else sorted({*sizes} - {*small.values()}):
         seconds = progressive.render(small[spp], next(seeds)).seconds
         if seconds * spp / small[spp] <= LONG_PASS:
             progressive.render(spp, next(seeds))

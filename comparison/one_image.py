@@ -13,7 +13,7 @@ from .occasional import OccasionalWriter
 from .progress import ImageBar
 from .render import DENOISING, render
 from .scene_files import SceneFile
-from .single_pass import expected_channels
+from .single_pass import check_film
 
 WRITE_SECONDS = 10.0  # between writes of the unfinished image
 INTERRUPTED = 130  # exit status
@@ -92,14 +92,15 @@ class Image:
                     self._check_file(self._scene.get())
                 output.metadata = self._described | {"load_seconds": self._scene.seconds, **command_line.versions()}
                 image, took = self._render(output)
+            if self._remote:
+                output.metadata["workers"] = self._remote.workers
+            output.keep(took, image)
+            if took.ended_by != "interruption":
+                output.write_last()
         except KeyboardInterrupt:
             return output.end_early()
-        if self._remote:
-            output.metadata["workers"] = self._remote.workers
-        output.keep(took, image)
         if took.ended_by == "interruption":
             return output.end_early()
-        output.write()
         if self._checkpoint:
             self._checkpoint.remove()
         print(
@@ -117,8 +118,7 @@ class Image:
     def _check_file(self, scene):
         """Raise ValueError before the render if its images have no colour for a PNG file."""
         if self.path.suffix == ".png":
-            channels = expected_channels(scene.sensors()[self._sensor], self._scene.integrator)
-            images.check_colour(channels, f"'{self.path}'")
+            check_film(scene.sensors()[self._sensor], self._scene.integrator, f"'{self.path}'")
 
     def _limits(self):
         return {name: getattr(self._options, name) for name in ("error", "time", "spp", "seed", "pass_spp")}
@@ -175,17 +175,27 @@ class Output:
         self._writer.offer(self.write)
 
     def end_early(self):
-        """Write the last image, report that on the standard error, and return the exit status."""
-        if self._took is None:
-            print("manylights: interrupted before the first pass was finished; nothing was written", file=sys.stderr)
-        else:
-            self.write()
+        """Write the last image, report on the standard error what there is, and return the exit status."""
+        if self._took is not None:
             resume = "; --resume goes on" if self._checkpoint and self._checkpoint.leave() else ""
-            print(
-                f"manylights: interrupted; wrote {self._took.spp} samples per pixel to {self.path}{resume}",
-                file=sys.stderr,
-            )
+            self.write()
+            said = f"; wrote {self._took.spp} samples per pixel to {self.path}{resume}"
+        elif self._checkpoint and self._checkpoint.path.is_file():
+            # Of an earlier process, perhaps with all passes
+            said = f" without a new pass; '{self._checkpoint.path}' stays, and --resume goes on from it"
+        else:
+            said = " before the first pass was finished; nothing was written"
+        print(f"manylights: interrupted{said}", file=sys.stderr)
         return INTERRUPTED
+
+    def write_last(self):
+        """Write the image of a finished render. If that fails, a checkpoint with all passes stays."""
+        try:
+            self.write()
+        except Exception:
+            if self._checkpoint:
+                self._checkpoint.leave()
+            raise
 
     def write(self):
         """Write the last image."""

@@ -7,7 +7,9 @@ from contextlib import contextmanager
 from tqdm import tqdm
 
 BAR = "{desc} |{bar}| {n_fmt}/{total_fmt} runs{postfix}"
-SAME = 3, 2, 0  # common parts of runs that tell of each other: the setting, the label on this scene, nothing
+# Numbers of equal parts of (scene, label, setting), by which the time of a run is expected from that of others: the
+# same setting on the scene, the same label on the scene, any run
+SAME = 3, 2, 0
 IMAGE_BAR = "{desc}|{bar}| {percentage:.0f}%{postfix}"
 
 

@@ -23,11 +23,10 @@ from .denoising import Denoiser, for_denoising, quality_of
 from .ending import Ending, checked
 from .features import channels_of, check_layers, hides_emitters, layers_of
 from .fine_film import usual_parts
-from .images import check_colour
 from .interruption import Interruption, is_interruption
 from .rendering import Progressive
 from .scene_files import SceneFile
-from .single_pass import expected_channels
+from .single_pass import check_film
 from .timed_sizes import sizes_of
 
 LIMITS = ("spp", "time")  # end a render regardless of its error
@@ -133,7 +132,7 @@ def render(
         spp = scene.sensors()[sensor].sampler().sample_count()
     begin = clock.perf_counter()
     if denoise:
-        check_colour(expected_channels(scene.sensors()[sensor], integrator), "denoise")
+        check_film(scene.sensors()[sensor], integrator, "denoise")
     # Passes of a checkpoint have the usual resolution, as the choice depends on times
     parts = 1 if checkpoint or not denoise else usual_parts(scene.sensors()[sensor], integrator, spp)
     of_image = {"seed": seed, "spp": spp, "time_limit": time, "hide_emitters": hides_emitters(integrator)}
@@ -183,7 +182,7 @@ def render_passes(progressive, sizes, ending, begin, progress=None, denoiser=Non
     """
     running = _Render(progressive, ending, begin, progress, checkpoint, layers)
     with Interruption() as interruption:
-        running.run(sizes, interruption)
+        running.run(sizes, interruption, stays=denoiser is not None)
     if not progressive.passes:
         raise KeyboardInterrupt if interruption.asked else RuntimeError("cancelled before the first pass was finished")
     image, took = running.result(denoiser)
@@ -233,12 +232,15 @@ class _Render:
             # The checkpoint may be of a render that reached its error, and whose image was lost
             self._judge()
 
-    def run(self, sizes, interruption):
-        """Render passes until the end; leave a checkpoint, as there is no image yet."""
+    def run(self, sizes, interruption, stays):
+        """Render passes until the end. Leave a checkpoint with all of them unless the render is complete, or if it
+        `stays`, for a denoiser, which may fail. Otherwise the image follows at once, and the file is removed."""
+        complete = False
         try:
             self._run(sizes, interruption)
+            complete = self._ended_by in (*LIMITS, "error")
         finally:
-            if self._checkpoint:
+            if self._checkpoint and (stays or not complete):
                 self._checkpoint.leave()
 
     def _run(self, sizes, interruption):

@@ -244,10 +244,22 @@ class Progressive(Passes):
     @property
     def largest_pass(self):
         """Maximum samples per pixel of a pass, whatever its time."""
+        return largest_pass(self.pixels, self.in_parts, self._in_one_kernel)
+
+    @property
+    def _in_one_kernel(self):
         # Plugins of this project tell how they render, and most of them store what the samples share. The others are
         # Mitsuba's; in comparisons, whose integrators have no nested ones, their passes are single kernels
-        in_one_kernel = not hasattr(self.integrator, "renders_in_parts")
-        return largest_pass(self.pixels, self.in_parts, in_one_kernel)
+        return not hasattr(self.integrator, "renders_in_parts")
+
+    @property
+    def shares_kernels(self):
+        """Whether passes of four samples or more have equal kernels, except that a power of two has others: those of
+        Mitsuba's integrators with the sampler `independent`. Kernels of other samplers contain the number of
+        samples."""
+        if not self._in_one_kernel:
+            return False
+        return self._scene.sensors()[self._sensor].sampler().class_name() == "IndependentSampler"
 
     @property
     def pixels(self):

@@ -224,13 +224,20 @@ class SceneFile:
 
     def _found_sensors(self):
         """Return the indices of the sensors of the scene and of its shapes; others are parts of sensors."""
+        nodes, kind = self._state.nodes, mi.ObjectType.Sensor
+        children = self._parts(self._state.root.props)
+        sensors = {index for index, node in enumerate(nodes) if node.type == kind}
+        known = sensors.intersection(children)
+        known.update(*(self._parts(nodes[index].props, kind) for index in sensors))
+        if known == sensors:
+            # Without a look at the shapes, which takes long for many
+            return [index for index in children if index in sensors]
         found = []
-        for index in self._parts(self._state.root.props):
-            node = self._state.nodes[index]
-            if node.type == mi.ObjectType.Sensor:
+        for index in children:
+            if index in sensors:
                 found.append(index)
-            elif node.type == mi.ObjectType.Shape:
-                found += self._parts(node.props, mi.ObjectType.Sensor)
+            elif nodes[index].type == mi.ObjectType.Shape:
+                found += self._parts(nodes[index].props, kind)
         return found
 
 

@@ -15,7 +15,7 @@ from vpl.core.stages import Stage
 from vpl.split.film_cells import HALF
 
 from .fine_film import fine_film
-from .images import colour, planes_of
+from .images import check_colour, colour, planes_of
 
 MAXIMUM_PASS_SAMPLES = 2**21  # pixel samples of a pass: bounds memory, and the time to the first image
 MORE_IN_PARTS = 4  # factor of the above for a pass that is rendered in parts
@@ -158,12 +158,17 @@ def render_pass(
     return PassImage(planes[..., rest], [channels[index] for index in rest], taken, of_half)
 
 
-def expected_channels(sensor, integrator):
-    """Return the names of the channels of images by an integrator for a `mi.Sensor`, before a render. Empties the film.
-    Raises RuntimeError if another thread uses the sensor."""
+def check_film(sensor, integrator, purpose):
+    """Raise ValueError before a render if images by an integrator for a `mi.Sensor` have no colour, which the `purpose`
+    needs. May empty the film. Raises RuntimeError if another thread uses the sensor."""
+    film = sensor.film()
+    if film.class_name() == "HDRFilm":
+        # Each of its pixel formats has colour. To develop an image for the names takes memory and time
+        return
     with exclusive(sensor=sensor):
-        sensor.film().prepare(integrator.aov_names())
-        return planes_of(sensor.film().bitmap())[1]
+        film.prepare(integrator.aov_names())
+        _, channels = planes_of(film.bitmap())
+    check_colour(channels, purpose)
 
 
 def _render(scene, sensor, integrator, spp, seed, parts):

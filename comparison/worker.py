@@ -141,8 +141,7 @@ def render(job):
     parameters, scene = file.integrator[1], file.load(job.threads)
     load_seconds = time.perf_counter() - begin
 
-    usual = usual_parts(scene.sensors()[0], scene.integrator(), job.spp)
-    denoiser = _denoiser(scene, job, usual) if job.denoised_output else None
+    denoiser = _denoiser(scene, job) if job.denoised_output else None
     # Pixels may have different numbers of samples, which the denoiser decides, if the render ends by time
     decides = denoiser and job.budget and hasattr(scene.integrator(), "may_differ")
     parts, denoise = denoiser.parts if denoiser else 1, denoiser.denoise if decides else None
@@ -178,11 +177,13 @@ def render(job):
     return result | {"vpl_output": _render_vpl(job, progressive, described) if job.vpl_folder else None}
 
 
-def _denoiser(scene, job, parts, like=None):
-    """Return the `Denoiser` for the image of a job; `parts`, `like`: see there."""
+def _denoiser(scene, job, like=None):
+    """Return the `Denoiser` for the image of a job; `like`: see there."""
+    integrator = scene.integrator()
+    parts = usual_parts(scene.sensors()[0], integrator, job.spp)
     return Denoiser(
         scene, seed=job.seed, spp=None if job.budget else job.spp, time_limit=job.budget, parts=parts,
-        hide_emitters=hides_emitters(scene.integrator()), like=like,
+        hide_emitters=hides_emitters(integrator), like=like,
     )  # fmt: skip
 
 
@@ -192,7 +193,7 @@ def _denoise(job, scene, progressive, denoiser, described):
     if not denoiser:
         return {"denoise_seconds": None, "cold_denoise_seconds": None}
     seconds = []
-    for one in (denoiser, _denoiser(scene, job, denoiser.parts, denoiser)):
+    for one in (denoiser, _denoiser(scene, job, denoiser)):
         begin = time.perf_counter()
         image = one.denoise_passes(progressive)
         seconds.append(one.start_seconds + time.perf_counter() - begin)

@@ -6,10 +6,9 @@ import time as clock
 from ..denoising import Denoiser, quality_of
 from ..ending import Ending, checked
 from ..features import check_layers, hides_emitters, layers_of
-from ..images import check_colour
 from ..pass_sizes import PassSizes
 from ..render import render_passes
-from ..single_pass import expected_channels
+from ..single_pass import check_film
 from .passes import DistributedPasses, samples_of_a_pass
 from .pool import TASKS_PER_WORKER
 from .scene_travel import bundle
@@ -58,7 +57,7 @@ class DistributedRender:
             if layers:
                 check_layers(layers, self._scene.integrator)
             if denoise:
-                check_colour(expected_channels(scene.sensors()[self._sensor], self._scene.integrator), "denoise")
+                check_film(scene.sensors()[self._sensor], self._scene.integrator, "denoise")
             of_image = {"seed": self._seed, "spp": self.spp, "time_limit": self._time}
             if scene:
                 of_image["hide_emitters"] = hides_emitters(self._scene.integrator)

@@ -364,6 +364,22 @@ def test_a_denoiser_may_decide_as_another_one(monkeypatch):
     assert like.features["albedo"].shape == (128, 128, 3)
 
 
+def test_a_denoiser_that_decides_as_another_one_measures_what_that_one_measured(monkeypatch):
+    """Also where the first one falls from two parts to one."""
+    made_up_networks(monkeypatch, 0.37)
+    measured, expected_by_tiles = [], Denoiser._expected_by_tiles
+    monkeypatch.setattr(
+        Denoiser,
+        "_expected_by_tiles",
+        lambda self, quality: measured.append((self, self.parts, quality)) or expected_by_tiles(self, quality),
+    )
+    scene = cornell(40).load()
+    first = Denoiser(scene, time_limit=1000, parts=2)
+    like = Denoiser(scene, time_limit=1000, like=first)
+    own, other = ([more for found, *more in measured if found is one] for one in (first, like))
+    assert first.parts == like.parts == 1 and own[0][0] == 2 and own == other
+
+
 def test_a_run_is_denoised_as_its_first_denoiser_decided(tmp_path, monkeypatch):
     """The second one, whose time is told, makes the image."""
     slower_from_the_second_on(monkeypatch)

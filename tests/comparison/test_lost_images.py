@@ -1,6 +1,8 @@
 """Renders whose image is lost after the last pass go on from their checkpoint; images without colour are refused."""
 
+import json
 import re
+import signal
 
 import mitsuba as mi
 import numpy as np
@@ -12,6 +14,7 @@ from comparison.checkpoint import Checkpoint
 from comparison.denoising import Denoiser
 from comparison.rendering import Passes, Progressive
 from comparison.scene_files import SceneFile
+from comparison.single_pass import check_film
 from tests.comparison.cluster.test_cluster import pass_of
 from tests.support.distributed_renders import TINY
 from tests.support.paths import CORNELL
@@ -81,6 +84,74 @@ def test_a_render_whose_image_is_lost_goes_on(breaks, error, status, said, passe
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
+def interrupt(*_, **__):
+    raise KeyboardInterrupt
+
+
+def test_ctrl_c_in_the_denoiser_of_a_render_without_a_new_pass_tells_of_the_checkpoint(
+    passes, tmp_path, monkeypatch, capfd
+):
+    with monkeypatch.context() as patched:
+        denoiser_of(tmp_path, patched, MemoryError("out of memory"))
+        assert command(tmp_path / "a.exr", "--denoise") == 1
+        capfd.readouterr()
+        denoiser_of(tmp_path, patched, KeyboardInterrupt())
+        assert command(tmp_path / "a.exr", "--denoise") == 130
+    said = f"interrupted without a new pass; '{tmp_path / 'a.checkpoint.npz'}' stays, and --resume goes on from it"
+    assert said in capfd.readouterr().err and files_of(tmp_path) == ["a.checkpoint.npz"]
+    assert command(tmp_path / "a.exr", "--denoise") == 0 and passes == [4, 4]
+
+
+def test_ctrl_c_before_the_first_pass_wrote_nothing(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(Progressive, "render", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    assert command(tmp_path / "a.exr") == 130 and files_of(tmp_path) == []
+    assert "interrupted before the first pass was finished; nothing was written" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("where", ["keep", "write"])
+def test_ctrl_c_while_the_last_image_is_written_tells_what_there_is(where, tmp_path, monkeypatch, capfd):
+    original, calls = getattr(one_image.Output, where), []
+
+    def broken(self, *arguments):
+        calls.append(arguments)
+        # `keep` is called after each of two passes, and with the last image
+        if len(calls) == {"keep": 3, "write": 1}[where]:
+            raise KeyboardInterrupt
+        original(self, *arguments)
+
+    monkeypatch.setattr(one_image.Output, where, broken)
+    assert command(tmp_path / "a.exr") == 130
+    said = f"interrupted; wrote 8 samples per pixel to {tmp_path / 'a.exr'}; --resume goes on"
+    assert said in capfd.readouterr().err and files_of(tmp_path) == ["a.checkpoint.npz", "a.exr"]
+
+
+@pytest.fixture
+def saved(monkeypatch):
+    """The numbers of passes of the checkpoints that are written."""
+    found, savez = [], np.savez
+
+    def noted(file, **arrays):
+        found.append(len(json.loads(arrays["described"].item())["passes"]))
+        savez(file, **arrays)
+
+    monkeypatch.setattr(np, "savez", noted)
+    return found
+
+
+def test_a_render_that_is_complete_writes_no_checkpoint(saved, tmp_path):
+    """It would be removed as soon as it is written."""
+    assert command(tmp_path / "a.exr") == 0
+    assert saved == [] and files_of(tmp_path) == ["a.exr"]
+
+
+def test_an_image_that_cannot_be_written_leaves_all_of_its_passes(saved, tmp_path, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr(images, "write", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+        assert command(tmp_path / "a.exr") == 1
+    assert saved == [2] and files_of(tmp_path) == ["a.checkpoint.npz"]
+    assert command(tmp_path / "a.exr") == 0 and files_of(tmp_path) == ["a.exr"]
+
+
 def test_a_render_that_reached_its_error_and_was_lost_has_no_further_pass(tmp_path, passes):
     scene, file = SceneFile(CORNELL, TINY).load(1), Checkpoint(tmp_path / "a.checkpoint.npz", {})
 
@@ -134,6 +205,12 @@ def test_what_needs_colour_is_refused_before_the_first_pass(output, more, purpos
     else:
         assert re.search(f"manylights: {purpose} needs an image with colour .*no colour channels among blue, red", said)
         assert passes == [] and files_of(tmp_path) == ["scene.xml"]
+
+
+def test_a_film_with_colour_by_its_format_is_not_developed(monkeypatch):
+    sensor = SceneFile(CORNELL, TINY).load(1).sensors()[0]
+    monkeypatch.setattr(type(sensor.film()), "bitmap", interrupt)
+    check_film(sensor, mi.load_dict({"type": "path"}), "denoise")
 
 
 def test_a_png_file_without_colour_by_workers_is_refused_after_the_first_pass(tmp_path):

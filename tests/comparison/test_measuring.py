@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import drjit as dr
 import mitsuba as mi
 import pytest
 
@@ -70,6 +71,32 @@ def test_passes_in_parts_are_those_of_a_render_by_time_and_include_a_pilot():
     assert all(is_unused for _, is_unused in warm) and not any(is_unused for _, is_unused in measured)
     assert sum(one.statistics["pilots"] for one in progressive.passes) == 1
     assert 9 < progressive.seconds < 10.2
+
+
+def test_small_passes_alone_compile_kernels_that_do_not_depend_on_the_samples():
+    progressive = InOneKernel(8 * single_pass.MAXIMUM_PASS_SAMPLES // 9)
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", spp=19))
+    assert progressive.asked == [(5, True), (1, True), (9, False), (9, False), (1, False)]
+
+
+@pytest.mark.parametrize(("sampler", "shares"), [("independent", True), ("multijitter", False), ("stratified", False)])
+def test_kernels_of_samplers_that_stratify_depend_on_the_samples(sampler, shares):
+    file = cornell(16)
+    file.set_sampler(sampler)
+    progressive = rendering.Progressive(file.load(), 0, integrator=mi.load_dict({"type": "path"}))
+    assert progressive.shares_kernels is shares
+    kernels = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for spp in (1, 4, 64):  # the first pass also compiles what the scene needs once
+            dr.kernel_history_clear()
+            progressive.render(spp)
+            kernels.append({one["hash"] for one in dr.kernel_history([dr.KernelType.JIT])})
+    assert (kernels[2] <= kernels[1]) is shares
+
+
+def test_kernels_of_this_project_are_compiled_for_every_size():
+    scene = cornell(16).load()
+    assert not rendering.Progressive(scene, 0, integrator=mi.load_dict({"type": "vpl"})).shares_kernels
 
 
 def test_only_small_passes_compile_where_passes_are_long():
@@ -149,9 +176,9 @@ def test_integrators_of_mitsuba_have_larger_passes_than_those_that_store_points(
 
 
 class InOneKernel(Recorded):
-    """The same by an integrator of Mitsuba."""
+    """The same by an integrator of Mitsuba, with the sampler `independent`."""
 
-    integrator = None
+    integrator, shares_kernels = None, True
 
 
 @pytest.mark.parametrize(("budget", "start", "passes"), [(60, 0, [18, 18, 18, 6]), (30, 4, [11, 11]), (30, 15, [1, 1])])

@@ -65,6 +65,19 @@ def test_sensors_and_their_films_are_those_of_the_loaded_scene(tmp_path, content
     assert [tuple(sensor.film().crop_size()) for sensor in file.load().sensors()] == sizes
 
 
+@pytest.mark.parametrize(("sensor", "looks"), [("", False), ('<sensor type="irradiancemeter"/>', True)])
+def test_shapes_are_only_searched_for_sensors_that_are_found_nowhere_else(tmp_path, sensor, looks, monkeypatch):
+    """Copies of the properties of many shapes take long."""
+    seen, parts = [], SceneFile._parts
+    monkeypatch.setattr(
+        SceneFile,
+        "_parts",
+        lambda self, properties, *kind: seen.append(properties.plugin_name()) or parts(self, properties, *kind),
+    )
+    file = scene_file(tmp_path, camera(8, 4) + BATCH + LAMP + f'<shape type="sphere">{sensor}</shape>')
+    assert file.sensors == (3 if looks else 2) and ("sphere" in seen) is looks
+
+
 def test_parts_by_reference_are_those_of_the_sensor(tmp_path):
     file = scene_file(tmp_path, PARTS + '<sensor type="perspective"><ref id="picture"/><ref id="sampler"/></sensor>')
     assert file.sampler_name == "multijitter" and file.sampling(0)[1].class_name() == "MultijitterSampler"
