@@ -4,6 +4,8 @@ from itertools import count
 
 import numpy as np
 
+from vpl.direct.environment_regions import forget_regions
+
 from .pass_sizes import FIRST_SAMPLES
 from .single_pass import pass_seed, pass_sizes
 from .timed_sizes import sizes_of
@@ -29,13 +31,13 @@ def measure(progressive, job):
         # Once to compile the kernels of all sizes
         _render_in_time(progressive, job.budget, unused)
         cold = progressive.passes[0].seconds
-        progressive.restart()
+        _begin(progressive)
         _render_in_time(progressive, job.budget)
         return cold
     if job.spp:
         sizes = _sizes_of_samples(progressive, job)
         cold = _compile(progressive, sizes, unused)
-        progressive.restart()
+        _begin(progressive)
         for spp in sizes:
             progressive.render(spp)
         return cold
@@ -45,12 +47,18 @@ def measure(progressive, job):
     else:
         cold = _compile(progressive, [1], unused)
         spp, start = _samples_of_a_pass(progressive, job.budget, unused)
-    progressive.restart()
+    _begin(progressive)
     following = spp
     while following:
         progressive.render(following)
         following = _samples_that_fit(progressive, spp, job.budget, start)
     return cold
+
+
+def _begin(progressive):
+    """Begin a render without what warm-up passes have learned; compiled kernels remain."""
+    progressive.restart()
+    forget_regions()
 
 
 def _sizes_of_samples(progressive, job):

@@ -10,6 +10,8 @@ import pytest
 from comparison import measuring, rendering, single_pass, worker
 from tests.support.scenes import cornell
 from vpl.core.stages import Stage
+from vpl.direct import environment_regions
+from vpl.direct.environment_regions import regions_of
 
 
 class Recorded(rendering.Progressive):
@@ -38,6 +40,20 @@ def test_kernels_of_every_size_of_pass_are_compiled_before_the_clock_runs():
     assert measuring.measure(progressive, job) == 2.0
     assert progressive.asked == [(5, True), (1, True), (5, True), (9, True), (9, False), (9, False), (1, False)]
     assert sum(one.spp for one in progressive.passes) == 19
+
+
+def test_measured_passes_make_the_regions_of_an_environment():
+    kept = regions_of(mi.load_dict({"type": "constant"}), 4)
+
+    class Looks(Recorded):
+        def render(self, spp, seed=None, is_probe=False, is_last=False):
+            self.found = environment_regions._previous
+            return super().render(spp, seed)
+
+    progressive = Looks(9, 2.0)
+    assert environment_regions._previous[1] is kept
+    measuring.measure(progressive, worker.Job("p", "path", "s.xml", "a.exr", spp=1))
+    assert progressive.found is None
 
 
 class InParts(Recorded):
