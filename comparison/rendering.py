@@ -248,8 +248,8 @@ class Progressive(Passes):
 
     @property
     def _in_one_kernel(self):
-        # Plugins of this project tell how they render, and most of them store what the samples share. The others are
-        # Mitsuba's; in comparisons, whose integrators have no nested ones, their passes are single kernels
+        # Plugins of this project have the attribute, and most of them store arrays for each sample. Passes of Mitsuba's
+        # integrators are single kernels, as comparisons have no nested integrators
         return not hasattr(self.integrator, "renders_in_parts")
 
     @property

@@ -139,7 +139,7 @@ def saved(monkeypatch):
 
 
 def test_a_render_that_is_complete_writes_no_checkpoint(saved, tmp_path):
-    """It would be removed as soon as it is written."""
+    """The command removes a checkpoint once the image is written."""
     assert command(tmp_path / "a.exr") == 0
     assert saved == [] and files_of(tmp_path) == ["a.exr"]
 

@@ -246,7 +246,7 @@ def _wave(
         # The next surface is too deep to gather, so following both costs no additional gather point
         both = depth + 1 == limits.max_depth
         goes_on, stays, direction, following, own, smooth_weight = _follow_delta(si, bsdf, flags, both, *random[:3])
-        eta *= own
+        eta = eta * own
     gathered = hit & mi.has_flag(flags, mi.BSDFFlags.Smooth) & stays & (depth < limits.max_depth)
     weight = throughput * smooth_weight
     if traits.delta:
