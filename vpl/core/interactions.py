@@ -127,6 +127,17 @@ def ray_to_emitter(si, direction: mi.Vector3f, point: mi.Point3f, is_infinite: m
     return dr.select(is_infinite, si.spawn_ray(direction), si.spawn_ray_to(point))
 
 
+def direction_sample(point: mi.Point3f, hit: mi.SurfaceInteraction3f, direction: mi.Vector3f):
+    """Mitsuba's record of the ``direction`` from a point to a surface, for densities of emitter samples.
+
+    The record has no emitter: kernels call no emitter pointers.  The distance is that from the point, because null
+    surfaces may have divided the ray.  The normal is the shading normal, as in emitter samples.
+    """
+    ds = dr.zeros(mi.DirectionSample3f, dr.width(point))
+    ds.p, ds.n, ds.uv, ds.d, ds.dist = hit.p, hit.sh_frame.n, hit.uv, direction, dr.norm(hit.p - point)
+    return ds
+
+
 def _by_mitsuba(shape, ray, hit, active):
     si = shape.compute_surface_interaction(ray, hit, mi.RayFlags.All, active)
     # A shape names itself by its index in Mitsuba's registry.  As a constant, it would make code of its own for each

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import finite_or_zero
-from ..core.interactions import ray_to_emitter
+from ..core.interactions import direction_sample, ray_to_emitter
 from ..core.loops import recorded_once
 from ..core.path_limits import PathLimits
 from ..core.sampling import Choice, SpreadSamples, derived_seed, independent_sampler
@@ -70,9 +70,7 @@ class ExtendedEmitters:
         """Density of :meth:`sample` for the direction of a ray from ``si`` and the emitter that the ray hit."""
         density = dr.zeros(mi.Float, dr.width(si.p))
         areas = self.emitters.area.count
-        ds = dr.zeros(mi.DirectionSample3f, dr.width(si.p))
-        ds.p, ds.n, ds.uv, ds.d = hit.p, hit.sh_frame.n, hit.uv, direction
-        ds.dist = dr.norm(hit.p - si.p)
+        ds = direction_sample(si.p, hit, direction)
         if areas:
             row = self.emitters.area.row(hit, active & hit.is_valid())
             here = active & hit.is_valid() & (row > 0)

@@ -85,8 +85,8 @@ class OmniSampler:
     # Whether scattered rays never hit these emitters: only next-event estimation reaches them
     delta = True
 
-    def __init__(self, lights: VirtualLights):
-        self.power = _power_of_omni(lights)
+    def __init__(self, lights: VirtualLights, power: np.ndarray):
+        self.power = power
         self._choice = Choice(self.power)
         self._position = upload(mi.Float, lights.position)
         self._axis = upload(mi.Float, lights.direction)
@@ -233,8 +233,9 @@ def emitter_samplers(scene, emitters: Emitters, focus: Focus | None = None) -> l
     rays = ParallelRays(sphere, focus)
     samplers = []
     omni = VirtualLights.concatenate([emitters.points, emitters.spots])
-    if _power_of_omni(omni).sum() > 0:
-        samplers.append(OmniSampler(omni))
+    power = _power_of_omni(omni)
+    if power.sum() > 0:
+        samplers.append(OmniSampler(omni, power))
     if emitters.area.power.sum() > 0:
         samplers.append(AreaSampler(emitters.area))
     if emitters.directional.count:

@@ -33,36 +33,35 @@ def read_unbound(scene, group_of: Callable, known: list[mi.Emitter]) -> tuple[li
         name = emitter.class_name()
         if emitter.is_environment() or name == "AreaLight" or lights_nothing(emitter):
             continue
-        parameters, group = parameters_of(emitter), group_of(emitter)
+        parameters = parameters_of(emitter)
         intensity = constant_rgb(parameters, "irradiance" if name == "DirectionalEmitter" else "intensity")
-        row = None
         if name == "PointLight" and intensity is not None:
-            points.append([*numbers(parameters["position"]), *intensity, group])
-            continue
-        if name == "SpotLight" and intensity is not None and "texture.value" in parameters:
-            row = _round_spot(parameters, intensity, group)
-        if row is not None:
-            spots.append(row)
+            points.append([*numbers(parameters["position"]), *intensity, group_of(emitter)])
+        elif name == "SpotLight" and (spot := _round_spot(parameters, intensity)):
+            spots.append([*spot, group_of(emitter)])
         elif name == "DirectionalEmitter" and intensity is not None:
-            suns.append(_directional(parameters, intensity, group))
+            suns.append([*_directional(parameters, intensity), group_of(emitter)])
         elif not any(emitter is one for one in known):
             others.append((name, emitter))
     return points, spots, suns, others
 
 
-def _round_spot(parameters, intensity, group: int) -> list | None:
-    """The row of a spot emitter, None if the scale of its frame makes the cone oval, as Mitsuba's emitters have it."""
+def _round_spot(parameters, intensity) -> list | None:
+    """The row of a spot emitter, without the group; None for a texture, and if the scale of the frame makes the cone
+    oval, as it does in Mitsuba."""
+    if intensity is None or "texture.value" not in parameters:
+        return None
     matrix = matrix_of(parameters["to_world"])[:3]
     products = matrix[:, :3].T @ matrix[:, :3]
     square = products[2, 2]
     if np.abs(products - square * np.eye(3)).max() > _ROUNDING * square:
         return None
     cone = np.deg2rad([*numbers(parameters["cutoff_angle"]), *numbers(parameters["beam_width"])])
-    return [*matrix[:, 3], *(matrix[:, 2] / square**0.5), *intensity, *cone, group]
+    return [*matrix[:, 3], *(matrix[:, 2] / square**0.5), *intensity, *cone]
 
 
-def _directional(parameters, intensity, group: int) -> list:
+def _directional(parameters, intensity) -> list:
     axis = matrix_of(parameters["to_world"], (2,))[:3, 0]
     length = np.linalg.norm(axis)
     # Mitsuba 3.9.1 does not normalise the direction, so that cosines have the scale of the frame
-    return [*(axis / length), *(length * np.array(intensity)), group]
+    return [*(axis / length), *(length * np.array(intensity))]

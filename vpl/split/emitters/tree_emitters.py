@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...core.arrays import finite_or_zero, rgb_to_spectrum, upload
-from ...core.interactions import ray_to_emitter
+from ...core.interactions import direction_sample, ray_to_emitter
 from ...core.shapes import registered_shapes
 from ...lights.emission import bounding_sphere, solid_angle_radiance
 from ...lights.emitter_groups import EmitterGroups
@@ -198,9 +198,7 @@ class TreeEmitters(CellEmitters):
         """See :meth:`vpl.split.emitters.base.EmitterSampler.met`."""
         origin = dr.zeros(mi.Interaction3f)
         origin.p = vertex
-        ds = dr.zeros(mi.DirectionSample3f)
-        # From the vertex, as null surfaces have divided the ray, and with the normal of `sample`, that of the shading
-        ds.p, ds.n, ds.uv, ds.d, ds.dist = si.p, si.sh_frame.n, si.uv, ray.d, dr.norm(si.p - vertex)
+        ds = direction_sample(vertex, si, ray.d)
         density, nearness = mi.Float(0), mi.Float(dr.inf)
         if self._areas:
             after = self._emitters.area.row(si, active & has_density & si.is_valid())
