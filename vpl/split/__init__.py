@@ -29,6 +29,10 @@ The terms of the estimator:
 - ``film_cells``: the rays of the pixels of a film that is finer than the image
 - ``lattice``: stratified random numbers for the samples of a pixel
 - ``emitters``: emitter samplers for next-event estimation
+- ``relays``: glass and mirrors by way of which light arrives, as targets of paths
+- ``relays_found``: which glass and mirrors, and how much light arrives by each
+- ``onward``: directions in which paths go on: of the BSDF, or to relays
+- ``edges_from_places``: first edges of paths that find the irradiance of places
 - ``spatial_cells``: cubes of space by facing, for values learned by place
 
 The lights and the decisions:

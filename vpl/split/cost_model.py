@@ -64,16 +64,19 @@ class CostModel:
         1 << 12, "camera rays", "Up to this size, pilots have the larger share.", "2.5 s: 4096 as good as 8192"
     )
     learned_cost: float = _constant(
-        1.15,
-        "paths",
-        "Cost of a path with learned emitters: more of its shadow rays reach an emitter.",
-        "15% and more in living_room and kitchen",
+        1.15, "paths", "Cost of a path with learned emitters: more shadow rays reach one.", "15% and more in kitchen"
     )
     learned_sky_cost: float = _constant(
         1.25,
         "paths",
         "The same where regions of the environment are learned, whose rays leave the scene.",
         "64 samples: kitchen_windows 1.15, foliage 1.25, arcade and forest_lights 1.36, living_room 1.40",
+    )
+    relayed_noise: float = _constant(
+        0.1, "variance", "Least part of the noise by glass and mirrors to sample them.", "staircase2 has 0.36"
+    )
+    relay_cost: float = _constant(
+        1.3, "paths", "Cost of a path that samples glass and mirrors.", "four rooms, lamps in glass: 1.25 to 1.33"
     )
     trimmed: float = _constant(
         0.001,
@@ -83,10 +86,7 @@ class CostModel:
         most=1,
     )
     black: float = _constant(
-        0.01,
-        "squared mean",
-        "Squared brightness added to that of every pixel, as the comparison's relMSE does.",
-        "definition of the error",
+        0.01, "squared mean", "Added to the squared brightness of each pixel, as in relMSE.", "definition of the error"
     )
     brightness_spread: float = _constant(
         0.15,

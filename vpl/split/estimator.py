@@ -68,7 +68,7 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
 
     ``kept``: lights of earlier images, or None; ``stopped``: whether to end early.
     """
-    view = replace(view, emitters=start.emitters_for(view.count))
+    view = replace(view, emitters=start.emitters_for(view.count), relays=start.relays)
     decision = decide(view, start)
     view, samples = with_emitter_samples(view, decision)
     view, roulette = with_roulette(view, decision)
@@ -76,7 +76,8 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
     lights, of_lights = make_lights(view, decision, kept, clock)
     radiance, valid, layers, of_image = render_image(view, lights, decision, stopped, clock)
     precision = {"precision": decision.precision(view.samples)}
-    statistics = {"plan": decision.plan.reason} | precision | samples | roulette | of_lights | of_image
+    relays = {"relays": start.relays.count} if start.relays else {}
+    statistics = {"plan": decision.plan.reason} | precision | relays | samples | roulette | of_lights | of_image
     return Estimate(radiance, valid, layers, decision, statistics | {"seconds": clock.seconds})
 
 

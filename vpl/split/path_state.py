@@ -14,6 +14,8 @@ from ..transport.minorant import is_diffuse, minorant_of, side_of
 from .contributions import Contributions
 from .gather_vertices import Gathered
 from .local_c import LocalC
+from .onward import Onward
+from .relays import Relays
 from .roulette import OutgoingRadiance
 
 
@@ -46,7 +48,8 @@ class PathSettings:
 
     Two more Python bools; ``plain`` and not ``several`` make smaller kernels.  ``plain``: whether paths find only
     radiance and alpha: virtual lights carry nothing, and there are no records for decisions and lights.  ``several``:
-    whether first scattering vertices may have several emitter samples.
+    whether first scattering vertices may have several emitter samples.  ``meets_relays``: whether paths may meet relays
+    (a Python bool); ``relays``: targets of paths, or None.
     """
 
     max_depth: mi.UInt32
@@ -60,6 +63,8 @@ class PathSettings:
     hide_emitters: bool
     plain: bool = False
     several: bool = True
+    meets_relays: bool = False
+    relays: Relays | None = None
 
 
 @dataclass
@@ -142,7 +147,8 @@ class Path(Edge):
 
     ``depth``: edges before; ``eta``: as in ``path``; ``scattered``: number of scattering vertices; ``valid``: whether
     the path met a surface counted in the film's alpha; ``carried``: β F1 before x2, w β F1 F2 at x2; ``cosine``: cosθ1;
-    the last two are None for plain paths.
+    these two are None for plain paths; ``relayed``: whether the edge begins at a relay (:mod:`vpl.split.relays`) that
+    the path met after another surface, None if this is not recorded.
     """
 
     depth: mi.UInt32
@@ -151,6 +157,7 @@ class Path(Edge):
     valid: mi.Bool
     carried: mi.UnpolarizedSpectrum | None = None
     cosine: mi.Float | None = None
+    relayed: mi.Bool | None = None
 
     @classmethod
     def of(cls, first: FirstEdge, settings: PathSettings) -> Path:
@@ -160,6 +167,7 @@ class Path(Edge):
         path = cls(*copies, mi.UInt32(0), mi.Float(1), mi.UInt32(0), mi.Bool(False))
         if not settings.plain:
             path.carried, path.cosine = dr.zeros(mi.UnpolarizedSpectrum, dr.width(first.throughput)), mi.Float(1)
+            path.relayed = mi.Bool(False) if settings.meets_relays else None
         return path
 
     def divide_by(self, survival: mi.Float) -> None:
@@ -218,7 +226,7 @@ class Vertex:
 
     ``hit``; ``gathers``, ``weight``: mask and weights of gather vertices, None in plain paths; ``cell`` of the emitter
     sampler; ``samples``: number of emitter samples; ``share`` of a sample in their light; ``numbers`` of the lattice;
-    ``scatters``: whether a sample of the BSDF is needed.
+    ``scatters``: whether a sample of the BSDF is needed; ``onward``: to relays, None without relays.
     """
 
     hit: Hit
@@ -229,6 +237,7 @@ class Vertex:
     share: mi.Float
     numbers: tuple
     scatters: mi.Bool
+    onward: Onward | None
 
 
 @dataclass
@@ -237,27 +246,32 @@ class Noise:
 
     ``seen``: emission at the end of the first edge; ``difference``: contributions of the emitter samples with even
     numbers at the first scattering vertex less those with odd numbers; ``alone_excess``: radiance with the first of
-    these samples alone, weighted as a single sample, less the radiance.
+    these samples alone, weighted as a single sample, less the radiance; ``relayed``: radiance by way of relays.
     """
 
     seen: mi.Float
     difference: mi.Float
     alone_excess: mi.Float
+    relayed: mi.Float
 
     @classmethod
     def none(cls, count: int) -> Noise:
         """Paths that have found nothing."""
-        return cls(*(dr.zeros(mi.Float, count) for _ in range(3)))
+        return cls(*(dr.zeros(mi.Float, count) for _ in range(4)))
 
-    def add_emission(self, arrived, mis, single, is_first) -> None:
+    def add_emission(self, path: Path, arrived, mis, single) -> None:
         """Add the emission that paths hit: radiance ``arrived``, with the weight ``mis``; ``single``: the weight beside
-        a single emitter sample; ``is_first``: whether the path hit the emitter by its first edge."""
-        self.seen += dr.select(is_first, arrived * mis, 0)
+        a single emitter sample."""
+        self.seen += dr.select(path.depth == 0, arrived * mis, 0)
         self.alone_excess += arrived * (single - mis)
+        if path.relayed is not None:
+            self.relayed += dr.select(path.relayed, arrived * mis, 0)
 
-    def add_sample(self, level, number, samples, single) -> None:
+    def add_sample(self, path: Path, level, number, samples, single) -> None:
         """Add the contribution ``level`` of an emitter sample, which has a ``number`` among the ``samples`` of its
         vertex.  ``single``: weight of an only sample over the weight of this one."""
+        if path.relayed is not None:
+            self.relayed += dr.select(path.relayed, level, 0)
         signed = dr.select((number & 1) == 0, level, -level)
         self.difference += dr.select(samples > 1, signed, 0)
         self.alone_excess += dr.select(number == 0, level * single, 0) - level

@@ -36,7 +36,9 @@ from .contributions import Contributions, LayerSums
 from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
 from .gather_vertices import Gathered, GatherVertices, SecondVertices
 from .lattice import Lattice
+from .onward import Onward, Turned
 from .path_state import FirstEdge, Gathering, Hit, Noise, Path, PathSettings, State, Traced, Vertex
+from .relays import relays_by
 from .roulette import residual_survival
 
 
@@ -63,6 +65,9 @@ def trace_paths(
         # ---------------------- Emission, by BSDF sampling ----------------------
         _add_emission(path, hit, emitters, settings, sampler, found, noise, lane)
 
+        if dr.hint(path.relayed is not None, mode="scalar"):
+            path.relayed = path.active & relays_by(hit.flags) & (path.relayed | (path.scattered > 0) | ~path.delta)
+
         # ---------------------- Subtraction: w β F1 F2 of x2 ----------------------
         connects = _carry(path, hit, settings, found.radiance, gathered) if records else mi.Bool(False)
 
@@ -80,11 +85,14 @@ def trace_paths(
         # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
         scatters = path.active & ~hit.hidden & (hit.goes_on | ~path.valid)
         share = dr.rcp(mi.Float(samples))
-        vertex = Vertex(hit, gathers, weight, cell, samples, share, lattice.at(path.depth), scatters)
-        turned, bsdf_weight = _sample_emitters(scene, emitters, path, vertex, settings, sampler, found, noise, lane)
+        numbers, onward = lattice.at(path.depth), None
+        if dr.hint(settings.relays is not None, mode="scalar"):
+            onward, numbers = Onward.of(settings.relays, hit, numbers, scatters)
+        vertex = Vertex(hit, gathers, weight, cell, samples, share, numbers, scatters, onward)
+        turned = _sample_emitters(scene, emitters, path, vertex, settings, sampler, found, noise, lane)
 
-        # ---------------------- Onward by the sample of the BSDF ----------------------
-        survival = _turn(path, vertex, turned, bsdf_weight, emitters.traits)
+        # ---------------------- Onward by the sample of the BSDF, or to a relay ----------------------
+        survival = _turn(path, vertex, turned, emitters.traits)
 
         # ---------------------- Russian roulette: residual of the direction, and throughput ----------------------
         _end_at_direction(path, hit, survival, settings, sampler.next_1d())
@@ -107,41 +115,41 @@ def _add_emission(
     found.add(arrived * mis, path.depth + 1, met.group, _draw(sampler, settings), lane)
     if noise is not None:
         single = power_heuristic(path.density, met.density)
-        noise.add_emission(channel_mean(arrived), mis, single, path.depth == 0)
+        noise.add_emission(path, channel_mean(arrived), mis, single)
 
 
 @dr.syntax
 def _sample_emitters(
     scene, emitters: EmitterSampler, path: Path, vertex: Vertex, settings: PathSettings, sampler, found: Contributions,
     noise: Noise | None, lane,
-):  # fmt: skip
-    """Add the light of emitters by the samples at each vertex to ``found``; returns a sample of the BSDF and its
-    weight."""
+) -> Turned:  # fmt: skip
+    """Add the light of emitters by the samples at each vertex to ``found``; returns the directions onward."""
     count, samples = dr.width(lane), vertex.samples
-    turned, bsdf_weight = dr.zeros(mi.BSDFSample3f, count), dr.zeros(mi.Spectrum, count)
-    number = dr.zeros(mi.UInt32, count)
+    turned, number = Turned.none(count), dr.zeros(mi.UInt32, count)
     if dr.hint(settings.several, mode="scalar"):
         while dr.hint(number < samples, exclude=[scene, emitters, path, vertex, samples, settings, lane]):
-            turned, bsdf_weight = _sample_emitter(
-                scene, emitters, path, vertex, number, settings, sampler, found, noise, lane
+            turned = _sample_emitter(
+                scene, emitters, path, vertex, turned, number, settings, sampler, found, noise, lane
             )
             number += 1
     else:
-        turned, bsdf_weight = _sample_emitter(
-            scene, emitters, path, vertex, number, settings, sampler, found, noise, lane
-        )
-    return turned, bsdf_weight
+        turned = _sample_emitter(scene, emitters, path, vertex, turned, number, settings, sampler, found, noise, lane)
+    return turned if vertex.onward is None else vertex.onward.mixed(turned)
 
 
 def _sample_emitter(
-    scene, emitters: EmitterSampler, path: Path, vertex: Vertex, number: mi.UInt32, settings: PathSettings, sampler,
-    found: Contributions, noise: Noise | None, lane,
-):  # fmt: skip
-    """Add the light of emitters by the sample ``number`` at each vertex to ``found``; returns a sample of the BSDF and
-    its weight."""
+    scene, emitters: EmitterSampler, path: Path, vertex: Vertex, before: Turned, number: mi.UInt32,
+    settings: PathSettings, sampler, found: Contributions, noise: Noise | None, lane,
+) -> Turned:  # fmt: skip
+    """Add the light of emitters by the sample ``number`` at each vertex to ``found``; returns the directions onward,
+    ``before`` by earlier samples."""
     hit, edges = vertex.hit, path.depth + 2
     chosen, place, lobe, turn = _numbers_of_sample(vertex.numbers, number) if settings.several else vertex.numbers
     sample = emitters.sample(hit.si, vertex.cell, chosen, sampler.next_1d(), place, hit.smooth)
+    onward = vertex.onward
+    if onward is not None:
+        # Instead of the first sample of emitters
+        sample = onward.instead(sample, number)
     # A single call for both: each call adds the code of every material to the kernel
     toward = hit.si.to_local(sample.direction)
     value, density, turned, bsdf_weight = emitters.traits.materials.call(
@@ -154,8 +162,9 @@ def _sample_emitter(
     lit = dr.select(crossings > 0, beyond, lit) * arriving
     found.add(lit, edges + crossings, sample.group, _draw(sampler, settings), lane)
     if noise is not None:
-        noise.add_sample(channel_mean(lit), number, vertex.samples, single)
-    return turned, bsdf_weight
+        noise.add_sample(path, channel_mean(lit), number, vertex.samples, single)
+    turned = Turned(turned, bsdf_weight, turned.pdf)
+    return turned if onward is None else onward.chosen(before, turned, toward, value, density, number)
 
 
 def _draw(sampler, settings: PathSettings) -> mi.Float | None:
@@ -275,21 +284,21 @@ def _lit(
     return value * mis, beyond * mis, ratio
 
 
-def _turn(path: Path, vertex: Vertex, bs, bsdf_weight, traits: SceneTraits):
-    """Continue along a BSDF sample ``bs`` with its weight, and carry the weight of gather vertices on; returns the
-    survival probability by the residual.
+def _turn(path: Path, vertex: Vertex, turned: Turned, traits: SceneTraits):
+    """Continue in the directions ``turned``, and carry the weight of gather vertices on; returns the survival
+    probability by the residual.
 
     A path that passes a null surface keeps the vertex and the density of its direction: next-event estimation passes
     null surfaces as well.
     """
-    hit = vertex.hit
-    full = path.throughput * mi.unpolarized_spectrum(bsdf_weight)
+    hit, bs = vertex.hit, turned.sample
+    full = path.throughput * mi.unpolarized_spectrum(turned.weight)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     # Like `path`, by the sampled direction, even if the path ends
     null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     path.valid |= path.active & hit.si.is_valid() & ~hit.hidden & ~null
     path.throughput, path.eta = full, path.eta * bs.eta
-    survival = mi.Float(1) if path.carried is None else _turn_carried(path, vertex, bs, delta)
+    survival = mi.Float(1) if path.carried is None else _turn_carried(path, vertex, turned, delta)
     path.ray = hit.si.spawn_ray(dr.select(hit.hidden, path.ray.d, hit.si.to_world(bs.wo)))
     turns = mi.Bool(True)
     if traits.null:
@@ -302,14 +311,14 @@ def _turn(path: Path, vertex: Vertex, bs, bsdf_weight, traits: SceneTraits):
     return survival
 
 
-def _turn_carried(path: Path, vertex: Vertex, bs, delta):
+def _turn_carried(path: Path, vertex: Vertex, turned: Turned, delta):
     """Subtract the light that virtual lights carry from the throughput, and carry the weight of gather vertices on;
     returns the survival probability by the residual."""
-    hit, gathers, full = vertex.hit, vertex.gathers, path.throughput
+    hit, gathers, full, bs = vertex.hit, vertex.gathers, path.throughput, turned.sample
     path.cosine = dr.abs(bs.wo.z)
     # A Lambertian BSDF of value 1, times the cosine, over the density of the direction
-    lambertian = ~delta & (bs.wo.z * hit.side > 0) & (bs.pdf > 0)
-    lambertian = dr.select(lambertian, path.cosine / bs.pdf, 0)
+    lambertian = ~delta & (bs.wo.z * hit.side > 0) & (turned.density > 0)
+    lambertian = dr.select(lambertian, path.cosine / turned.density, 0)
     path.throughput = full - path.carried * lambertian
     # At diffuse surfaces the residual is the same in all directions, and has ended paths before
     judged = (dr.max(dr.abs(path.carried)) > 0) & ~hit.is_diffuse

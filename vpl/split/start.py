@@ -21,9 +21,22 @@ from .emitters.base import EmitterSampler
 from .emitters.cell_choice import learning_rays
 from .local_c import LocalC
 from .path_state import Gathering
-from .pilot import PILOT_SAMPLES, Pilot, kept_of_both, pilot_lanes, relative_errors, single_sample_radiance
+from .pilot import (
+    PILOT_SAMPLES,
+    Pilot,
+    kept_of_both,
+    pilot_lanes,
+    relative_errors,
+    relative_variance,
+    single_sample_radiance,
+)
 from .plan import Evidence, Option
+from .relays import Relays
+from .relays_found import find_relays
 from .view import Stream, View, ViewLights
+
+# Paths to relays over shadow rays to emitters, by time
+_RELAY_COST = 4
 
 
 @dataclass(frozen=True)
@@ -32,8 +45,9 @@ class Start:
     if ``learned``; ``options``: kinds of lights to compare, empty if ``refusal`` holds a reason against lights.
 
     ``effects`` of more emitter samples, with and without virtual lights that represent emitters; ``paths``: number of
-    camera rays that sized the learning; ``seed`` of the first pass; ``later``: samplers of emitters by the size of
-    passes, see :meth:`emitters_for`; ``known``: see :class:`vpl.split.plan.Evidence`.
+    camera rays that sized the learning; ``seed`` of the first pass; ``relays``: targets of paths, or None; ``later``:
+    samplers of emitters by the size of passes, see :meth:`emitters_for`; ``known``: see
+    :class:`vpl.split.plan.Evidence`.
     """
 
     pilot: Pilot
@@ -44,6 +58,7 @@ class Start:
     effects: dict[bool, EmitterSamples]
     paths: int
     seed: int
+    relays: Relays | None = None
     later: dict[int, EmitterSampler] = field(default_factory=dict)
     known: dict = field(default_factory=dict)
 
@@ -78,6 +93,7 @@ def make_start(view: View, virtual_lights: bool) -> Start:
     if model.most_emitter_samples > 1 and view.learning_count >= model.emitter_samples_from * view.pixels:
         view = replace(view, direct_samples=dr.opaque(mi.UInt32, PILOT_SAMPLES, view.pixels))
     (pilot, learned), refusal = learning_pilot(view), _refusal(view, virtual_lights)
+    view, pilot = with_relays(view, pilot)
     # Single samples, and samples that never differ, tell nothing
     fraction = retained_fraction(view) if pilot.difference.any() else 1.0
     effect = EmitterSamples.of(pilot, pilot, fraction)
@@ -86,7 +102,7 @@ def make_start(view: View, virtual_lights: bool) -> Start:
         options, carried = _options(view, pilot)
         if carried is not None:
             effects[True] = EmitterSamples.of(pilot, carried, fraction)
-    return Start(pilot, view.emitters, learned, options, refusal, effects, view.learning_count, view.seed)
+    return Start(pilot, view.emitters, learned, options, refusal, effects, view.learning_count, view.seed, view.relays)
 
 
 def learning_pilot(view: View) -> tuple[Pilot, bool]:
@@ -109,6 +125,27 @@ def learning_pilot(view: View) -> tuple[Pilot, bool]:
         view.emitters.forget()
         return pilot, False
     return again, True
+
+
+def with_relays(view: View, pilot: Pilot) -> tuple[View, Pilot]:
+    """The view with the relays of its scene, and its pilot, if samples of relays lower variance × cost; otherwise the
+    arguments.
+
+    Relays are looked for if light by way of glass and mirrors makes a part of the noise.
+    """
+    unseen = pilot.radiance - pilot.seen
+    noise, rest = (relative_variance(x, pilot.brightness, view.model) for x in (unseen, unseen - pilot.relayed))
+    if noise - rest <= view.model.relayed_noise * noise:
+        return view, pilot
+    relays = find_relays(view, pilot, learning_rays(view.learning_count) // _RELAY_COST)
+    if relays is None:
+        return view, pilot
+    relayed = replace(view, relays=relays)
+    again = Pilot.trace(relayed, ViewLights())
+    before, after = (relative_errors(x.radiance - x.seen, pilot.brightness, view.model) for x in (pilot, again))
+    kept = kept_of_both(before, after, view.model)
+    pays = view.model.relay_cost * np.mean(after[kept]) < np.mean(before[kept])
+    return (relayed, again) if pays else (view, pilot)
 
 
 def is_certain_rise(before: np.ndarray, after: np.ndarray, model: CostModel) -> bool:

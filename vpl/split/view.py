@@ -18,6 +18,7 @@ from .emitters.base import EmitterSampler
 from .local_c import LocalC
 from .path_state import Gathering, PathSettings
 from .pixel_rays import PixelRays
+from .relays import Relays, relays_by
 from .roulette import OutgoingRadiance
 
 # c of paths without a carried part, world units: beyond every distance, with a finite square
@@ -36,6 +37,7 @@ class Stream(IntEnum):
     ALPHA = 8
     OCTREE = 9
     STRATA = 10
+    RELAYS = 11
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,8 @@ class View:
     ``seed``; ``importance`` of radiance in each pixel and ``outgoing`` radiance of surfaces: for Russian roulette;
     ``direct_samples``: number of emitter samples at the first scattering vertices of each pixel;
     ``learning_count``: number of camera rays, for the size of the emitter sampler's learning; ``planned_count``: the
-    same for the size of the pilot; ``model``: constants of the decisions; ``layers`` of the image.
+    same for the size of the pilot; ``model``: constants of the decisions; ``layers`` of the image;
+    ``relays``: targets of paths, or None.
     """
 
     scene: mi.Scene
@@ -94,6 +97,7 @@ class View:
     planned_count: int
     model: CostModel
     layers: Layers
+    relays: Relays | None = None
 
     @property
     def count(self) -> int:
@@ -109,6 +113,11 @@ class View:
     def samples(self) -> int:
         """Mean number of camera rays of a pixel."""
         return self.rays.mean
+
+    @property
+    def meets_relays(self) -> bool:
+        """Whether the scene may have relays."""
+        return any(relays_by(int(bsdf.flags())) for bsdf in self.emitters.traits.materials.bsdfs)
 
     @property
     def plain_from(self) -> float:
@@ -141,4 +150,5 @@ class View:
             upload_limit(self.rules.max_depth), dr.opaque(mi.UInt32, self.rules.rr_depth), lights.c,
             dr.opaque(mi.UInt32, gathering), dr.opaque(mi.Bool, lights.emitters is not None),
             dr.opaque(mi.Float, lights.emitters_c**2), self.outgoing, self.with_minorant, self.rules.hide_emitters,
+            meets_relays=self.meets_relays, relays=self.relays,
         )  # fmt: skip

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import drjit as dr
@@ -71,7 +72,7 @@ class CellChoice:
         self._usual, self._share = usual, share
         self._learnable = upload(mi.UInt32, np.isin(np.arange(len(usual)), ignored, invert=True)) > 0
         dr.eval(self._learnable)
-        # During learning, every source has a cell, and the cell draws only the source
+        # See `each_source`
         self._learns = dr.opaque(mi.Bool, False)
         self.forget()
 
@@ -95,8 +96,8 @@ class CellChoice:
     def learn(self, position: np.ndarray, normal: np.ndarray, rays: int, seed: int, look: Callable) -> bool:
         """Learn from vertices (n, 3) with at most about ``rays`` rays; returns whether anything was learned.
 
-        ``look(places, cell, seed)``: :func:`vpl.split.emitters.irradiance.irradiance_from_emitters` with a single
-        sample each.
+        ``look(places, cell, seed)``: irradiance at places, with a single sample each, as
+        :func:`vpl.split.emitters.irradiance.irradiance_from_emitters` returns it.
         """
         each = RAYS * self.count
         most = rays // each
@@ -106,18 +107,24 @@ class CellChoice:
         vertices = _VerticesOfCells.of(position, normal, cell)
         most = max(_RAYS_AT_A_TIME // each, 1)
         looks = Looks.none(vertices.cells * self.count)
-        self._learns = dr.opaque(mi.Bool, True)
-        try:
+        with self.each_source():
             for first in range(0, vertices.cells, most):
                 cells = min(most, vertices.cells - first)
                 found = self._look(vertices, first, cells, derived_seed(seed, first), look)
                 looks.write(first * self.count, found.irradiance, found.unoccluded, self._learnable)
-        finally:
-            self._learns = dr.opaque(mi.Bool, False)
         power = arriving_power(looks, self.count, self._cells.neighbours())
         self._use(self._shares(download(power).reshape(-1, self.count)))
         self.has_learned = True
         return True
+
+    @contextmanager
+    def each_source(self) -> Iterator[None]:
+        """Within the block, every source has a cell, and the cell draws only the source."""
+        self._learns = dr.opaque(mi.Bool, True)
+        try:
+            yield
+        finally:
+            self._learns = dr.opaque(mi.Bool, False)
 
     def _look(self, vertices: _VerticesOfCells, first: int, cells: int, seed: int, look: Callable):
         """Result of ``look`` for :data:`RAYS` rays to each source, in ``cells`` cells from ``first`` on."""

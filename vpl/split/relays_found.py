@@ -1,0 +1,209 @@
+"""Finding relays: balls around glass and mirrors, and how much light arrives by way of each.
+
+Candidates are balls around the shapes with such a material.  A ball is divided while its halves are smaller together,
+as around two lamps of one mesh, or while it looks large from the vertices of the pilot, as a window does.  A few paths
+from these vertices find the light that arrives by way of each ball, and the light that arrives otherwise.  Balls with
+little light are left out, and all of them where they would seldom be chosen.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import channel_mean, download, upload, upload_vectors
+from ..core.meshes import is_hit_as_triangles, triangles_of
+from ..core.sampling import derived_seed, independent_sampler
+from ..core.shapes import INSTANCE, SceneShapes
+from .edges_from_places import edges_from
+from .emitters.irradiance import Places, irradiance_from_emitters
+from .lattice import Lattice
+from .path_tracer import trace_paths
+from .pilot import Pilot
+from .relays import OF_BSDF, Relays, relays_by
+from .view import Stream, View, ViewLights
+
+# Most candidates, and paths that try each
+_MOST, _TRIED = 32, 256
+# Points of a shape, fewest and most; most points of all shapes
+_FEWEST_POINTS, _POINTS, _MOST_POINTS = 8, 256, 1 << 16
+# A ball is divided if the squared radii of its halves sum to less than this fraction of its own squared radius. Halves
+# of a round shape have more, two lamps less
+_DIVIDED = 0.7
+# Largest radius of a ball that is not divided, over its distance to the median vertex
+_WIDE = 0.2
+# Least part of a relay in the light: each takes time wherever a path turns
+_LEAST = 0.002
+# Largest part of the samples of a diffuse BSDF that go to relays anyway: paths to relays would not be denser
+_MOST_REACH = 0.3
+# Least probability of all relays over the largest one: seldom drawn, they take more time than they save
+_LEAST_DRAWN = 0.2
+
+
+def find_relays(view: View, pilot: Pilot, rays: int) -> Relays | None:
+    """The relays of a scene for the vertices of a pilot, after learning by ``rays`` paths; None where they would not
+    lower the variance."""
+    places, facing = pilot.vertices
+    points = points_of_relays(view.scene)
+    if len(points) == 0 or len(places) == 0:
+        return None
+    candidates = Relays(*balls_around(points, np.median(places, axis=0)))
+    light, reach = _tried(candidates, _Look(view, candidates), places, facing, view.seed)
+    share = light / max(light.sum(), np.finfo(np.float64).tiny)
+    kept = np.flatnonzero(share[1:] >= _LEAST)
+    if len(kept) == 0 or reach[1:][kept].sum() > _MOST_REACH:
+        return None
+    relays = Relays(candidates.center[kept], candidates.radius[kept])
+    seed = derived_seed(view.seed, Stream.RELAYS, 1)
+    if not relays.choice.learn(places, facing, rays, seed, _Look(view, relays)):
+        return None
+    drawn = 1 - np.mean(relays.choice.pmf[1:, 0])
+    return relays if drawn >= _LEAST_DRAWN * (1 - OF_BSDF) else None
+
+
+def _tried(relays: Relays, look: _Look, places: np.ndarray, facing: np.ndarray, seed: int):
+    """Means at random vertices, (n + 1,): irradiance by each choice; fraction of the samples of a diffuse BSDF in its
+    directions."""
+    sources = relays.choice.count
+    drawn = np.random.default_rng(seed).integers(len(places), size=sources * _TRIED)
+    normal = mi.Normal3f(upload_vectors(mi.Point3f, facing[drawn]))
+    seen = Places(upload_vectors(mi.Point3f, places[drawn]), normal + dr.opaque(mi.Float, 0.0), normal)
+    source = upload(mi.UInt32, np.repeat(np.arange(sources), _TRIED))
+    dr.eval(seen, source)
+    with relays.choice.each_source():
+        found = look.measured(seen, source, derived_seed(seed, Stream.RELAYS))
+    return tuple(x.reshape(sources, _TRIED).mean(1) for x in found)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Irradiance at places, one per lane: ``irradiance`` and ``unoccluded``, its mean over channels, are equal, as the
+    light has been traced."""
+
+    irradiance: mi.UnpolarizedSpectrum
+    unoccluded: mi.Float
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Light that arrives by way of each choice of ``relays`` in a ``view``: see
+    :meth:`vpl.split.emitters.cell_choice.CellChoice.learn`."""
+
+    view: View
+    relays: Relays
+
+    def __call__(self, places: Places, choice: mi.UInt32, seed: int) -> _Found:
+        """Irradiance by a single path in the direction of each ``choice``; beside the BSDF, by emitters, too."""
+        level, _ = self._traced(places, choice, seed)
+        return _Found(mi.UnpolarizedSpectrum(level), level)
+
+    def measured(self, places: Places, choice: mi.UInt32, seed: int) -> list[np.ndarray]:
+        """The same irradiance, and the fraction of the samples of a diffuse BSDF that a choice draws, (n,) float64."""
+        found = (download(x).astype(np.float64) for x in self._traced(places, choice, seed))
+        return [np.nan_to_num(x, posinf=0, neginf=0) for x in found]
+
+    def _traced(self, places: Places, choice: mi.UInt32, seed: int) -> tuple[mi.Float, mi.Float]:
+        view, emitters = self.view, self.view.emitters
+        settings = view.settings(ViewLights())
+        cell = emitters.cell(places.position, places.facing) + dr.opaque(mi.UInt32, 0, places.count)
+        edge = edges_from(places, cell, choice, self.relays, independent_sampler(derived_seed(seed, 0), places.count))
+        lattice = Lattice.of_lanes(dr.arange(mi.UInt32, places.count), 1, seed)
+        sampler = independent_sampler(derived_seed(seed, 1), places.count)
+        traced = trace_paths(view.scene, emitters, edge, lattice, sampler, settings)
+        most = settings.max_depth - 1
+        dr.make_opaque(most)
+        near = irradiance_from_emitters(view.scene, emitters, places, cell, 1, most, derived_seed(seed, 2))
+        # Beside relays, the BSDF finds the other light alone
+        level, other = channel_mean(traced.radiance), channel_mean(near.irradiance) - traced.noise.relayed
+        level, reach = dr.abs(level + dr.select(choice == 0, other, 0)), edge.throughput[0] * dr.inv_pi
+        dr.eval(level, reach)
+        return level, reach
+
+
+# ---------------------- Candidates ----------------------
+
+
+def points_of_relays(scene) -> np.ndarray:
+    """Points (n, 3) on the shapes of a scene that relay light, without instances and emitters."""
+    shapes = [
+        shape
+        for _, shape in SceneShapes.of(scene).own
+        if shape.class_name() != INSTANCE and relays_by(int(shape.bsdf().flags())) and not shape.is_emitter()
+    ]
+    shapes = shapes[: _MOST_POINTS // _FEWEST_POINTS]
+    each = int(np.clip(_MOST_POINTS // max(len(shapes), 1), _FEWEST_POINTS, _POINTS))
+    return np.concatenate([_points_on(shape, each) for shape in shapes]) if shapes else np.zeros((0, 3))
+
+
+def _points_on(shape, count: int) -> np.ndarray:
+    """Points (n, 3) on a mesh: ``count`` by area, and about as many corners; on other shapes, on the ellipsoid in the
+    bounding box."""
+    generator = np.random.default_rng(0)
+    if not is_hit_as_triangles(shape):
+        box = shape.bbox()
+        direction = generator.normal(size=(count, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        axes = np.concatenate([np.eye(3), -np.eye(3), direction])
+        return np.array(box.center()) + axes * 0.5 * np.array(box.extents())
+    triangles = triangles_of(shape)
+    positions = triangles.positions.astype(np.float64)
+    corners = positions[:: max(len(positions) // count, 1)]
+    a, b, c = (positions[triangles.faces[:, k]] for k in range(3))
+    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    if not (len(area) and area[-1] > 0):
+        return corners
+    chosen = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
+    u, v = generator.random((2, count, 1))
+    root = np.sqrt(u)
+    return np.concatenate([corners, (1 - root) * a[chosen] + root * ((1 - v) * b[chosen] + v * c[chosen])])
+
+
+def balls_around(points: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (n, 3) and radii (n,) of balls that hold the ``points`` (m, 3), for rays from about ``middle`` (3,)."""
+    first = _Ball.around(points)
+    # The largest first; numbers decide between equal ones
+    heap, done, number = [(-first.radius, 0, first)], [], 0
+    while heap:
+        ball = heapq.heappop(heap)[-1]
+        halves = ball.halves() if len(heap) + len(done) + 1 < _MOST else None
+        if not halves or not _pays(ball, halves, middle):
+            done.append(ball)
+            continue
+        for half in halves:
+            number += 1
+            heapq.heappush(heap, (-half.radius, number, half))
+    return np.array([ball.center for ball in done]), np.array([ball.radius for ball in done])
+
+
+def _pays(ball: _Ball, halves: tuple[_Ball, _Ball], middle: np.ndarray) -> bool:
+    """Whether to divide a ball."""
+    smaller = sum(half.radius**2 for half in halves) < _DIVIDED * ball.radius**2
+    return smaller or ball.radius > _WIDE * np.linalg.norm(ball.center - middle)
+
+
+@dataclass(frozen=True)
+class _Ball:
+    """Ball around ``points`` (n, 3)."""
+
+    points: np.ndarray
+    center: np.ndarray
+    extent: np.ndarray
+    radius: float
+
+    @classmethod
+    def around(cls, points: np.ndarray) -> _Ball:
+        low, high = points.min(0), points.max(0)
+        center = 0.5 * (low + high)
+        return cls(points, center, high - low, float(np.sqrt(np.max(np.sum((points - center) ** 2, axis=1)))))
+
+    def halves(self) -> tuple[_Ball, _Ball] | None:
+        """Balls around the points to either side of the middle of the longest axis; None for a single place."""
+        axis = int(np.argmax(self.extent))
+        below = self.points[:, axis] < self.center[axis]
+        if below.all() or not below.any():
+            return None
+        return _Ball.around(self.points[below]), _Ball.around(self.points[~below])
