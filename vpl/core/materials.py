@@ -41,6 +41,10 @@ class Materials:
         """The materials with a kind of lobe."""
         return self.where(lambda bsdf: mi.has_flag(bsdf.flags(), flag))
 
+    def hold(self, pointers: mi.BSDFPtr, active: mi.Bool) -> mi.Bool:
+        """Whether each pointer points to one of the materials."""
+        return self._numbers.at(pointers, active) > 0
+
     def call(self, pointers: mi.BSDFPtr, function: Callable, *arguments, active: mi.Bool):
         """``function(bsdf, *arguments, active)`` for the material behind each pointer, with arrays as arguments; 0 for
         pointers to no material of this object and in lanes that are not ``active``."""

@@ -79,9 +79,14 @@ def is_hit_as_triangles(shape) -> bool:
     return shape.is_mesh() and not shape.is_ellipsoids()
 
 
+def surface_of(shape) -> tuple[np.ndarray, np.ndarray]:
+    """(Indices of the vertices of each triangle that rays hit, positions of the vertices): see :class:`Triangles`."""
+    return faces_of(shape), _rows(shape.vertex_positions_buffer(), 3)
+
+
 def triangles_of(shape) -> Triangles:
     """The triangles that rays hit."""
+    faces, positions = surface_of(shape)
     normals = _rows(shape.vertex_normals_buffer(), 3) if shape.has_vertex_normals() else None
     coordinates = _rows(shape.vertex_texcoords_buffer(), 2) if shape.has_vertex_texcoords() else None
-    positions = _rows(shape.vertex_positions_buffer(), 3)
-    return Triangles(faces_of(shape), positions, normals, coordinates, shape.has_flipped_normals())
+    return Triangles(faces, positions, normals, coordinates, shape.has_flipped_normals())

@@ -1,7 +1,7 @@
 """Directions in which paths go on: samples of the BSDF, or directions to relays (:mod:`vpl.split.relays`).
 
 A direction to a relay takes the place of the first emitter sample of its vertex, so that the materials are called once.
-The first emitter samples that remain count for those that are missing.
+Therefore first emitter samples are divided by the probability that no relay is drawn.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Turned:
 
 
 @dataclass
-class Onward:
+class RelayChoice:
     """Choice between the BSDF and relays, one per lane.
 
     ``relays``; ``si``: surfaces; ``cell`` of the relays; ``chooses``: whether there is a choice; ``drawn``: choice, 0
@@ -55,10 +55,11 @@ class Onward:
         return self.drawn > 0
 
     @classmethod
-    def of(cls, relays: Relays, hit, numbers: tuple, scatters: mi.Bool) -> tuple[Onward, tuple]:
-        """The choice at each ``hit`` by the ``numbers`` of a lattice, and the remaining numbers."""
+    def of(cls, relays: Relays, hit, numbers: tuple, active: mi.Bool) -> tuple[RelayChoice, tuple]:
+        """The choice at each ``hit`` by the ``numbers`` of a lattice, and the remaining numbers; the BSDF where a lane
+        is not ``active``."""
         chosen, place, lobe, turn = numbers
-        si, chooses = hit.si, hit.smooth & scatters
+        si, chooses = hit.si, active & hit.smooth & relays.materials.hold(hit.bsdf, hit.smooth)
         cell = relays.cell(si.p, si.sh_frame.n * hit.side)
         drawn, direction, rest = relays.draw(si.p, cell, lobe, turn, chooses)
         of_bsdf = dr.select(chooses, relays.choice.probability(cell, mi.UInt32(0), chooses), 1)
@@ -66,7 +67,8 @@ class Onward:
         return cls(relays, si, cell, chooses, drawn, direction, of_bsdf), (chosen, place, lobe, turn)
 
     def instead(self, sample: EmitterSample, number: mi.UInt32) -> EmitterSample:
-        """The emitter ``sample`` with a ``number`` at its vertex, or the direction to a relay without light."""
+        """The emitter ``sample`` with a ``number`` at its vertex, or, if a relay is drawn, the direction to it with the
+        weight 0."""
         first = number == 0
         to_relay = self.to_relay & first
         weight = dr.select(to_relay, 0, sample.weight / dr.select(first, self.of_bsdf, 1))

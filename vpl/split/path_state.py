@@ -14,7 +14,7 @@ from ..transport.minorant import is_diffuse, minorant_of, side_of
 from .contributions import Contributions
 from .gather_vertices import Gathered
 from .local_c import LocalC
-from .onward import Onward
+from .onward import RelayChoice
 from .relays import Relays
 from .roulette import OutgoingRadiance
 
@@ -48,8 +48,10 @@ class PathSettings:
 
     Two more Python bools; ``plain`` and not ``several`` make smaller kernels.  ``plain``: whether paths find only
     radiance and alpha: virtual lights carry nothing, and there are no records for decisions and lights.  ``several``:
-    whether first scattering vertices may have several emitter samples.  ``meets_relays``: whether paths may meet relays
-    (a Python bool); ``relays``: targets of paths, or None.
+    whether first scattering vertices may have several emitter samples.
+
+    ``meets_relays``: whether paths record light by way of relays (a Python bool), also those of the image, which share
+    the kernel of the pilot; ``relays``: targets of paths, or None.
     """
 
     max_depth: mi.UInt32
@@ -148,7 +150,7 @@ class Path(Edge):
     ``depth``: edges before; ``eta``: as in ``path``; ``scattered``: number of scattering vertices; ``valid``: whether
     the path met a surface counted in the film's alpha; ``carried``: β F1 before x2, w β F1 F2 at x2; ``cosine``: cosθ1;
     these two are None for plain paths; ``relayed``: whether the edge begins at a relay (:mod:`vpl.split.relays`) that
-    the path met after another surface, None if this is not recorded.
+    the path met after a surface with a minorant, None if this is not recorded.
     """
 
     depth: mi.UInt32
@@ -226,7 +228,7 @@ class Vertex:
 
     ``hit``; ``gathers``, ``weight``: mask and weights of gather vertices, None in plain paths; ``cell`` of the emitter
     sampler; ``samples``: number of emitter samples; ``share`` of a sample in their light; ``numbers`` of the lattice;
-    ``scatters``: whether a sample of the BSDF is needed; ``onward``: to relays, None without relays.
+    ``scatters``: whether a sample of the BSDF is needed; ``choice``: between the BSDF and relays, None without relays.
     """
 
     hit: Hit
@@ -237,7 +239,7 @@ class Vertex:
     share: mi.Float
     numbers: tuple
     scatters: mi.Bool
-    onward: Onward | None
+    choice: RelayChoice | None
 
 
 @dataclass

@@ -36,7 +36,7 @@ from .contributions import Contributions, LayerSums
 from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
 from .gather_vertices import Gathered, GatherVertices, SecondVertices
 from .lattice import Lattice
-from .onward import Onward, Turned
+from .onward import RelayChoice, Turned
 from .path_state import FirstEdge, Gathering, Hit, Noise, Path, PathSettings, State, Traced, Vertex
 from .relays import relays_by
 from .roulette import residual_survival
@@ -66,7 +66,7 @@ def trace_paths(
         _add_emission(path, hit, emitters, settings, sampler, found, noise, lane)
 
         if dr.hint(path.relayed is not None, mode="scalar"):
-            path.relayed = path.active & relays_by(hit.flags) & (path.relayed | (path.scattered > 0) | ~path.delta)
+            path.relayed = path.active & relays_by(hit.flags) & (path.relayed | (path.state != State.SEEKING))
 
         # ---------------------- Subtraction: w β F1 F2 of x2 ----------------------
         connects = _carry(path, hit, settings, found.radiance, gathered) if records else mi.Bool(False)
@@ -85,10 +85,12 @@ def trace_paths(
         # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
         scatters = path.active & ~hit.hidden & (hit.goes_on | ~path.valid)
         share = dr.rcp(mi.Float(samples))
-        numbers, onward = lattice.at(path.depth), None
+        numbers, choice = lattice.at(path.depth), None
         if dr.hint(settings.relays is not None, mode="scalar"):
-            onward, numbers = Onward.of(settings.relays, hit, numbers, scatters)
-        vertex = Vertex(hit, gathers, weight, cell, samples, share, numbers, scatters, onward)
+            # A relay needs one more edge behind it
+            far = scatters & (path.depth + 2 < settings.max_depth)
+            choice, numbers = RelayChoice.of(settings.relays, hit, numbers, far)
+        vertex = Vertex(hit, gathers, weight, cell, samples, share, numbers, scatters, choice)
         turned = _sample_emitters(scene, emitters, path, vertex, settings, sampler, found, noise, lane)
 
         # ---------------------- Onward by the sample of the BSDF, or to a relay ----------------------
@@ -134,7 +136,7 @@ def _sample_emitters(
             number += 1
     else:
         turned = _sample_emitter(scene, emitters, path, vertex, turned, number, settings, sampler, found, noise, lane)
-    return turned if vertex.onward is None else vertex.onward.mixed(turned)
+    return turned if vertex.choice is None else vertex.choice.mixed(turned)
 
 
 def _sample_emitter(
@@ -146,10 +148,8 @@ def _sample_emitter(
     hit, edges = vertex.hit, path.depth + 2
     chosen, place, lobe, turn = _numbers_of_sample(vertex.numbers, number) if settings.several else vertex.numbers
     sample = emitters.sample(hit.si, vertex.cell, chosen, sampler.next_1d(), place, hit.smooth)
-    onward = vertex.onward
-    if onward is not None:
-        # Instead of the first sample of emitters
-        sample = onward.instead(sample, number)
+    if vertex.choice is not None:
+        sample = vertex.choice.instead(sample, number)
     # A single call for both: each call adds the code of every material to the kernel
     toward = hit.si.to_local(sample.direction)
     value, density, turned, bsdf_weight = emitters.traits.materials.call(
@@ -164,7 +164,7 @@ def _sample_emitter(
     if noise is not None:
         noise.add_sample(path, channel_mean(lit), number, vertex.samples, single)
     turned = Turned(turned, bsdf_weight, turned.pdf)
-    return turned if onward is None else onward.chosen(before, turned, toward, value, density, number)
+    return turned if vertex.choice is None else vertex.choice.chosen(before, turned, toward, value, density, number)
 
 
 def _draw(sampler, settings: PathSettings) -> mi.Float | None:

@@ -17,13 +17,17 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import upload
+from ..core.materials import Materials
+from ..core.parameters import children_of
 from .emitters.cell_choice import CellChoice
 
 _KINDS = mi.BSDFFlags
-# Lobes of relays, and lobes that they have not: shadow rays pass null lobes, and virtual lights carry light from
+# Lobes of relays, and lobes that exclude a material: shadow rays pass null lobes, and virtual lights carry light from
 # diffuse lobes
 _PASSED = int(_KINDS.DeltaReflection) | int(_KINDS.DeltaTransmission) | int(_KINDS.GlossyTransmission)
 _REFUSED = int(_KINDS.DiffuseReflection) | int(_KINDS.DiffuseTransmission) | int(_KINDS.Null)
+# Classes of materials of several parts
+_OF_PARTS = ("BlendBSDF", "MaskBSDF")
 # Fraction of the samples that the BSDF draws in every cell: its paths find all other light
 OF_BSDF = 0.5
 # Least squared sine of the angle of a cone: directions are rounded by 1e-7
@@ -35,17 +39,26 @@ def relays_by(flags):
     return ((flags & _PASSED) != 0) & ((flags & _REFUSED) == 0)
 
 
+def tells_density(bsdf: mi.BSDF) -> bool:
+    """Whether samples of a BSDF come with the density that the BSDF gives any direction.
+
+    In Mitsuba 3.9.1, a sample of ``blendbsdf`` or ``mask`` has that of the drawn material alone.
+    """
+    return bsdf.class_name() not in _OF_PARTS and all(map(tells_density, children_of(bsdf, mi.BSDF)))
+
+
 class Relays:
     """Choice between a sample of the BSDF, source 0 of ``choice``, and directions to balls around pieces of relays.
 
-    ``center`` (n, 3), ``radius`` (n,) of the balls: world units.
+    ``center`` (n, 3), ``radius`` (n,) of the balls: world units; ``materials`` at which paths choose, see
+    :func:`tells_density`.
     """
 
-    def __init__(self, center: np.ndarray, radius: np.ndarray):
+    def __init__(self, center: np.ndarray, radius: np.ndarray, materials: Materials):
         self.center, self.radius = center, radius
-        balls = np.concatenate([center, radius[:, None]], 1).astype(np.float32)
-        # Twice, because Dr.Jit compiles different kernels for arrays of a single entry
-        self._balls, self._last = upload(mi.Float, np.tile(balls, (2, 1))), dr.opaque(mi.UInt32, self.count)
+        self.materials = materials.where(tells_density)
+        self._balls = upload(mi.Float, np.concatenate([center, radius[:, None]], 1).astype(np.float32))
+        self._last = dr.opaque(mi.UInt32, self.count)
         usual = np.zeros(1 + self.count)
         usual[0] = 1
         self.choice = CellChoice(usual, OF_BSDF, np.zeros(0, int))

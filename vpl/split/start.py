@@ -35,7 +35,7 @@ from .relays import Relays
 from .relays_found import find_relays
 from .view import Stream, View, ViewLights
 
-# Paths to relays over shadow rays to emitters, by time
+# Paths from a place over shadow rays from it, by time: about as many edges
 _RELAY_COST = 4
 
 
