@@ -50,8 +50,8 @@ from benchmarks.views import move_cameras  # noqa: E402
 from comparison.command_line import positive  # noqa: E402
 
 NAMES = (*scenes.NAMES, "classroom", "hall")
-# Scenes where virtual lights gain little: leaves, equal emitters, gloss, masks, no noise
-HARD = ("foliage", "lamp_grid", "glossy", "veils", "furnace")
+# Scenes where virtual lights gain little: leaves, equal emitters, gloss, masks, lamps in glass, no noise
+HARD = ("foliage", "lamp_grid", "glossy", "veils", "globes", "furnace")
 # Parts that measure the variance between passes
 BETWEEN = ("product", "timed", "classes", "lights")
 PARTS = ("product", "timed", "denoised", "cost", "classes", "lights", "cold")

@@ -1,5 +1,5 @@
 """Render the preview pictures of the scenes by `lightcuts` with adaptive direct light. Exceptions: direct light alone
-for the forest, emitters as virtual lights for the veils.
+for the forest, emitters as virtual lights for the veils, `manylights` for the globes.
 
 ./run -- python scenes/previews.py [NAME...]
 """
@@ -12,6 +12,7 @@ import mitsuba as mi
 FOLDER = Path(__file__).resolve().parent
 WIDTH, SAMPLES, FEW_SAMPLES, DEPTH, DEEP = 192, 16, 4, 8, 24
 DIRECT = ("forest_lights",)  # tracing light paths through the leaves takes minutes
+IN_GLASS, MANY_SAMPLES = ("globes",), 1024  # only `manylights` sends paths to the glass
 BEHIND_MASKS = ("veils",)  # next-event estimation does not pass masks, as in Mitsuba's integrators
 
 
@@ -23,6 +24,8 @@ def preview(name):
     scene = mi.load_file(str(path), resx=str(WIDTH), resy=str(height))
     if name in DIRECT:
         integrator, samples = {"type": "adaptivedirect"}, FEW_SAMPLES
+    elif name in IN_GLASS:
+        integrator, samples = {"type": "manylights", "max_depth": DEEP}, MANY_SAMPLES
     else:
         direct = "vpl" if name in BEHIND_MASKS else "adaptive"
         depth = DEEP if name in BEHIND_MASKS else DEPTH

@@ -33,7 +33,9 @@ def kinds(text):
     return [len(re.findall(f'<emitter type="{kind}">', text)) for kind in ("point", "spot", "area")]
 
 
-@pytest.mark.parametrize("name", ["cornell", "glossy", "hall", "banquet", "arcade", "corridor", "veils", "furnace"])
+@pytest.mark.parametrize(
+    "name", ["cornell", "glossy", "hall", "banquet", "arcade", "corridor", "veils", "globes", "furnace"]
+)
 def test_scene_takes_the_usual_parameters(name):
     defines = {"integrator": "direct", "max_depth": "3", "spp": "7", "resx": "16", "resy": "8"}
     file = SceneFile(ROOT / "scenes" / f"{name}.xml", defines)

@@ -28,8 +28,9 @@ _PASSED = int(_KINDS.DeltaReflection) | int(_KINDS.DeltaTransmission) | int(_KIN
 _REFUSED = int(_KINDS.DiffuseReflection) | int(_KINDS.DiffuseTransmission) | int(_KINDS.Null)
 # Classes of materials of several parts
 _OF_PARTS = ("BlendBSDF", "MaskBSDF")
-# Fraction of the samples that the BSDF draws in every cell: its paths find all other light
-OF_BSDF = 0.5
+# Of the samples of a cell, the fraction that is drawn by the probabilities of unknown cells, and in these, the fraction
+# that the BSDF draws: its paths find all other light, so it draws at least 3/8 everywhere
+_USUAL_SHARE, _OF_BSDF = 0.5, 0.75
 # Least squared sine of the angle of a cone: directions are rounded by 1e-7
 _LEAST_CONE = 1e-8
 
@@ -50,23 +51,28 @@ def tells_density(bsdf: mi.BSDF) -> bool:
 class Relays:
     """Choice between a sample of the BSDF, source 0 of ``choice``, and directions to balls around pieces of relays.
 
-    ``center`` (n, 3), ``radius`` (n,) of the balls: world units; ``materials`` at which paths choose, see
-    :func:`tells_density`.
+    ``center`` (n, 3), ``radius`` (n,) of the balls: world units; ``light`` (n,) of each relay, for the probabilities in
+    unknown cells; ``materials`` at which paths choose, see :func:`tells_density`.
     """
 
-    def __init__(self, center: np.ndarray, radius: np.ndarray, materials: Materials):
+    def __init__(self, center: np.ndarray, radius: np.ndarray, light: np.ndarray, materials: Materials):
         self.center, self.radius = center, radius
         self.materials = materials.where(tells_density)
         self._balls = upload(mi.Float, np.concatenate([center, radius[:, None]], 1).astype(np.float32))
         self._last = dr.opaque(mi.UInt32, self.count)
-        usual = np.zeros(1 + self.count)
-        usual[0] = 1
-        self.choice = CellChoice(usual, OF_BSDF, np.zeros(0, int))
+        usual = np.concatenate([[_OF_BSDF], (1 - _OF_BSDF) * light / light.sum()])
+        self.choice = CellChoice(usual, _USUAL_SHARE, np.zeros(0, int))
 
     @property
     def count(self) -> int:
         """Number of balls."""
         return len(self.radius)
+
+    @property
+    def drawn(self) -> float:
+        """Mean over cells of the probability of all relays, over the largest that can be learned."""
+        learned = self.choice.pmf[1:, 1:].sum(1) - _USUAL_SHARE * (1 - _OF_BSDF)
+        return float(np.mean(learned) / (1 - _USUAL_SHARE))
 
     def cell(self, position: mi.Point3f, facing: mi.Normal3f) -> mi.UInt32:
         """Number of the spatial cell of each vertex; ``facing``: shading normal on the visible side."""

@@ -25,7 +25,7 @@ from .emitters.irradiance import Places, irradiance_from_emitters
 from .lattice import Lattice
 from .path_tracer import trace_paths
 from .pilot import Pilot
-from .relays import OF_BSDF, Relays, relays_by
+from .relays import Relays, relays_by
 from .view import Stream, View, ViewLights
 
 # Most candidates: each is a step of a loop wherever a path turns. Paths that try each: their light varies by half
@@ -56,18 +56,18 @@ def find_relays(view: View, pilot: Pilot, rays: int) -> Relays | None:
     if len(points) == 0 or len(places) == 0:
         return None
     materials = view.emitters.traits.materials
-    candidates = Relays(*balls_around(points, np.median(places, axis=0)), materials)
+    center, radius = balls_around(points, np.median(places, axis=0))
+    candidates = Relays(center, radius, np.ones(len(radius)), materials)
     light, reach = _tried(candidates, _Look(view, candidates), places, facing, view.seed)
     share = light / max(light.sum(), np.finfo(np.float64).tiny)
     kept = np.flatnonzero(share[1:] >= _LEAST)
     if len(kept) == 0 or reach[1:][kept].sum() > _MOST_REACH:
         return None
-    relays = Relays(candidates.center[kept], candidates.radius[kept], materials)
+    relays = Relays(center[kept], radius[kept], light[1:][kept], materials)
     seed = derived_seed(view.seed, Stream.RELAYS, 1)
     if not relays.choice.learn(places, facing, rays, seed, _Look(view, relays)):
         return None
-    drawn = 1 - np.mean(relays.choice.pmf[1:, 0])
-    return relays if drawn >= _LEAST_DRAWN * (1 - OF_BSDF) else None
+    return relays if relays.drawn >= _LEAST_DRAWN else None
 
 
 def _tried(relays: Relays, look: _Look, places: np.ndarray, facing: np.ndarray, seed: int):

@@ -28,7 +28,7 @@ class Places:
     """Relays that are drawn with equal probabilities in every cell."""
 
     def __init__(self, center, radius):
-        self.relays = Relays(np.array(center, float), np.array(radius, float), Materials([]))
+        self.relays = Relays(np.array(center, float), np.array(radius, float), np.ones(len(radius)), Materials([]))
         rows = np.full((2, 1 + self.relays.count), 1 / (1 + self.relays.count))
         self.relays.choice._use(rows)
 
