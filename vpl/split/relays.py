@@ -57,7 +57,8 @@ class Relays:
 
     def __init__(self, center: np.ndarray, radius: np.ndarray, light: np.ndarray, materials: Materials):
         self.center, self.radius = center, radius
-        self.materials = materials.where(tells_density)
+        # Glass is left by its BSDF: it lies in the balls, and directions to them would seldom pass it
+        self.materials = materials.where(lambda bsdf: tells_density(bsdf) and not relays_by(int(bsdf.flags())))
         self._balls = upload(mi.Float, np.concatenate([center, radius[:, None]], 1).astype(np.float32))
         self._last = dr.opaque(mi.UInt32, self.count)
         usual = np.concatenate([[_OF_BSDF], (1 - _OF_BSDF) * light / light.sum()])
