@@ -29,7 +29,7 @@ _REFUSED = int(_KINDS.DiffuseReflection) | int(_KINDS.DiffuseTransmission) | int
 # Classes of materials of several parts
 _OF_PARTS = ("BlendBSDF", "MaskBSDF")
 # Of the samples of a cell, the fraction that is drawn by the probabilities of unknown cells, and in these, the fraction
-# that the BSDF draws: its paths find all other light, so it draws at least 3/8 everywhere
+# that the BSDF draws: its paths find all other light, so it draws at least 3/8 everywhere (decisions.md)
 _USUAL_SHARE, _OF_BSDF = 0.5, 0.75
 # Least squared sine of the angle of a cone: directions are rounded by 1e-7
 _LEAST_CONE = 1e-8
