@@ -36,7 +36,7 @@ def behind_a_shade(mirror):
     """A lamp that a plate hides from most of the room, and a mirror on the wall behind."""
     plate = wall([0, 0.0, -0.45], [0, 1, 0], 0, 0.3, bsdf={"type": "twosided", "nested": {"type": "diffuse"}})
     return {
-        "lamp": lamp([0, 0, -0.6], 0.1),
+        "lamp": lamp([0, 0, -0.7], 0.2),
         "plate": plate,
         "mirror": wall([0, 0, -0.98], [0, 1, 0], 0, 0.5, bsdf=mirror),
     }
@@ -46,7 +46,11 @@ ROOMS = {
     "clear": lambda: closed_box(globes(CLEAR, 0.2, 0.7), 12),
     "frosted": lambda: closed_box(globes(FROSTED, 0.2, 0.7), 12),
     "mirror": lambda: closed_box(behind_a_shade({"type": "conductor"}), 12),
-    "with a lamp": lambda: closed_box(globes(CLEAR, 0.2, 0.7) | {"light": area_light()}, 12),
+    "with a lamp": lambda: closed_box(
+        globes(CLEAR, 0.2, 0.7) | {"light": area_light()},
+        12,
+        plastic=ball([0, -0.6, -0.2], 0.35, bsdf={"type": "plastic"}),
+    ),
     "glossy": lambda: closed_box(
         globes(FROSTED, 0.2, 0.7),
         12,
@@ -79,7 +83,7 @@ def always_relays(monkeypatch):
         yield
 
 
-@pytest.mark.parametrize("name", ["frosted", "blend", "masks", *stress("clear", "mirror", "with a lamp", "glossy")])
+@pytest.mark.parametrize("name", ["frosted", "with a lamp", "masks", *stress("blend", "clear", "mirror", "glossy")])
 def test_mean_is_that_of_path(name, always_relays):
     scene = mi.load_dict(ROOMS[name]())
     with_relays = []
@@ -89,7 +93,7 @@ def test_mean_is_that_of_path(name, always_relays):
         with_relays.append("relays" in statistics)
         return found, render(scene, "prb", 1024, seed, max_depth=-1)
 
-    assert_same_mean(pair, 6, finds=0.03)
+    assert_same_mean(pair, 8, finds=0.03)
     # The pilots of some seeds may meet too little light by way of mirrors
     assert np.mean(with_relays) > 0.5
 
@@ -98,7 +102,7 @@ def test_mean_is_that_of_path(name, always_relays):
 def test_lamps_in_glass_make_little_noise(glass):
     scene = mi.load_dict(closed_box(globes(glass), 24))
     found = [render_with_statistics("manylights", scene, 64, seed) for seed in range(6)]
-    assert all(statistics["relays"] >= 1 for _, statistics in found)
+    assert all(int(statistics.get("relays", 0)) >= 1 for _, statistics in found)
     with plugin_with_model(relayed_noise=1e9):
         others = [render(scene, "manylights", 64, seed) for seed in range(6)]
     noise, before = (np.median(np.var(images, axis=0, ddof=1)) for images in ([image for image, _ in found], others))
@@ -110,7 +114,7 @@ def test_seeds_repeat_images():
     (first, statistics), (again, _), (other, _) = (
         render_with_statistics("manylights", scene, 64, seed) for seed in (1, 1, 2)
     )
-    assert statistics["relays"] >= 1
+    assert int(statistics.get("relays", 0)) >= 1
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
@@ -128,6 +132,19 @@ def area_light_and(glass):
 def test_layers_sum_to_the_image():
     scene = mi.load_dict(closed_box(globes(FROSTED), 24))
     image, statistics = render_with_statistics("manylights", scene, 64, 3, layers="emission,direct,indirect")
-    assert statistics["relays"] >= 1
+    assert int(statistics.get("relays", 0)) >= 1
     layers = image[..., 3:].reshape(*image.shape[:2], 3, 3).sum(2)
     assert np.allclose(layers, image[..., :3], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("max_depth, lights", [(4, {}), (6, {"pays_below": 1e30, "fewest_light_paths": 4000})])
+def test_mean_with_few_edges_and_with_virtual_lights(max_depth, lights, always_relays):
+    scene = mi.load_dict(ROOMS["with a lamp"]())
+
+    def pair(seed):
+        with plugin_with_model(relayed_noise=0.0, relay_cost=0.0, **lights):
+            found, statistics = render_with_statistics("manylights", scene, 64, seed, max_depth=max_depth)
+        assert "relays" in statistics and ("lights" in statistics or not lights)
+        return found, render(scene, "prb", 1024, seed, max_depth=max_depth)
+
+    assert_same_mean(pair, 6, finds=0.03)

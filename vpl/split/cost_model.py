@@ -76,7 +76,7 @@ class CostModel:
         0.1, "variance", "Least part of the noise by glass and mirrors to sample them.", "staircase2 has 0.36"
     )
     relay_cost: float = _constant(
-        1.3, "paths", "Cost of a path that samples glass and mirrors.", "four rooms, lamps in glass: 1.25 to 1.33"
+        1.3, "paths", "Cost of a path that samples glass and mirrors.", "6 to 27 lamps in glass: 1.25 to 1.33"
     )
     trimmed: float = _constant(
         0.001,

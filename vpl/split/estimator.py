@@ -76,7 +76,8 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
     lights, of_lights = make_lights(view, decision, kept, clock)
     radiance, valid, layers, of_image = render_image(view, lights, decision, stopped, clock)
     precision = {"precision": decision.precision(view.samples)}
-    relays = {"relays": start.relays.count} if start.relays else {}
+    # Text, because passes add up numbers
+    relays = {"relays": str(start.relays.count)} if start.relays else {}
     statistics = {"plan": decision.plan.reason} | precision | relays | samples | roulette | of_lights | of_image
     return Estimate(radiance, valid, layers, decision, statistics | {"seconds": clock.seconds})
 

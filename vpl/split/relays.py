@@ -31,6 +31,8 @@ _OF_PARTS = ("BlendBSDF", "MaskBSDF")
 # Of the samples of a cell, the fraction that is drawn by the probabilities of unknown cells, and in these, the fraction
 # that the BSDF draws: its paths find all other light, so it draws at least 3/8 everywhere (decisions.md)
 _USUAL_SHARE, _OF_BSDF = 0.5, 0.75
+# Largest difference of equal probabilities, which are rounded to 2^-23
+_ROUNDED = 1e-6
 # Least squared sine of the angle of a cone: directions are rounded by 1e-7
 _LEAST_CONE = 1e-8
 
@@ -51,12 +53,12 @@ def tells_density(bsdf: mi.BSDF) -> bool:
 class Relays:
     """Choice between a sample of the BSDF, source 0 of ``choice``, and directions to balls around pieces of relays.
 
-    ``center`` (n, 3), ``radius`` (n,) of the balls: world units; ``light`` (n,) of each relay, for the probabilities in
-    unknown cells; ``materials`` at which paths choose, see :func:`tells_density`.
+    ``count`` n; ``center`` (n, 3), ``radius`` (n,) of the balls: world units; ``light`` (n,) of each relay, for the
+    probabilities in unknown cells; ``materials`` at which paths choose, see :func:`tells_density`.
     """
 
     def __init__(self, center: np.ndarray, radius: np.ndarray, light: np.ndarray, materials: Materials):
-        self.center, self.radius = center, radius
+        self.count = len(radius)
         # Glass is left by its BSDF: it lies in the balls, and directions to them would seldom pass it
         self.materials = materials.where(lambda bsdf: tells_density(bsdf) and not relays_by(int(bsdf.flags())))
         self._balls = upload(mi.Float, np.concatenate([center, radius[:, None]], 1).astype(np.float32))
@@ -65,15 +67,12 @@ class Relays:
         self.choice = CellChoice(usual, _USUAL_SHARE, np.zeros(0, int))
 
     @property
-    def count(self) -> int:
-        """Number of balls."""
-        return len(self.radius)
-
-    @property
     def drawn(self) -> float:
-        """Mean over cells of the probability of all relays, over the largest that can be learned."""
-        learned = self.choice.pmf[1:, 1:].sum(1) - _USUAL_SHARE * (1 - _OF_BSDF)
-        return float(np.mean(learned) / (1 - _USUAL_SHARE))
+        """Mean of the part of the light in a cell that comes by relays, over the cells where light was found."""
+        usual, cells = self.choice.pmf[0], self.choice.pmf[1:]
+        known = cells[np.abs(cells - usual).max(1) > _ROUNDED]
+        learned = known[:, 1:].sum(1) - _USUAL_SHARE * (1 - _OF_BSDF)
+        return float(np.mean(learned) / (1 - _USUAL_SHARE)) if len(known) else 0.0
 
     def cell(self, position: mi.Point3f, facing: mi.Normal3f) -> mi.UInt32:
         """Number of the spatial cell of each vertex; ``facing``: shading normal on the visible side."""

@@ -30,7 +30,8 @@ from .view import Stream, View, ViewLights
 
 # Most candidates: each is a step of a loop wherever a path turns. Paths that try each: their light varies by half
 _MOST, _TRIED = 32, 256
-# Points of a shape, fewest and most, which leave gaps of a tenth of a ball; most points of all shapes, for 0.1 s
+# Points of a shape by area, fewest and most, which leave gaps of a tenth of a ball; most of all shapes: with more than
+# 8192 such shapes, only some are targets
 _FEWEST_POINTS, _POINTS, _MOST_POINTS = 8, 256, 1 << 16
 # A ball is divided if the squared radii of its halves sum to less than this fraction of its own squared radius. Halves
 # of a round shape have more, two lamps less
@@ -40,11 +41,11 @@ _DIVIDED = 0.7
 _WIDE = 0.2
 # Least part of a relay in the light: a relay with less makes little noise, and takes time wherever a path turns
 _LEAST = 0.002
-# Largest part of the samples of a diffuse BSDF that go to relays anyway. In four rooms, lamps in glass have 0.05 to
-# 0.13; a wall of glass has 0.6, where paths to relays had four times the variance
+# Largest part of the samples of a diffuse BSDF that go to the kept relays anyway. In four rooms, lamps in glass have
+# 0.05 to 0.13; a wall of glass has 0.6, where paths to relays had four times the variance
 _MOST_REACH = 0.3
-# Least probability of all relays over the largest one. Lamps in glass in four rooms have 0.9 and more, staircase2 0.1,
-# where paths to relays gained 4 to 15% in the pilot and took a third more time
+# Least mean of the part of the light in a cell that comes by relays. Lamps in glass in four rooms have 0.9 and more,
+# staircase2 0.1, where paths to relays gained 4 to 15% in the pilot and took a third more time
 _LEAST_DRAWN = 0.2
 
 
@@ -58,10 +59,12 @@ def find_relays(view: View, pilot: Pilot, rays: int) -> Relays | None:
     materials = view.emitters.traits.materials
     center, radius = balls_around(points, np.median(places, axis=0))
     candidates = Relays(center, radius, np.ones(len(radius)), materials)
-    light, reach = _tried(candidates, _Look(view, candidates), places, facing, view.seed)
-    share = light / max(light.sum(), np.finfo(np.float64).tiny)
-    kept = np.flatnonzero(share[1:] >= _LEAST)
-    if len(kept) == 0 or reach[1:][kept].sum() > _MOST_REACH:
+    tries = min(_TRIED, rays // candidates.choice.count)
+    if tries < 1:
+        return None
+    light, reach = _tried(candidates, _Look(view, candidates), tries, places, facing, view.seed)
+    kept = _worth(light, reach)
+    if len(kept) == 0:
         return None
     relays = Relays(center[kept], radius[kept], light[1:][kept], materials)
     seed = derived_seed(view.seed, Stream.RELAYS, 1)
@@ -70,18 +73,31 @@ def find_relays(view: View, pilot: Pilot, rays: int) -> Relays | None:
     return relays if relays.drawn >= _LEAST_DRAWN else None
 
 
-def _tried(relays: Relays, look: _Look, places: np.ndarray, facing: np.ndarray, seed: int):
-    """Means at random vertices, (n + 1,): irradiance by each choice; fraction of the samples of a diffuse BSDF in its
-    directions."""
+def _worth(light: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Indices of the relays to keep, by the results (n + 1,) of :func:`_tried`: relays with much light, first those
+    with the most for the samples of a diffuse BSDF that go there."""
+    share = light[1:] / max(light.sum(), np.finfo(np.float64).tiny)
+    order = np.argsort(-light[1:] / np.maximum(reach[1:], np.finfo(np.float64).tiny), kind="stable")
+    kept, left = [], _MOST_REACH
+    for number in order[share[order] >= _LEAST]:
+        if reach[1 + number] <= left:
+            kept.append(number)
+            left -= reach[1 + number]
+    return np.sort(np.array(kept, int))
+
+
+def _tried(relays: Relays, look: _Look, tries: int, places: np.ndarray, facing: np.ndarray, seed: int):
+    """Means of ``tries`` paths at random vertices, (n + 1,): irradiance by each choice; fraction of the samples of a
+    diffuse BSDF in its directions."""
     sources = relays.choice.count
-    drawn = np.random.default_rng(seed).integers(len(places), size=sources * _TRIED)
+    drawn = np.random.default_rng(seed).integers(len(places), size=sources * tries)
     normal = mi.Normal3f(upload_vectors(mi.Point3f, facing[drawn]))
     seen = Places(upload_vectors(mi.Point3f, places[drawn]), normal + dr.opaque(mi.Float, 0.0), normal)
-    source = upload(mi.UInt32, np.repeat(np.arange(sources), _TRIED))
+    source = upload(mi.UInt32, np.repeat(np.arange(sources), tries))
     dr.eval(seen, source)
     with relays.choice.each_source():
         found = look.measured(seen, source, derived_seed(seed, Stream.RELAYS))
-    return tuple(x.reshape(sources, _TRIED).mean(1) for x in found)
+    return tuple(x.reshape(sources, tries).mean(1) for x in found)
 
 
 @dataclass(frozen=True)
@@ -144,19 +160,21 @@ def points_of_relays(scene) -> np.ndarray:
     shapes.sort(key=lambda shape: (*np.array(shape.bbox().min), *np.array(shape.bbox().max)))
     shapes = shapes[:: -(-len(shapes) * _FEWEST_POINTS // _MOST_POINTS) or 1]
     each = int(np.clip(_MOST_POINTS // max(len(shapes), 1), _FEWEST_POINTS, _POINTS))
-    return np.concatenate([_points_on(shape, each) for shape in shapes]) if shapes else np.zeros((0, 3))
+    points = np.concatenate([_points_on(shape, each) for shape in shapes]) if shapes else np.zeros((0, 3))
+    return points[np.isfinite(points).all(1)]
 
 
 def _points_on(shape, count: int) -> np.ndarray:
-    """Points (n, 3) on a mesh: ``count`` by area, and about as many corners; on other shapes, on the ellipsoid in the
-    bounding box."""
+    """Points (n, 3): on a mesh, ``count`` by area, and about as many corners; on a sphere, as many; of other shapes,
+    the corners of the bounding box."""
     generator = np.random.default_rng(0)
     if not is_hit_as_triangles(shape):
-        box = shape.bbox()
-        direction = generator.normal(size=(count, 3))
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        axes = np.concatenate([np.eye(3), -np.eye(3), direction])
-        return np.array(box.center()) + axes * 0.5 * np.array(box.extents())
+        box, directions = shape.bbox(), 2.0 * np.indices((2, 2, 2)).reshape(3, -1).T - 1
+        if shape.class_name() == "Sphere":
+            directions = generator.normal(size=(count, 3))
+            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+            directions = np.concatenate([np.eye(3), -np.eye(3), directions])
+        return np.array(box.center()) + directions * 0.5 * np.array(box.extents())
     faces, positions = surface_of(shape)
     positions = positions.astype(np.float64)
     corners = positions[:: max(len(positions) // count, 1)]

@@ -35,8 +35,8 @@ from .relays import Relays
 from .relays_found import find_relays
 from .view import Stream, View, ViewLights
 
-# Paths from a place over shadow rays from it, by time: about as many edges
-_RELAY_COST = 4
+# Shadow rays that take the time of a path: about as many as it has edges
+_RAYS_OF_PATH = 4
 
 
 @dataclass(frozen=True)
@@ -133,11 +133,13 @@ def with_relays(view: View, pilot: Pilot) -> tuple[View, Pilot]:
 
     Relays are looked for if light by way of glass and mirrors makes a part of the noise.
     """
+    if not pilot.relayed.any():
+        return view, pilot
     unseen = pilot.radiance - pilot.seen
     noise, rest = (relative_variance(x, pilot.brightness, view.model) for x in (unseen, unseen - pilot.relayed))
     if noise - rest <= view.model.relayed_noise * noise:
         return view, pilot
-    relays = find_relays(view, pilot, learning_rays(view.learning_count) // _RELAY_COST)
+    relays = find_relays(view, pilot, learning_rays(view.learning_count) // _RAYS_OF_PATH)
     if relays is None:
         return view, pilot
     relayed = replace(view, relays=relays)

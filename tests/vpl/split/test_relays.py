@@ -10,7 +10,7 @@ from vpl.core.arrays import download
 from vpl.core.materials import Materials
 from vpl.core.sampling import independent_sampler
 from vpl.split.relays import Relays, relays_by, tells_density
-from vpl.split.relays_found import balls_around, points_of_relays
+from vpl.split.relays_found import _worth, balls_around, points_of_relays
 
 COUNT = 1 << 18
 FLAGS = {
@@ -24,7 +24,7 @@ FLAGS = {
 }
 
 
-class Places:
+class EvenChoice:
     """Relays that are drawn with equal probabilities in every cell."""
 
     def __init__(self, center, radius):
@@ -49,7 +49,7 @@ def mixed(relays, origin, count=COUNT):
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
 def test_density_is_that_of_directions(radius, size):
     """Integrals over all directions; the balls overlap or hold the origin in some cases."""
-    places = Places(size * np.array([[1.0, 0.5, 0.2], [1.1, 0.8, 0.1]]), size * np.array(radius))
+    places = EvenChoice(size * np.array([[1.0, 0.5, 0.2], [1.1, 0.8, 0.1]]), size * np.array(radius))
     direction, density = mixed(places.relays, [0.0, 0.0, 0.0])
     assert (density > 0).all() and np.isfinite(density).all()
     for values, expected in ((np.ones(COUNT), 4 * np.pi), (direction[:, 0] ** 2, 4 / 3 * np.pi)):
@@ -58,15 +58,18 @@ def test_density_is_that_of_directions(radius, size):
         assert abs(weighted.mean() - expected) < 4.5 * error + 1e-4 * expected
 
 
-def test_directions_lie_in_cones():
-    places = Places([[0.0, 0.0, 2.0]], [0.1])
-    direction, density = mixed(places.relays, [0.0, 0.0, 0.0])
-    cosine = (1 - 0.05**2) ** 0.5
-    of_cone = 0.25 / (2 * np.pi * (1 - cosine)) / 0.5  # half of all directions are uniform
-    inside = direction[:, 2] >= cosine
-    assert abs(inside.mean() - 0.5) < 0.01
-    assert np.allclose(density[inside].mean(), of_cone + 0.125 / np.pi, rtol=1e-2)
-    assert np.allclose(density[~inside].max(), 0.125 / np.pi, rtol=1e-5)
+@pytest.mark.parametrize("sine", [0.5, 0.05, 1e-3])
+def test_directions_lie_in_cones(sine):
+    choice = EvenChoice([[0.0, 0.0, 2.0]], [2.0 * sine])
+    direction, density = mixed(choice.relays, [0.0, 0.0, 0.0])
+    across = np.linalg.norm(direction[:, :2], axis=1)
+    front = direction[:, 2] > 0
+    # Half of all directions are uniform. Directions at the edge of the cone may be rounded to either side
+    inside, outside = front & (across < 0.999 * sine), ~front | (across > 1.001 * sine)
+    assert abs(np.mean(~outside) - 0.5) < 0.05
+    of_cone = 0.5 * (1 + (1 - sine**2) ** 0.5) / (2 * np.pi * sine**2)
+    assert np.allclose(density[inside], of_cone + 0.125 / np.pi, rtol=1e-3)
+    assert np.allclose(density[outside], 0.125 / np.pi, rtol=1e-5)
 
 
 @pytest.mark.parametrize("material, expected", FLAGS.items())
@@ -91,6 +94,11 @@ def test_materials_of_parts_tell_no_density():
 def around(center, radius, count=100):
     direction = np.random.default_rng(1).normal(size=(count, 3))
     return np.array(center) + radius * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+
+def test_much_light_in_few_directions_is_worth_a_choice():
+    light, reach = np.array([1.0, 0.5, 0.5, 0.001, 4.0]), np.array([1.0, 0.01, 0.25, 0.01, 0.9])
+    assert list(_worth(light, reach)) == [0, 1]
 
 
 def test_two_lamps_get_a_ball_each():
