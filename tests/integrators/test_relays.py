@@ -77,7 +77,7 @@ ROOMS = {
 @pytest.fixture
 def always_relays(monkeypatch):
     """``manylights`` that takes relays wherever there are some."""
-    monkeypatch.setattr("vpl.split.relays_found._LEAST_DRAWN", 0.0)
+    monkeypatch.setattr("vpl.split.relays_found._LEAST_PART", 0.0)
     monkeypatch.setattr("vpl.split.relays_found._MOST_REACH", 10.0)
     with plugin_with_model(relayed_noise=0.0, relay_cost=0.0):
         yield
