@@ -16,7 +16,7 @@ from tests.support.scenes import area_light, closed_box
 from vpl.core.registry import RegistryTable
 from vpl.lights.emitters import read_emitters
 from vpl.points.camera_paths import shape_in
-from vpl.split import surface_lights
+from vpl.split import paths_from_places
 from vpl.split.emitters import cell_emitters, irradiance
 
 MITSUBAS = 2  # one makes the camera's rays, one puts samples on the film; both hold the image's width
@@ -160,7 +160,7 @@ def test_sites_and_lights_find_irradiance_by_one_kernel(monkeypatch, lights_cost
         return found
 
     monkeypatch.setattr(cell_emitters, "irradiance_from_emitters", watched)
-    monkeypatch.setattr(surface_lights, "irradiance_from_emitters", watched)
+    monkeypatch.setattr(paths_from_places, "irradiance_from_emitters", watched)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         mi.render(scene, integrator=mi.load_dict({"type": "manylights", "max_depth": 4}), spp=64).numpy()
     assert len(launched) == 2

@@ -9,7 +9,7 @@ paths has 8100 instead of 16 800 operations.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 
 import drjit as dr
 import mitsuba as mi
@@ -32,6 +32,11 @@ class Materials:
         """The materials of all surfaces of a scene."""
         found = [shape.bsdf() for _, shape in shapes.of_hits]
         return cls(list({id(bsdf): bsdf for bsdf in found}.values()))
+
+    @cached_property
+    def flags(self) -> frozenset[int]:
+        """Flags of the materials, each once."""
+        return frozenset(int(bsdf.flags()) for bsdf in self.bsdfs)
 
     def where(self, test: Callable[[mi.BSDF], bool]) -> Materials:
         """The materials that pass a test."""

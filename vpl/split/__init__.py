@@ -32,7 +32,7 @@ The terms of the estimator:
 - ``relays``: glass and mirrors by way of which light arrives, as targets of paths
 - ``relays_found``: which glass and mirrors, and how much light arrives by each
 - ``onward``: directions in which paths go on: of the BSDF, or to relays
-- ``edges_from_places``: first edges of paths that find the irradiance of places
+- ``paths_from_places``: paths that find the irradiance of places on surfaces
 - ``spatial_cells``: cubes of space by facing, for values learned by place
 
 The lights and the decisions:

@@ -59,7 +59,7 @@ class RelayChoice:
         """The choice at each ``hit`` by the ``numbers`` of a lattice, and the remaining numbers; the BSDF where a lane
         is not ``active``."""
         chosen, place, lobe, turn = numbers
-        si, chooses = hit.si, active & hit.smooth & relays.materials.hold(hit.bsdf, hit.smooth)
+        si, chooses = hit.si, active & relays.materials.hold(hit.bsdf, hit.smooth)
         cell = relays.cell(si.p, si.sh_frame.n * hit.side)
         drawn, direction, rest = relays.draw(si.p, cell, lobe, turn, chooses)
         of_bsdf = dr.select(chooses, relays.choice.probability(cell, mi.UInt32(0), chooses), 1)
@@ -91,7 +91,7 @@ class RelayChoice:
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         counts = self.chooses & ~delta
         direction = self.si.to_world(bs.wo)
-        mixture = self.relays.density(self.si.p, self.cell, self.drawn, direction, bs.pdf, counts)
+        mixture = self.relays.density(self.si.p, self.cell, self.drawn, direction, bs.pdf * self.of_bsdf, counts)
         density = dr.select(counts, mixture, bs.pdf)
         # BSDF × cosine over the density of the mixture
         of_sample = dr.select(counts, bs.pdf / density, dr.rcp(self.of_bsdf))

@@ -97,9 +97,8 @@ class Relays:
         active: mi.Bool,
     ):  # fmt: skip
         """Density of each ``direction`` from a vertex, 1 / sr; ``drawn``: the choice that drew it; ``of_bsdf``: density
-        of the samples of the BSDF."""
-        active, last = mi.Bool(active), self._last
-        sampled = of_bsdf * self.choice.probability(cell, mi.UInt32(0), active)
+        of the samples of the BSDF, times their probability."""
+        active, last, sampled = mi.Bool(active), self._last, mi.Float(of_bsdf)
         number = dr.zeros(mi.UInt32, dr.width(active))
         while dr.hint(active & (number < last), exclude=[origin, cell, drawn, direction, active, last]):
             axis, height = self._cone(origin, number, active)

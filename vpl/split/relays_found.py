@@ -20,10 +20,8 @@ from ..core.arrays import channel_mean, download, upload, upload_vectors
 from ..core.meshes import is_hit_as_triangles, surface_of
 from ..core.sampling import derived_seed, independent_sampler
 from ..core.shapes import INSTANCE, SceneShapes
-from .edges_from_places import edges_from
-from .emitters.irradiance import Places, irradiance_from_emitters
-from .lattice import Lattice
-from .path_tracer import trace_paths
+from .emitters.irradiance import Places
+from .paths_from_places import paths_from
 from .pilot import Pilot
 from .relays import Relays, relays_by
 from .view import Stream, View, ViewLights
@@ -91,8 +89,7 @@ def _tried(relays: Relays, look: _Look, tries: int, places: np.ndarray, facing: 
     diffuse BSDF in its directions."""
     sources = relays.choice.count
     drawn = np.random.default_rng(seed).integers(len(places), size=sources * tries)
-    normal = mi.Normal3f(upload_vectors(mi.Point3f, facing[drawn]))
-    seen = Places(upload_vectors(mi.Point3f, places[drawn]), normal + dr.opaque(mi.Float, 0.0), normal)
+    seen = Places.of_facing(*(upload_vectors(mi.Point3f, rows[drawn]) for rows in (places, facing)))
     source = upload(mi.UInt32, np.repeat(np.arange(sources), tries))
     dr.eval(seen, source)
     with relays.choice.each_source():
@@ -128,16 +125,10 @@ class _Look:
         return [np.nan_to_num(x, posinf=0, neginf=0) for x in found]
 
     def _traced(self, places: Places, choice: mi.UInt32, seed: int) -> tuple[mi.Float, mi.Float]:
-        view, emitters = self.view, self.view.emitters
-        settings = view.settings(ViewLights())
-        cell = emitters.cell(places.position, places.facing) + dr.opaque(mi.UInt32, 0, places.count)
-        edge = edges_from(places, cell, choice, self.relays, independent_sampler(derived_seed(seed, 0), places.count))
-        lattice = Lattice.of_lanes(dr.arange(mi.UInt32, places.count), 1, seed)
-        sampler = independent_sampler(derived_seed(seed, 1), places.count)
-        traced = trace_paths(view.scene, emitters, edge, lattice, sampler, settings)
-        most = settings.max_depth - 1
-        dr.make_opaque(most)
-        near = irradiance_from_emitters(view.scene, emitters, places, cell, 1, most, derived_seed(seed, 2))
+        view, sampler = self.view, independent_sampler(derived_seed(seed, 0), places.count)
+        near, edge, traced = paths_from(
+            view.scene, view.emitters, places, choice, self.relays, 1, view.settings(ViewLights()), sampler, seed
+        )
         # Light by way of relays belongs to them, all other light to the BSDF, whichever drew the direction
         relayed = traced.noise.relayed
         others = channel_mean(traced.radiance) - relayed + channel_mean(near.irradiance)

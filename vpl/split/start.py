@@ -119,7 +119,7 @@ def learning_pilot(view: View) -> tuple[Pilot, bool]:
     if not view.emitters.learn(*pilot.vertices, rays, seed):
         return pilot, False
     again = Pilot.trace(view, ViewLights())
-    before, after = (relative_errors(x.radiance - x.seen, pilot.brightness, view.model) for x in (pilot, again))
+    before, after = unseen_errors(pilot, again)
     cost = view.model.learned_sky_cost if view.emitters.learns_sky else view.model.learned_cost
     if is_certain_rise(before, cost * after, view.model):
         view.emitters.forget()
@@ -144,10 +144,17 @@ def with_relays(view: View, pilot: Pilot) -> tuple[View, Pilot]:
         return view, pilot
     relayed = replace(view, relays=relays)
     again = Pilot.trace(relayed, ViewLights())
-    before, after = (relative_errors(x.radiance - x.seen, pilot.brightness, view.model) for x in (pilot, again))
+    before, after = unseen_errors(pilot, again)
     kept = kept_of_both(before, after, view.model)
     pays = view.model.relay_cost * np.mean(after[kept]) < np.mean(before[kept])
     return (relayed, again) if pays else (view, pilot)
+
+
+def unseen_errors(*pilots: Pilot) -> list[np.ndarray]:
+    """Relative errors (n // 2,) of pilots with the same camera rays, without emission that is seen directly, over the
+    brightness of the first."""
+    first = pilots[0]
+    return [relative_errors(x.radiance - x.seen, first.brightness, first.model) for x in pilots]
 
 
 def is_certain_rise(before: np.ndarray, after: np.ndarray, model: CostModel) -> bool:

@@ -23,15 +23,15 @@ from ..core.parameters import fingerprint_without_camera
 from ..core.sampling import derived_seed, independent_sampler
 from ..lights.light_set import ScatteredGroup
 from ..lights.virtual_lights import VirtualLights
-from .edges_from_places import edges_from
 from .emitters.base import EmitterSampler
-from .emitters.irradiance import Places, irradiance_from_emitters
+from .emitters.irradiance import Places
 from .lattice import Lattice
 from .line_hits import LineHits, hits_of
 from .line_sampling import LineSampler
 from .local_c import LocalC
 from .path_state import FirstEdge, Gathering, PathSettings
 from .path_tracer import trace_paths
+from .paths_from_places import paths_from
 from .roulette import OutgoingRadiance
 from .view import Stream, View, ViewLights
 
@@ -139,22 +139,13 @@ def _places_with_minorants(scene, emitters, rays, settings: PathSettings, seed: 
 
 def _irradiance(scene, emitters, places: Places, settings: PathSettings, seed: int):
     """Irradiance of each place by a single path: (unpolarized spectrum, edges of the path, group of the emitter)."""
-    count = places.count
-    cell = emitters.cell(places.position, places.facing) + dr.opaque(mi.UInt32, 0, count)
+    count, relays = places.count, settings.relays
     sampler = independent_sampler(derived_seed(seed, 0), count)
-    of_relays = settings.relays.cell(places.position, places.facing) if settings.relays else None
-    edge = edges_from(places, cell, of_relays, settings.relays, sampler)
-    draw = sampler.next_1d()
-    dr.eval(cell, draw)
+    of_relays = relays.cell(places.position, places.facing) if relays else None
     # Many pixels see a light: with few of many emitters, its irradiance would vary visibly
     samples = _EMITTER_SAMPLES if emitters.lights is not None else 1
-    # A path to an emitter has an edge and one more for each null surface
-    most = settings.max_depth - 1
-    dr.make_opaque(most)
-    near = irradiance_from_emitters(scene, emitters, places, cell, samples, most, derived_seed(seed, 2))
-    nearest = near.irradiance
-    lattice = Lattice.of_lanes(dr.arange(mi.UInt32, count), 1, seed)
-    found = trace_paths(scene, emitters, edge, lattice, independent_sampler(derived_seed(seed, 1), count), settings)
+    near, _, found = paths_from(scene, emitters, places, of_relays, relays, samples, settings, sampler, seed)
+    nearest, draw = near.irradiance, sampler.next_1d()
     # A light stands for paths of one length, because gather vertices far from the camera may use short paths only. The
     # irradiance is a single contribution, drawn by its share, with the colour of the contribution
     level, more = dr.sum(dr.abs(nearest)), dr.sum(dr.abs(found.drawn))

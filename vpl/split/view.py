@@ -117,7 +117,7 @@ class View:
     @property
     def meets_relays(self) -> bool:
         """Whether the scene may have relays."""
-        return any(relays_by(int(bsdf.flags())) for bsdf in self.emitters.traits.materials.bsdfs)
+        return any(map(relays_by, self.emitters.traits.materials.flags))
 
     @property
     def plain_from(self) -> float:

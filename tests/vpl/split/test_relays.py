@@ -41,7 +41,7 @@ def mixed(relays, origin, count=COUNT):
     assert dr.all((rest >= 0) & (rest < 1))
     uniform = mi.warp.square_to_uniform_sphere(sampler.next_2d())
     direction = dr.select(drawn > 0, direction, uniform)
-    everywhere = dr.full(mi.Float, 0.25 / np.pi, count)
+    everywhere = 0.25 / np.pi * relays.choice.probability(cell, mi.UInt32(0), mi.Bool(True))
     return download(direction), download(relays.density(origin, cell, drawn, direction, everywhere, mi.Bool(True)))
 
 

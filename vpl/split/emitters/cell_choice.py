@@ -54,9 +54,7 @@ class _VerticesOfCells:
         """A random vertex of each of the cells ``row``, from 0 on."""
         number = mi.UInt32(sampler.next_1d() * mi.Float(dr.gather(mi.UInt32, self.size, row)))
         vertex = dr.gather(mi.UInt32, self.first, row) + number
-        facing = mi.Normal3f(dr.gather(mi.Point3f, self.normal, vertex))
-        # Two distinct arrays of normals, as for virtual lights: both use the same kernel
-        return Places(dr.gather(mi.Point3f, self.position, vertex), facing + dr.opaque(mi.Float, 0.0), facing)
+        return Places.of_facing(*(dr.gather(mi.Point3f, x, vertex) for x in (self.position, self.normal)))
 
 
 class CellChoice:

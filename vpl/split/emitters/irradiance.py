@@ -24,6 +24,13 @@ class Places:
     normal: mi.Normal3f
     facing: mi.Normal3f
 
+    @classmethod
+    def of_facing(cls, position: mi.Point3f, facing: mi.Point3f) -> Places:
+        """Points of which only the shading normal is known."""
+        facing = mi.Normal3f(facing)
+        # Two distinct arrays of normals, as for virtual lights: both use the same kernel
+        return cls(position, facing + dr.opaque(mi.Float, 0.0), facing)
+
     @property
     def count(self) -> int:
         """Number of points."""
