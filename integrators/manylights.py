@@ -25,7 +25,7 @@ from vpl.split.roulette import OutgoingRadiance
 from vpl.split.start import Start, make_start
 from vpl.split.surface_lights import KeptLights
 from vpl.split.view import PathRules, Stream, View
-from vpl.transport.minorant import with_minorant
+from vpl.transport.minorant import Minorants
 
 from .camera_samples import LatticeSampler, stratified
 from .knobs import Boolean, Groups, Words
@@ -142,8 +142,9 @@ class ManyLightsIntegrator(PassRenderer):
       environment behind a mask, which ``manylights`` shows.  Alpha is that of ``path``.
     - Surfaces only: the plugin refuses a scene with a participating medium.
     - ``*_rgb`` and ``*_mono`` variants only.  No recording by ``dr.freeze``.
-    - Materials and emitters: all that ``path`` renders.  Virtual lights do not carry light that metals or surfaces with
-      bump or normal maps reflect, nor light that passes a mask or thin glass between x1 and x2: paths trace it.
+    - Materials and emitters: all that ``path`` renders.  Virtual lights do not carry light that metals reflect, nor
+      light that passes a mask or thin glass between x1 and x2: paths trace it.  Paths also trace the light of bump and
+      normal maps in blends and masks, and where the perturbed normal is more than 45 degrees from the shading normal.
 
     .. tabs::
         .. code-tab:: xml
@@ -329,7 +330,7 @@ class ManyLightsIntegrator(PassRenderer):
         groups = EmitterGroups(scene, self.light_groups) if self.light_groups and not known else None
         emitters = known.emitters if known else emitter_sampler(scene, learning_rays(learning), groups)
         return View(
-            scene, emitters, with_minorant(emitters.traits.materials),
+            scene, emitters, Minorants(emitters.traits.materials),
             PathRules(self.max_depth, self.rr_depth, self.hide_emitters), ray, active, cells.width, cells.rays, seed,
             dr.opaque(mi.Float, 1.0, pixels), dr.opaque(mi.UInt32, 1, pixels), OutgoingRadiance.unknown(), learning,
             planned, self.cost_model if self.denoised else self.cost_model.without_denoiser(),

@@ -9,7 +9,7 @@ import pytest
 from tests.support.catalogue import EMITTERS, MATERIALS, ONE_PIXEL, SENSORS, film, one_of, stage
 from tests.support.marks import not_on_cuda, stress
 from tests.support.rendering import plugin_with_model, render, render_with_statistics
-from tests.support.rooms import bulb, lamp_behind_the_camera, smooth_octahedron, sunny, veiled_room
+from tests.support.rooms import bulb, glowing_octahedron, lamp_behind_the_camera, sunny, veiled_room
 from tests.support.scenes import area_light, closed_box, image, rgb, sensor, wall
 from tests.support.statistics import assert_same_mean
 
@@ -82,7 +82,7 @@ def test_a_glowing_mesh_with_vertex_normals():
     """With as many emitter samples as `path`: for these meshes, Mitsuba's samples of emitters and of BSDFs have
     different means (decisions.md)."""
     with plugin_with_model(pays_below=1e30, fewest_light_paths=4000, most_emitter_samples=1):
-        assert_image_of_path(closed_box(smooth_octahedron(), 16), max_depth=4)
+        assert_image_of_path(closed_box(glowing_octahedron(), 16), max_depth=4)
 
 
 def test_a_sun_of_one_texel():
@@ -167,7 +167,7 @@ def test_a_mask_with_nothing_behind_it(hide_emitters):
 
 @pytest.mark.parametrize("material", ["bumpmap", *stress("normalmap")])
 def test_walls_that_turn_their_normals(material):
-    """Lights would shine from below the turned normal too, where no sample of the BSDF goes to take that off."""
+    """Lights shine in a lobe, all of which paths have to reach and subtract."""
     description = {**MATERIALS[material](), "nested": {"type": "diffuse", "reflectance": rgb(0.8)}}
     if material == "bumpmap":
         description["scale"] = 0.6

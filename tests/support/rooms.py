@@ -19,22 +19,27 @@ def bulb():
     return {"bulb": {"type": "point", "position": [0.3, 0.4, 0.6], "intensity": rgb(1.0)}}
 
 
-def smooth_octahedron(flip=False, size=0.4):
+def glowing_octahedron(flip=False):
     """A glowing mesh with the normals of a ball: near the outline, visible faces shine away from the camera."""
+    emitter = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": 4.0}})
+    return {"lamp": smooth_octahedron(emitter, [0, 0.1, 0], flip)}
+
+
+def smooth_octahedron(of_surface, place, flip=False, size=0.4):
+    """A mesh at a ``place`` with the normals of a ball; ``of_surface``: emitter or material."""
     props = mi.Properties()
-    props["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": 4.0}})
-    props["flip_normals"] = flip
+    props["of_surface"], props["flip_normals"] = of_surface, flip
     corners = np.concatenate([np.eye(3), -np.eye(3)])
     faces = [[x, y, z] if np.linalg.det(corners[[x, y, z]]) > 0 else [x, z, y]
              for x in (0, 3) for y in (1, 4) for z in (2, 5)]  # fmt: skip
     mesh = mi.Mesh("octahedron", len(corners), len(faces), props, has_vertex_normals=True)
     parameters = mi.traverse(mesh)
     turned = corners @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    parameters["vertex_positions"] = upload(mi.Float, size * turned + [0, 0.1, 0])
+    parameters["vertex_positions"] = upload(mi.Float, size * turned + place)
     parameters["vertex_normals"] = upload(mi.Float, turned)
     parameters["faces"] = upload(mi.UInt32, np.array(faces))
     parameters.update()
-    return {"lamp": mesh}
+    return mesh
 
 
 def veiled_room(veils=4, lamp=None):

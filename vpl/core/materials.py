@@ -14,8 +14,20 @@ from functools import cached_property, partial
 import drjit as dr
 import mitsuba as mi
 
+from .parameters import children_of
 from .registry import RegistryTable
 from .shapes import SceneShapes
+
+# Materials whose samples have the density of the drawn part, by class
+_OF_PARTS = ("BlendBSDF", "MaskBSDF")
+
+
+def tells_density(bsdf: mi.BSDF) -> bool:
+    """Whether samples of a BSDF come with the density that the BSDF gives any direction.
+
+    In Mitsuba 3.9.1, a sample of ``blendbsdf`` or ``mask`` has that of the drawn material alone.
+    """
+    return bsdf.class_name() not in _OF_PARTS and all(map(tells_density, children_of(bsdf, mi.BSDF)))
 
 
 class Materials:
@@ -26,6 +38,10 @@ class Materials:
         self.bsdfs = bsdfs or [mi.load_dict({"type": "null"})]
         indices = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in self.bsdfs]
         self._numbers = RegistryTable(indices, range(1, len(indices) + 1))
+
+    def __contains__(self, bsdf: mi.BSDF) -> bool:
+        """Whether ``bsdf`` is one of the materials."""
+        return any(bsdf is one for one in self.bsdfs)
 
     @classmethod
     def of(cls, shapes: SceneShapes) -> Materials:

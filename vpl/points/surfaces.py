@@ -32,7 +32,8 @@ class Surface:
 
 @dataclass
 class LambertianSurface(Surface):
-    """Diffuse surfaces.  ``normal``: shading normal on the viewer's side; ``albedo``: reflectance / pi."""
+    """Diffuse surfaces.  ``normal``: axis of the cosine lobe, for example the shading normal on the viewer's side;
+    ``albedo``: reflectance / pi."""
 
     normal: mi.Normal3f
     albedo: mi.Color3f
@@ -60,6 +61,15 @@ class LambertianSurface(Surface):
         density = mi.warp.square_to_cosine_hemisphere_pdf(local)
         weight = rgb_to_spectrum(self.albedo * dr.pi) & active
         return mi.Frame3f(self.normal).to_world(local), weight, density & active
+
+
+@dataclass
+class CutLambertianSurface(LambertianSurface):
+    """The same, without light from below: ``interaction.n`` is the geometric normal on the viewer's side."""
+
+    def reflected(self, to_light, active):
+        """BSDF times cosine for light from a world space direction."""
+        return super().reflected(to_light, active & (dr.dot(self.interaction.n, to_light) > 0))
 
 
 @dataclass

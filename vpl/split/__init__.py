@@ -29,6 +29,7 @@ The terms of the estimator:
 - ``film_cells``: the rays of the pixels of a film that is finer than the image
 - ``lattice``: stratified random numbers for the samples of a pixel
 - ``emitters``: emitter samplers for next-event estimation
+- ``covered``: directions at bump and normal maps, which cover the lobes of virtual lights
 - ``relays``: glass and mirrors by way of which light arrives, as targets of paths
 - ``relays_found``: which glass and mirrors, and how much light arrives by each
 - ``onward``: directions in which paths go on: of the BSDF, or to relays

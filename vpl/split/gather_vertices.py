@@ -27,9 +27,9 @@ _RECORD = 16
 class GatherVertices:
     """Vertices of paths, one per lane.
 
-    ``position``: world units; ``normal``: shading normal on the visible side; ``flat``: geometric normal; ``weight``:
-    contribution to the camera ray per irradiance from virtual lights, an unpolarized spectrum, may be negative, 0 for
-    no vertex; ``depth``: edges from the camera, 0 for no vertex.
+    ``position``: world units; ``normal``: axis of the lobe (:class:`vpl.transport.minorant.Lobe`); ``flat``: geometric
+    normal on the visible side; ``weight``: contribution to the camera ray per irradiance from virtual lights, an
+    unpolarized spectrum, may be negative, 0 for no vertex; ``depth``: edges from the camera, 0 for no vertex.
     """
 
     position: mi.Point3f
@@ -149,7 +149,7 @@ class PackedVertices:
         dr.eval(self._records, self.level)
 
     def place(self, row) -> tuple[mi.Point3f, mi.Normal3f]:
-        """(Position, shading normal) of vertices."""
+        """(Position, axis of the lobe) of vertices."""
         return mi.Point3f(self._part(row, 0).xyz), mi.Normal3f(self._part(row, 2).xyz)
 
     def at(self, row) -> tuple[GatherVertices, mi.UInt32]:

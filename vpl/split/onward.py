@@ -19,8 +19,9 @@ from .relays import Relays
 class Turned:
     """Directions onward, one per lane.
 
-    ``sample`` of the BSDF, with the density that the BSDF gives its direction; ``weight``: BSDF × cosine over
-    ``density``, the density with which the direction is drawn, 1 / sr, without meaning for delta lobes.
+    ``sample`` of the BSDF, with the density of its direction without relays, see :mod:`vpl.split.covered`; ``weight``:
+    BSDF × cosine over ``density``, the density with which the direction is drawn, 1 / sr, without meaning for delta
+    lobes.
     """
 
     sample: mi.BSDFSample3f
@@ -60,7 +61,7 @@ class RelayChoice:
         is not ``active``."""
         chosen, place, lobe, turn = numbers
         si, chooses = hit.si, active & relays.materials.hold(hit.bsdf, hit.smooth)
-        cell = relays.cell(si.p, si.sh_frame.n * hit.side)
+        cell = relays.cell(si.p, hit.facing)
         drawn, direction, rest = relays.draw(si.p, cell, lobe, turn, chooses)
         of_bsdf = dr.select(chooses, relays.choice.probability(cell, mi.UInt32(0), chooses), 1)
         lobe = dr.select(chooses, rest, lobe)
@@ -77,7 +78,7 @@ class RelayChoice:
     def chosen(self, before: Turned, turned: Turned, direction, value, density, number: mi.UInt32) -> Turned:
         """Where a relay is drawn, its ``direction``, with BSDF × cosine ``value`` as weight; otherwise ``turned``.
 
-        ``density``: that of the BSDF; ``before``: the result of the sample before.
+        ``density`` of the direction, see :class:`Turned`; ``before``: the result of the sample before.
         """
         along = dr.zeros(mi.BSDFSample3f, dr.width(density))
         along.wo, along.pdf, along.eta = direction, density, mi.Float(1)

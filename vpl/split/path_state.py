@@ -8,9 +8,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import ones
-from ..core.materials import Materials
 from ..points.camera_paths import SceneTraits
-from ..transport.minorant import is_diffuse, minorant_of, side_of
+from ..transport.minorant import Lobe, Minorants, is_diffuse, side_of
 from .contributions import Contributions
 from .gather_vertices import Gathered
 from .local_c import LocalC
@@ -44,7 +43,7 @@ class PathSettings:
 
     ``max_depth``, ``rr_depth``: as in ``path``; ``c``: of lights on surfaces; ``gathering``: a :class:`Gathering`;
     ``emitters_carried``: whether virtual lights represent emitters, with ``emitters_squared_c``; ``outgoing``: for
-    Russian roulette; ``with_minorant``: materials with a minorant; ``hide_emitters``: a Python bool.
+    Russian roulette; ``minorants`` of materials; ``hide_emitters``: a Python bool.
 
     Two more Python bools; ``plain`` and not ``several`` make smaller kernels.  ``plain``: whether paths find only
     radiance and alpha: virtual lights carry nothing, and there are no records for decisions and lights.  ``several``:
@@ -61,7 +60,7 @@ class PathSettings:
     emitters_carried: mi.Bool
     emitters_squared_c: mi.Float
     outgoing: OutgoingRadiance
-    with_minorant: Materials
+    minorants: Minorants
     hide_emitters: bool
     plain: bool = False
     several: bool = True
@@ -183,9 +182,10 @@ class Path(Edge):
 class Hit:
     """Surfaces that paths hit.
 
-    ``si``; ``bsdf`` with its ``flags``; ``side``, ``minorant``: see :mod:`vpl.transport.minorant`, None in plain paths;
-    ``hidden``: whether the surface is an emitter hidden from the camera; ``goes_on``: whether the path may continue;
-    ``smooth``: whether the path continues at a BSDF with a density.
+    ``si``; ``bsdf`` with its ``flags``; ``side``; ``minorant`` and its ``lobe``: see :mod:`vpl.transport.minorant`,
+    None in plain paths; ``hidden``: whether the surface is an emitter hidden from the camera; ``goes_on``: whether the
+    path may continue; ``smooth``: whether the path continues at a BSDF with a density; ``perturbed``: whether it has a
+    minorant and a bump or normal map, None in scenes without such materials.
     """
 
     si: mi.SurfaceInteraction3f
@@ -193,9 +193,11 @@ class Hit:
     flags: mi.UInt32
     side: mi.Float
     minorant: mi.UnpolarizedSpectrum | None
+    lobe: Lobe | None
     hidden: mi.Bool
     goes_on: mi.Bool
     smooth: mi.Bool
+    perturbed: mi.Bool | None
 
     @classmethod
     def of(cls, traits: SceneTraits, path: Path, settings: PathSettings) -> Hit:
@@ -210,16 +212,23 @@ class Hit:
         goes_on = path.active & si.is_valid() & (path.depth + 1 < settings.max_depth) & ~hidden
         flags, side = bsdf.flags(), side_of(si)
         smooth = goes_on & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-        minorant = None
+        minorant, lobe, perturbed = None, None, None
         if not settings.plain:
-            seeks = smooth & (settings.gathering >= path.state)
-            minorant = minorant_of(si, bsdf, side, settings.with_minorant, seeks)
-        return cls(si, bsdf, flags, side, minorant, hidden, goes_on, smooth)
+            minorants, seeks = settings.minorants, smooth & (settings.gathering >= path.state)
+            minorant, lobe = minorants.at(si, bsdf, side, seeks)
+            perturbed = None if minorants.perturbed is None else minorants.perturbed.hold(bsdf, seeks)
+        return cls(si, bsdf, flags, side, minorant, lobe, hidden, goes_on, smooth, perturbed)
+
+    @property
+    def facing(self) -> mi.Normal3f:
+        """Axis of the lobe of the minorant; in plain paths the shading normal on the side of arrival."""
+        return self.si.sh_frame.n * self.side if self.lobe is None else self.lobe.normal
 
     @property
     def is_diffuse(self) -> mi.Bool:
-        """Whether the BSDF has only a diffuse lobe."""
-        return is_diffuse(self.flags)
+        """Whether the BSDF has only a diffuse lobe, about the shading normal."""
+        found = is_diffuse(self.flags)
+        return found if self.perturbed is None else found & ~self.perturbed
 
 
 @dataclass

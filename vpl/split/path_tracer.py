@@ -33,6 +33,7 @@ from ..points.camera_paths import SceneTraits
 from ..transport.carried_share import carried_share
 from ..transport.minorant import agrees
 from .contributions import Contributions, LayerSums
+from .covered import evaluated_and_sampled
 from .emitters.base import EmitterSample, EmitterSampler, MetEmitter
 from .gather_vertices import Gathered, GatherVertices, SecondVertices
 from .lattice import Lattice
@@ -81,7 +82,7 @@ def trace_paths(
         path.scattered += dr.select(hit.smooth, 1, 0)
         several = hit.smooth & (path.scattered == 1) & settings.several
         samples = dr.select(several, first.direct_samples, 1)
-        cell = emitters.cell(hit.si.p, hit.si.sh_frame.n * hit.side)
+        cell = emitters.cell(hit.si.p, hit.facing)
         # A path that ends needs a sample of the BSDF only to tell whether the surface counts in alpha
         scatters = path.active & ~hit.hidden & (hit.goes_on | ~path.valid)
         share = dr.rcp(mi.Float(samples))
@@ -150,12 +151,12 @@ def _sample_emitter(
     sample = emitters.sample(hit.si, vertex.cell, chosen, sampler.next_1d(), place, hit.smooth)
     if vertex.choice is not None:
         sample = vertex.choice.instead(sample, number)
-    # A single call for both: each call adds the code of every material to the kernel
     toward = hit.si.to_local(sample.direction)
-    value, density, turned, bsdf_weight = emitters.traits.materials.call(
-        hit.bsdf, _evaluated_and_sampled, hit.si, toward, lobe, turn, active=vertex.scatters
+    perturbed = None if settings.plain else settings.minorants.perturbed
+    value, density, turned, bsdf_weight = evaluated_and_sampled(
+        path, vertex, emitters.traits.materials, perturbed, toward, lobe, turn
     )
-    lit, beyond, single = _lit(path, vertex, sample, toward.z, value, density, settings, sampler)
+    lit, beyond, single = _lit(path, vertex, sample, value, density, settings, sampler)
     arriving, crossings = sample.arriving(
         scene, emitters.traits, settings.max_depth - edges, dr.max(dr.abs(beyond)) > 0
     )
@@ -170,10 +171,6 @@ def _sample_emitter(
 def _draw(sampler, settings: PathSettings) -> mi.Float | None:
     """A uniform number for drawing a contribution or a vertex, None for plain paths, which draw none."""
     return None if settings.plain else sampler.next_1d()
-
-
-def _evaluated_and_sampled(bsdf, si, toward, lobe, turn, active):
-    return bsdf.eval_pdf_sample(mi.BSDFContext(), si, toward, lobe, turn, active)
 
 
 def _numbers_of_sample(numbers: tuple, number: mi.UInt32) -> tuple:
@@ -207,12 +204,11 @@ def emitter_share(squared_c, nearness, cosine):
 
 def _carry(path: Path, hit: Hit, settings: PathSettings, radiance, gathered: Gathered):
     """Turn ``path.carried`` from β F1 into w β F1 F2 at x2, 0 elsewhere; record second vertices; return the x2 mask."""
-    si = hit.si
+    si, outward = hit.si, hit.lobe.outward
     cosine = dr.abs(dr.dot(si.n, path.ray.d))
-    # A virtual light at x2 shines only to the side of its shading normal
-    connects = hit.smooth & (path.state == State.CONNECTING) & agrees(si, hit.side)
+    # A virtual light at x2 shines only to the side of the normal of its lobe
+    connects = hit.smooth & (path.state == State.CONNECTING) & (dr.dot(hit.lobe.normal, path.ray.d) < 0)
     path.carried = dr.select(connects, path.carried * hit.minorant, 0)
-    outward = si.n * dr.mulsign(mi.Float(1), -dr.dot(si.n, path.ray.d))
     means = (channel_mean(x) for x in (path.carried, path.throughput, radiance))
     second = connects | (hit.smooth & (path.scattered == 1))
     # On the ray, like virtual lights: on large shapes, Mitsuba's point lies beside the ray
@@ -232,8 +228,7 @@ def _end_at_vertex(path: Path, hit: Hit, connects, settings: PathSettings, sampl
         residual = residual_survival(reflected - path.carried, reflected, connects & hit.is_diffuse)
     # Only after the first surface that counts in alpha: a path may pass masks before
     judged = hit.smooth & (path.scattered > 0) & path.valid
-    facing = hit.si.sh_frame.n * hit.side
-    expected = settings.outgoing.survival(hit.si.p, facing, path.throughput, path.importance, residual)
+    expected = settings.outgoing.survival(hit.si.p, hit.facing, path.throughput, path.importance, residual)
     survival = dr.select(judged, expected, residual)
     hit.goes_on &= sample < survival
     hit.smooth &= hit.goes_on
@@ -245,30 +240,32 @@ def _gather(path: Path, hit: Hit, settings: PathSettings, gathered: Gathered, sa
     virtual lights are placed, paths end at these vertices."""
     si, seeks = hit.si, hit.smooth & (path.state == State.SEEKING)
     gathers = seeks | (hit.smooth & (settings.gathering == Gathering.EVERYWHERE))
-    gathers &= agrees(si, hit.side) | (settings.gathering == Gathering.PLACING)
+    # Without a map, both conditions are the same; a map may turn its normal around where it is seen from behind
+    seen = agrees(si, hit.side) & (dr.dot(hit.lobe.normal, path.ray.d) < 0)
+    gathers &= seen | (settings.gathering == Gathering.PLACING)
     gathers &= (dr.max(hit.minorant) > 0) & (settings.emitters_carried | (path.depth + 2 < settings.max_depth))
     weight = path.throughput * hit.minorant - path.carried
     gathers &= dr.all(dr.abs(weight) <= LARGEST_VALUE)
     weight = dr.select(gathers, weight, 0)
-    gathered.add(GatherVertices(si.p, si.sh_frame.n * hit.side, si.n, weight, path.depth + 1), seeks, sample)
+    gathered.add(GatherVertices(si.p, hit.lobe.normal, hit.lobe.outward, weight, path.depth + 1), seeks, sample)
     hit.goes_on &= settings.gathering != Gathering.PLACING
     hit.smooth &= hit.goes_on
     return gathers, weight
 
 
 def _lit(
-    path: Path, vertex: Vertex, sample: EmitterSample, height, value, density, settings: PathSettings, sampler
+    path: Path, vertex: Vertex, sample: EmitterSample, value, density, settings: PathSettings, sampler
 ):  # fmt: skip
     """Three factors.  Of the light of the sampled emitters: β f, minus the parts carried by virtual lights.  Of light
     that passes null surfaces, which virtual lights that represent emitters do not carry: the same without these parts.
     Of the weight of a sample: from one of several to a single sample.
 
-    ``height``: cosine of the direction; ``value``, ``density``: of the BSDF.
+    ``value`` of the BSDF; ``density`` with which :mod:`vpl.split.covered` draws the direction.
     """
     hit, share = vertex.hit, vertex.share
     value = beyond = full = path.throughput * mi.unpolarized_spectrum(value)
     if not settings.plain:
-        cosine = dr.select(height * hit.side > 0, dr.abs(height), 0)
+        cosine = hit.lobe.cosine(sample.direction)
         value = beyond = full - path.carried * cosine
         if sample.nearness is not None:
             w = emitter_share(settings.emitters_squared_c, sample.nearness, cosine)
@@ -298,8 +295,9 @@ def _turn(path: Path, vertex: Vertex, turned: Turned, traits: SceneTraits):
     null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     path.valid |= path.active & hit.si.is_valid() & ~hit.hidden & ~null
     path.throughput, path.eta = full, path.eta * bs.eta
-    survival = mi.Float(1) if path.carried is None else _turn_carried(path, vertex, turned, delta)
-    path.ray = hit.si.spawn_ray(dr.select(hit.hidden, path.ray.d, hit.si.to_world(bs.wo)))
+    direction = hit.si.to_world(bs.wo)
+    survival = mi.Float(1) if path.carried is None else _turn_carried(path, vertex, turned, direction, delta)
+    path.ray = hit.si.spawn_ray(dr.select(hit.hidden, path.ray.d, direction))
     turns = mi.Bool(True)
     if traits.null:
         # Some materials do not tell what they transmit, and block shadow rays
@@ -311,13 +309,13 @@ def _turn(path: Path, vertex: Vertex, turned: Turned, traits: SceneTraits):
     return survival
 
 
-def _turn_carried(path: Path, vertex: Vertex, turned: Turned, delta):
-    """Subtract the light that virtual lights carry from the throughput, and carry the weight of gather vertices on;
-    returns the survival probability by the residual."""
-    hit, gathers, full, bs = vertex.hit, vertex.gathers, path.throughput, turned.sample
-    path.cosine = dr.abs(bs.wo.z)
+def _turn_carried(path: Path, vertex: Vertex, turned: Turned, direction, delta):
+    """Subtract the light that virtual lights carry from the throughput, and carry the weight of gather vertices on, in
+    the world space ``direction``; returns the survival probability by the residual."""
+    hit, gathers, full = vertex.hit, vertex.gathers, path.throughput
+    path.cosine = hit.lobe.cosine(direction)
     # A Lambertian BSDF of value 1, times the cosine, over the density of the direction
-    lambertian = ~delta & (bs.wo.z * hit.side > 0) & (turned.density > 0)
+    lambertian = ~delta & (turned.density > 0)
     lambertian = dr.select(lambertian, path.cosine / turned.density, 0)
     path.throughput = full - path.carried * lambertian
     # At diffuse surfaces the residual is the same in all directions, and has ended paths before
@@ -325,7 +323,9 @@ def _turn_carried(path: Path, vertex: Vertex, turned: Turned, delta):
     path.carried = vertex.weight * lambertian
     onward = dr.select(gathers & ~delta, mi.UInt32(State.CONNECTING), mi.UInt32(State.PAST))
     path.state = dr.select((path.state == State.SEEKING) & ~gathers, mi.UInt32(State.SEEKING), onward)
-    return residual_survival(path.throughput, full, judged)
+    # Where a BSDF is less than the minorant, the path may be all that subtracts light which virtual lights carry
+    left = dr.maximum(dr.abs(path.throughput), dr.abs(path.carried))
+    return residual_survival(left, full, judged)
 
 
 def _end_at_direction(path: Path, hit: Hit, survival, settings: PathSettings, sample) -> None:

@@ -55,6 +55,7 @@ def _edges_from(
         of_bsdf = cosine * relays.choice.probability(of_relays, mi.UInt32(0), mi.Bool(True))
         density = relays.density(si.p, of_relays, drawn, direction, of_bsdf, mi.Bool(True))
         throughput *= dr.select(density > 0, cosine / density, 0)
+    cosine = dr.select(dr.dot(places.normal, direction) > 0, cosine, 0)
     ray = si.spawn_ray(direction)
     dr.eval(ray, cosine, throughput)
     return FirstEdge.of(places.position, ray, throughput, cosine, False, State.PAST, cell, 1.0, cosine > 0, 1)

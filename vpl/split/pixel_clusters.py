@@ -23,7 +23,7 @@ from ..core.loops import recorded_once
 from ..core.sampling import PairNumbers, derived_seed, find_interval, running_sums
 from ..cuts.light_cuts import collect_cuts, limited_cuts
 from ..points.bsdf_proxies import MaterialProxy
-from ..points.surfaces import LambertianSurface, Receiver
+from ..points.surfaces import CutLambertianSurface, Receiver
 from ..transport.evaluation import Transport, evaluate_pairs
 from .contributions import LayerSums
 from .gather_vertices import LitVertices, PackedVertices, joined
@@ -97,7 +97,7 @@ class PixelClusters:
         one, ray = self.vertices.at(row)
         interaction = dr.zeros(mi.Interaction3f, dr.width(row))
         interaction.p, interaction.n = one.position, one.flat
-        surface = LambertianSurface(interaction, one.depth, one.normal, mi.Color3f(1))
+        surface = CutLambertianSurface(interaction, one.depth, one.normal, mi.Color3f(1))
         return ray, surface, one.weight * (mi.Float(whole) / channel_mean(dr.abs(one.weight)))
 
 

@@ -17,8 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import upload
-from ..core.materials import Materials
-from ..core.parameters import children_of
+from ..core.materials import Materials, tells_density
 from .emitters.cell_choice import CellChoice
 
 _KINDS = mi.BSDFFlags
@@ -26,8 +25,6 @@ _KINDS = mi.BSDFFlags
 # diffuse lobes
 _PASSED = int(_KINDS.DeltaReflection) | int(_KINDS.DeltaTransmission) | int(_KINDS.GlossyTransmission)
 _REFUSED = int(_KINDS.DiffuseReflection) | int(_KINDS.DiffuseTransmission) | int(_KINDS.Null)
-# Classes of materials of several parts
-_OF_PARTS = ("BlendBSDF", "MaskBSDF")
 # Of the samples of a cell, the fraction that is drawn by the probabilities of unknown cells, and in these, the fraction
 # that the BSDF draws: its paths find all other light, so it draws at least 3/8 everywhere (decisions.md)
 _USUAL_SHARE, _OF_BSDF = 0.5, 0.75
@@ -42,19 +39,11 @@ def relays_by(flags):
     return ((flags & _PASSED) != 0) & ((flags & _REFUSED) == 0)
 
 
-def tells_density(bsdf: mi.BSDF) -> bool:
-    """Whether samples of a BSDF come with the density that the BSDF gives any direction.
-
-    In Mitsuba 3.9.1, a sample of ``blendbsdf`` or ``mask`` has that of the drawn material alone.
-    """
-    return bsdf.class_name() not in _OF_PARTS and all(map(tells_density, children_of(bsdf, mi.BSDF)))
-
-
 class Relays:
     """Choice between a sample of the BSDF, source 0 of ``choice``, and directions to balls around pieces of relays.
 
     ``count`` n; ``center`` (n, 3), ``radius`` (n,) of the balls: world units; ``light`` (n,) of each relay, for the
-    probabilities in unknown cells; ``materials`` at which paths choose, see :func:`tells_density`.
+    probabilities in unknown cells; ``materials`` at which paths choose, see :func:`vpl.core.materials.tells_density`.
     """
 
     def __init__(self, center: np.ndarray, radius: np.ndarray, light: np.ndarray, materials: Materials):
@@ -75,7 +64,7 @@ class Relays:
         return float(np.mean(learned) / (1 - _USUAL_SHARE)) if len(known) else 0.0
 
     def cell(self, position: mi.Point3f, facing: mi.Normal3f) -> mi.UInt32:
-        """Number of the spatial cell of each vertex; ``facing``: shading normal on the visible side."""
+        """Number of the spatial cell of each vertex; ``facing``: normal on the visible side."""
         return self.choice.cell(position, facing)
 
     def draw(self, origin: mi.Point3f, cell: mi.UInt32, number: mi.Float, place: mi.Point2f, active: mi.Bool):

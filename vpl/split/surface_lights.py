@@ -131,8 +131,7 @@ def _places_with_minorants(scene, emitters, rays, settings: PathSettings, seed: 
     met = trace_paths(scene, emitters, edge, lattice, sampler, settings).gathered.first
     index = dr.compress((met.depth > 0) & (dr.max(met.weight) > 0))
     met = met.select(index)
-    outward = met.flat * dr.mulsign(mi.Float(1), dr.dot(met.flat, met.normal))
-    places = Places(met.position, outward, met.normal)
+    places = Places(met.position, met.flat, met.normal)
     dr.eval(places)
     return places, met.weight, index
 

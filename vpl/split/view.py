@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import upload_limit
-from ..core.materials import Materials
 from ..lights.light_set import LightGroup, LightSet
+from ..transport.minorant import Minorants
 from .contributions import Layers
 from .cost_model import CostModel
 from .emitters.base import EmitterSampler
@@ -72,7 +72,7 @@ class ViewLights:
 class View:
     """Camera rays of one image or pass.
 
-    ``scene``; ``emitters``: emitter sampler; ``with_minorant``: materials with a minorant; ``rules`` of the paths;
+    ``scene``; ``emitters``: emitter sampler; ``minorants`` of materials; ``rules`` of the paths;
     ``ray``, ``active``: of the camera, evaluated, by pixel as in ``rays``; ``width`` of the image in pixels;
     ``seed``; ``importance`` of radiance in each pixel and ``outgoing`` radiance of surfaces: for Russian roulette;
     ``direct_samples``: number of emitter samples at the first scattering vertices of each pixel;
@@ -83,7 +83,7 @@ class View:
 
     scene: mi.Scene
     emitters: EmitterSampler
-    with_minorant: Materials
+    minorants: Minorants
     rules: PathRules
     ray: mi.Ray3f
     active: mi.Bool
@@ -149,6 +149,6 @@ class View:
         return PathSettings(
             upload_limit(self.rules.max_depth), dr.opaque(mi.UInt32, self.rules.rr_depth), lights.c,
             dr.opaque(mi.UInt32, gathering), dr.opaque(mi.Bool, lights.emitters is not None),
-            dr.opaque(mi.Float, lights.emitters_c**2), self.outgoing, self.with_minorant, self.rules.hide_emitters,
+            dr.opaque(mi.Float, lights.emitters_c**2), self.outgoing, self.minorants, self.rules.hide_emitters,
             meets_relays=self.meets_relays, relays=self.relays,
         )  # fmt: skip

@@ -3,7 +3,7 @@
 In the order to read in:
 
 - ``carried_share``: the share w of the light between two surfaces that virtual lights carry
-- ``minorant``: the Lambertian minorant of a BSDF, the diffuse part that virtual lights carry
+- ``minorant``: the Lambertian minorant of a BSDF and its lobe, the diffuse part that virtual lights carry
 - ``contribution``: the formula for the contribution of a light to a point, BSDF × cosine × geometry × intensity, and
   the shadow ray between them
 - ``bounds``: upper bounds of the contribution of a cluster of lights to a point or a cluster of points

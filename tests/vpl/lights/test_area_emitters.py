@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.marks import stress
 from tests.support.rendering import render
-from tests.support.rooms import smooth_octahedron
+from tests.support.rooms import glowing_octahedron
 from tests.support.scenes import closed_box, image
 from tests.support.statistics import assert_same_mean
 from vpl.lights.emitters import read_emitters
@@ -62,7 +62,7 @@ def test_light_paths_leave_a_turned_sphere_outwards():
 def test_a_mesh_with_vertex_normals_emits_to_the_side_of_its_shading_normals(method):
     """``path`` itself takes shading normals for the density of what it draws by area: BSDF samples are right."""
     plugin, more = DIRECT[method]
-    scene = mi.load_dict(closed_box(smooth_octahedron(), 16))
+    scene = mi.load_dict(closed_box(glowing_octahedron(), 16))
     bsdf_samples = {"emitter_samples": 0, "bsdf_samples": 1}
 
     def pair(seed):

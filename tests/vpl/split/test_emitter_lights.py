@@ -12,6 +12,7 @@ from tests.support.catalogue import EMITTERS
 from tests.support.many_emitters import bulbs, interactions, panels, sampler_of, vertices
 from tests.support.marks import stress
 from tests.support.rendering import plugin_with_model, render
+from tests.support.rooms import smooth_octahedron
 from tests.support.scenes import closed_box, image, rgb, wall
 from tests.support.statistics import assert_same_mean
 from vpl.split import estimator, plan, start
@@ -135,6 +136,22 @@ def test_no_lights_stand_for_emitters_with_normals_of_vertices(tmp_path, always)
     assert [group.kind for group in emitters.lights.groups(1000, 0.1, 0)] == ["spot"]
     assert_lights_stand_for_emitters(mi.load_dict({"type": "manylights", "max_depth": 3}), scene, 64)
     assert_image_of_path(scene, max_depth=3)
+
+
+@pytest.mark.parametrize("kind", ["mapped", *stress("smooth")])
+def test_emitters_below_an_open_surface_do_not_shine_through_it(kind, always):
+    """Although they are above perturbed normals and normals of vertices."""
+    rng = np.random.default_rng(3)
+    lamps = bulbs(80, rng)
+    for lamp in lamps.values():
+        lamp["position"][1] = float(rng.uniform(-0.5, -0.25))
+    if kind == "smooth":
+        shelf = smooth_octahedron(mi.load_dict({"type": "twosided", "of": {"type": "diffuse"}}), [0, -0.1, 0])
+    else:
+        colours = np.tile(0.5 + 0.5 * np.array([np.sin(0.7), 0, np.cos(0.7)]), (2, 2, 1))
+        mapped = {"type": "normalmap", "normalmap": image(colours), "of": {"type": "diffuse"}}
+        shelf = wall([0, -0.2, 0], [1, 0, 0], -90, 0.9, bsdf={"type": "twosided", "of": mapped})
+    assert_image_of_path(mi.load_dict(closed_box(lamps | {"shelf": shelf}, 16)), max_depth=3)
 
 
 @pytest.mark.parametrize("lit", [False, True])

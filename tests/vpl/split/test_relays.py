@@ -7,9 +7,9 @@ import pytest
 
 from tests.support.scenes import area_light, closed_box
 from vpl.core.arrays import download
-from vpl.core.materials import Materials
+from vpl.core.materials import Materials, tells_density
 from vpl.core.sampling import independent_sampler
-from vpl.split.relays import Relays, relays_by, tells_density
+from vpl.split.relays import Relays, relays_by
 from vpl.split.relays_found import _worth, balls_around, points_of_relays
 
 COUNT = 1 << 18

@@ -78,7 +78,7 @@ class EmitterSampler(Protocol):
     learns_sky: bool
 
     def cell(self, position: mi.Point3f, facing: mi.Normal3f) -> mi.UInt32:
-        """Number of the spatial cell of each vertex; ``facing``: shading normal on the visible side."""
+        """Number of the spatial cell of each vertex; ``facing``: normal on the visible side."""
         raise NotImplementedError
 
     def sample(self, si, cell, chosen, member, place, active) -> EmitterSample:

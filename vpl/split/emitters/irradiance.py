@@ -11,14 +11,15 @@ from ...core.arrays import channel_mean
 from ...core.loops import recorded_once
 from ...core.sampling import independent_sampler
 from ...direct.emitter_sampling import power_heuristic
+from ...transport.minorant import Lobe
 from ..contributions import Contributions
 from .base import EmitterSampler
 
 
 @dataclass
 class Places:
-    """Points on surfaces, one per lane, evaluated: ``position``, geometric ``normal``, and ``facing``: the shading
-    normal on the lit side."""
+    """Points on surfaces, one per lane, evaluated: ``position``, geometric ``normal`` on the lit side, and ``facing``:
+    the axis of a cosine lobe there, for example the shading normal."""
 
     position: mi.Point3f
     normal: mi.Normal3f
@@ -35,6 +36,11 @@ class Places:
     def count(self) -> int:
         """Number of points."""
         return dr.width(self.position)
+
+    @property
+    def lobe(self) -> Lobe:
+        """Cosine lobes of the lit side."""
+        return Lobe(self.facing, self.normal)
 
     def interaction(self) -> mi.SurfaceInteraction3f:
         """Surface interactions with the fields required by emitters and rays."""
@@ -75,7 +81,7 @@ def irradiance_from_emitters(
     draws = emitters.groups is not None or emitters.traits.null
     while dr.hint(number < wanted, exclude=[scene, emitters, si, places, cell, wanted, most]):
         sample = emitters.sample(si, cell, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
-        cosine = dr.maximum(dr.dot(places.facing, sample.direction), 0)
+        cosine = places.lobe.cosine(sample.direction)
         mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, cosine * dr.inv_pi))
         arriving, crossings = sample.arriving(scene, emitters.traits, most, cosine > 0)
         reached = dr.select(sample.density > 0, arriving * cosine * mis, 0)
