@@ -9,7 +9,7 @@ from tests.support.marks import stress
 from tests.support.rendering import render
 from tests.support.rooms import sunny
 from tests.support.scenes import sensor, wall
-from vpl.core.arrays import download
+from vpl.core.arrays import download, upload
 from vpl.core.sampling import independent_sampler
 from vpl.direct.environment_regions import EnvironmentRegions
 
@@ -34,7 +34,21 @@ def test_directions_are_drawn_nearly_by_the_light_of_a_single_texel(shape, sun, 
     total = (radiance / drawn).mean()
     assert regions.irradiance.sum() == pytest.approx(total, rel=0.02)
     # 1 for a density that is proportional to the radiance
-    assert (radiance**2 / density / drawn).mean() / total**2 < 6
+    assert (radiance**2 / density / drawn).mean() / total**2 < 1.6
+
+
+@pytest.mark.parametrize(("aperture", "light", "spread"), [(0.5358, 0.01, 0.5), (0.1, 0.2, 4.0)])
+@pytest.mark.parametrize("direction", [[0.3, 0.4, 0.8], [0.5, 0.6, 0.3], [0.9, -0.1, 0.05], [-0.2, 0.5, 0.1]])
+def test_directions_are_drawn_nearly_by_the_light_of_a_sun_smaller_than_a_cell(direction, aperture, light, spread):
+    sky = {"type": "sunsky", "sun_direction": direction, "sun_aperture": aperture}
+    environment = mi.load_dict({"type": "scene", "sky": sky, "ball": {"type": "sphere"}}).environment()
+    regions = EnvironmentRegions(environment, 256, 512)
+    probability, numbers = regions.irradiance / regions.irradiance.sum(), independent_sampler(0, COUNT)
+    drawn = np.random.default_rng(0).choice(regions.count, COUNT, p=probability)
+    value = regions.sample(upload(mi.UInt32, drawn), numbers.next_1d(), numbers.next_2d(), mi.Bool(True))[1]
+    weight = download(value).astype(float).mean(1) / probability[drawn]
+    assert regions.irradiance.sum() == pytest.approx(weight.mean(), rel=light)
+    assert weight.std() < spread * weight.mean()
 
 
 @pytest.mark.parametrize("plugin", ["adaptivedirect", *stress("manylights", "unoccludeddirect", "lightcuts")])
