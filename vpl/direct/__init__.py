@@ -13,7 +13,7 @@ for ``direct="adaptive"``.  Data flow, and reading order::
 - ``adaptive``: driver.  Builds sites, groups and cuts of an image, then samples or sums the sources of each group
 - ``sources``: arrays of the sources of direct light
 - ``emitter_pieces``: area emitters cut into triangles, parallelograms, disks and spheres
-- ``environment_cells``: cells of the environment emitter with their light
+- ``environment_cells``: cells of the environment emitter with their light, for its regions
 - ``environment_regions``: the environment emitter cut into regions, by the strata of ``environment_strata`` [SIS]
 - ``emitter_clusters``: cluster trees over sources [IAS section 4.3.1]
 - ``cluster_cuts``: clusters that light a group of points, by solid angle [IAS section 4.3]

@@ -24,23 +24,26 @@ _OWN_SAMPLES = 1 << 12  # directions that an environment samples: suns are among
 # Least brightness of an edge in an image, relative to the mean radiance: darker edges are many, and hold little light
 _BRIGHT = 10.0
 # Parts of a divided cell along each axis; least share in all light of an edge cell that is divided with its neighbours;
-# most of these edge cells; rows at each pole without divided cells: single precision does not tell the parts there
-_PARTS, _DIVIDED_SHARE, _MOST_DIVIDED, _POLAR_ROWS = 16, 1e-3, 64, 8
-# Least weight of a part in a divided cell, over the mean radiance of the cell: evaluations may all miss the part of the
-# sun in it, and samples there would have up to the inverse weight of others
+# most of these edge cells
+_PARTS, _DIVIDED_SHARE, _MOST_DIVIDED = 16, 1e-3, 64
+# Rows at each pole without divided cells, times this number: the square of the number of all rows. Cosines in single
+# precision cannot tell the parts apart there
+_POLAR = 2**17
+# Least weight of a part in a divided cell, over the mean radiance of the cell: evaluations of a part may all miss the
+# sun in it. Samples there have at most the inverse of this number times the weight of an even sample of the cell
 _LEAST_WEIGHT = 0.1
 # Columns of the table: for emitters without an image, and the most
-DEFAULT_WIDTH, LARGEST_WIDTH = 1024, 2048
+_DEFAULT_WIDTH, LARGEST_WIDTH = 1024, 2048
 
 
 class EnvironmentCells:
     """A table of ``width`` × ``height`` cells, at most ``most_columns`` wide.
 
-    ``radiance`` (height, width): means of undivided cells.  Of every cell that is not divided, and every part of a
-    divided cell, float64: ``light`` (n,): radiance times ``solid_angle`` (n,); ``weight`` (n,) for samples, about the
-    same; ``parent`` (n,): the cell, row by row;
-    ``curve`` (n,): place along a Morton curve; ``number`` (n,): below ``count``, for tables with an entry for each
-    number: the parts of divided cells follow all cells.
+    ``radiance`` (height, width): mean of every cell, float64.  The other arrays (n,) have an entry for every cell that
+    is not divided, and for every part of a divided cell.  float64: ``light``: radiance times ``solid_angle``;
+    ``weight`` for samples, about the same.  Integers: ``parent``: the cell, row by row;
+    ``curve``: place along a Morton curve; ``number``: below ``count``, for tables with an entry for each number: the
+    parts of divided cells follow all cells.  The numbers of divided cells are not used.  ``places`` of all these.
     """
 
     def __init__(self, environment, most_columns: int = LARGEST_WIDTH):
@@ -67,26 +70,38 @@ class EnvironmentCells:
         least[divided] = _LEAST_WEIGHT * of_parts.reshape(-1, _PARTS**2).mean(1)
         self.weight = np.maximum(mean, least[self.parent]) * self.solid_angle
         # The third axis is not used
-        self.curve = interleave(np.stack([column, row, np.zeros_like(row)], 1))
-        self._columns, self._rows = (dr.opaque(mi.UInt32, size) for size in (width, self.height))
-        self._divided = None
-        if len(divided):
-            first = np.zeros(self.radiance.size, np.uint32)
-            first[divided] = self.radiance.size + np.arange(len(divided)) * _PARTS**2
-            self._divided, self._first_part = upload(mi.UInt32, divided), upload(mi.UInt32, first)
+        codes = [interleave(np.outer(np.arange(width * _PARTS), axis)) for axis in ((0, 1, 0), (1, 0, 0))]
+        self.curve = codes[0][row] | codes[1][column]
+        self.places = CellPlaces(width, self.height, divided)
 
     def _bright(self, edges: np.ndarray) -> np.ndarray:
         """The cells that are divided, ascending: the brightest among ``edges``, and their neighbours, in which all
         evaluations may have missed a part of the sun."""
         light = self.radiance * np.sin((np.arange(self.height) + 0.5) * np.pi / self.height)[:, None]
         of_edges = light.ravel()[edges]
-        chosen = np.argsort(-of_edges)[:_MOST_DIVIDED]
+        chosen = np.argsort(-of_edges, kind="stable")[:_MOST_DIVIDED]
         chosen = edges[chosen[of_edges[chosen] > _DIVIDED_SHARE * light.sum()]]
         step = np.arange(-1, 2)
         row, column = (chosen[:, None, None] // self.width + step[:, None], chosen[:, None, None] % self.width + step)
         row, column = (x.ravel() for x in np.broadcast_arrays(row, column % self.width))
-        inside = (row >= _POLAR_ROWS) & (row < self.height - _POLAR_ROWS)
+        polar = -(-(self.height**2) // _POLAR)
+        inside = (row >= polar) & (row < self.height - polar)
         return np.unique(row[inside] * self.width + column[inside])
+
+
+class CellPlaces:
+    """Directions of the cells of a table of ``width`` × ``height`` cells, some of them ``divided``, and the reverse.
+
+    Tables without divided cells have smaller kernels.
+    """
+
+    def __init__(self, width: int, height: int, divided: np.ndarray):
+        self._columns, self._rows = (dr.opaque(mi.UInt32, size) for size in (width, height))
+        self._divided = None
+        if len(divided):
+            first = np.zeros(width * height, np.uint32)
+            first[divided] = width * height + np.arange(len(divided)) * _PARTS**2
+            self._divided, self._first_part = upload(mi.UInt32, divided), upload(mi.UInt32, first)
 
     def direction(self, number, sample, active):
         """A direction in each cell or part, by two uniform numbers: evenly by solid angle."""
@@ -121,7 +136,7 @@ class EnvironmentCells:
             return cell
         first = dr.gather(mi.UInt32, self._first_part, cell, active)
         row, column = (
-            mi.UInt32(dr.clip((x - mi.Float(of_cell)) * _PARTS, 0, _PARTS - 1))
+            dr.minimum(mi.UInt32((x - mi.Float(of_cell)) * _PARTS), _PARTS - 1)
             for x, of_cell in ((polar, row), (azimuth, column))
         )
         return dr.select(first > 0, first + row * _PARTS + column, cell)
@@ -131,7 +146,7 @@ def _table_width(environment) -> int:
     """Columns of the table: the width of the image rounded up to a power of two, between 64 and LARGEST_WIDTH."""
     if environment.class_name() == _CONSTANT:
         return 64
-    columns = _image_width(environment) or DEFAULT_WIDTH
+    columns = _image_width(environment) or _DEFAULT_WIDTH
     return int(np.clip(2 ** np.ceil(np.log2(columns)), 64, LARGEST_WIDTH))
 
 
@@ -153,7 +168,7 @@ def _read(environment, width: int) -> tuple[np.ndarray, np.ndarray]:
     height, across = width // 2, _across(environment, width)
     radiance = _read_cells(environment, np.arange(width * height), width, across).reshape(height, width)
     brightest = radiance
-    if environment.class_name() != _CONSTANT:
+    if not (_image_width(environment) or environment.class_name() == _CONSTANT):
         cell, found = _seen_by_samples(environment, width)
         brightest = radiance.copy()
         np.maximum.at(brightest.reshape(-1), cell, found)
@@ -163,7 +178,8 @@ def _read(environment, width: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _seen_by_samples(environment, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """(Cells, radiance) of directions that the environment samples: evaluations of the cells may miss the sun."""
+    """(Cells, radiance) of directions that the environment samples: evaluations of the cells may miss a sun.  Of a sun
+    below a tenth of a degree, those of an edge may."""
     ds, _ = environment.sample_direction(
         dr.zeros(mi.Interaction3f, _OWN_SAMPLES), independent_sampler(1, _OWN_SAMPLES).next_2d()
     )

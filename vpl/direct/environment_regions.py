@@ -1,7 +1,7 @@
 """An environment cut into regions that are sampled like lights [IAS section 4.3; Agarwal et al. 2003].
 
 The environment is evaluated once into a table of cells (:mod:`vpl.direct.environment_cells`).  Regions are sets of
-cells.  A cell is drawn from its region in proportion to its light, and a direction uniformly in the cell.
+cells.  A cell is drawn from its region about in proportion to its light, and a direction uniformly in the cell.
 Directions of a region thus have nearly equal weights: [IAS] calls this preintegrated and jittered sampling.  A sample
 evaluates the radiance of its direction, not the mean of its cell: the table causes no bias.
 """
@@ -55,7 +55,8 @@ class EnvironmentRegions:
 
     def __init__(self, environment, count: int, most_columns: int = LARGEST_WIDTH):
         self.environment = environment
-        self._cells = cells = EnvironmentCells(environment, most_columns)
+        cells = EnvironmentCells(environment, most_columns)
+        self._places = cells.places
         block = max(1, cells.width // _STRATA_WIDTH)
         sums = [
             np.bincount(cells.parent, values, cells.radiance.size)
@@ -71,11 +72,10 @@ class EnvironmentRegions:
         coarse = np.argsort(order)[coarse]
         labels = np.repeat(np.repeat(coarse, block, 0), block, 1).ravel()[cells.parent]
         self.irradiance = np.bincount(labels, cells.light, self.count)
-        self._tabulate(labels)
+        self._tabulate(cells, labels)
 
-    def _tabulate(self, labels):
+    def _tabulate(self, cells: EnvironmentCells, labels: np.ndarray):
         """Store the cells region by region, with their cumulative probabilities and densities within the region."""
-        cells = self._cells
         angle = np.bincount(labels, cells.solid_angle, self.count)
         total = np.bincount(labels, cells.weight, self.count)[labels]
         share = np.where(total > 0, cells.weight / np.where(total > 0, total, 1), 0)
@@ -99,7 +99,7 @@ class EnvironmentRegions:
         ``member``: uniform number that draws the cell; ``sample``: two uniform numbers for the direction in the cell.
         """
         cell = dr.gather(mi.UInt32, self._drawn, self._choice.draw(region, member, active), active)
-        direction = self._cells.direction(cell, sample, active)
+        direction = self._places.direction(cell, sample, active)
         density = self._of_cell(cell, active)[1]
         radiance = self.radiance(direction, active)
         return direction, finite_or_zero(radiance / density) & active, density
@@ -112,7 +112,7 @@ class EnvironmentRegions:
 
     def find(self, direction, active):
         """(Region, density of :meth:`sample`) of a direction."""
-        return self._of_cell(self._cells.number_of(direction, active), active)
+        return self._of_cell(self._places.number_of(direction, active), active)
 
     def _of_cell(self, cell, active):
         """(Region, density of :meth:`sample`) of cells."""

@@ -38,11 +38,16 @@ def test_directions_are_drawn_nearly_by_the_light_of_a_single_texel(shape, sun, 
 
 
 @pytest.mark.parametrize(("aperture", "light", "spread"), [(0.5358, 0.01, 0.5), (0.1, 0.2, 4.0)])
-@pytest.mark.parametrize("direction", [[0.3, 0.4, 0.8], [0.5, 0.6, 0.3], [0.9, -0.1, 0.05], [-0.2, 0.5, 0.1]])
+@pytest.mark.parametrize(
+    "direction",
+    [[0.3, 0.4, 0.8], [0.5, 0.6, 0.3], [0.9, -0.1, 0.05], [-0.2, 0.5, 0.1], [0.5, 0.0, 0.2], [0.0, 0.06, 0.9]],
+)
 def test_directions_are_drawn_nearly_by_the_light_of_a_sun_smaller_than_a_cell(direction, aperture, light, spread):
     sky = {"type": "sunsky", "sun_direction": direction, "sun_aperture": aperture}
     environment = mi.load_dict({"type": "scene", "sky": sky, "ball": {"type": "sphere"}}).environment()
     regions = EnvironmentRegions(environment, 256, 512)
+    _, own = environment.sample_direction(dr.zeros(mi.Interaction3f, COUNT), independent_sampler(0, COUNT).next_2d())
+    assert regions.irradiance.sum() == pytest.approx(download(own).astype(float).mean(), rel=light + 0.05)
     probability, numbers = regions.irradiance / regions.irradiance.sum(), independent_sampler(0, COUNT)
     drawn = np.random.default_rng(0).choice(regions.count, COUNT, p=probability)
     value = regions.sample(upload(mi.UInt32, drawn), numbers.next_1d(), numbers.next_2d(), mi.Bool(True))[1]
