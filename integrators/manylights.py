@@ -142,9 +142,8 @@ class ManyLightsIntegrator(PassRenderer):
       environment behind a mask, which ``manylights`` shows.  Alpha is that of ``path``.
     - Surfaces only: the plugin refuses a scene with a participating medium.
     - ``*_rgb`` and ``*_mono`` variants only.  No recording by ``dr.freeze``.
-    - Materials and emitters: all that ``path`` renders.  Virtual lights do not carry light that metals reflect, nor
-      light that passes a mask or thin glass between x1 and x2: paths trace it.  Paths also trace the light of bump and
-      normal maps in blends and masks, and where the perturbed normal is more than 45 degrees from the shading normal.
+    - Materials and emitters: all that ``path`` renders.  Paths alone trace the light of metals, of bump and normal maps
+      within blends and masks or beyond 45 degrees, and light that passes a mask or thin glass between x1 and x2.
 
     .. tabs::
         .. code-tab:: xml

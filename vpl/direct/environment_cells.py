@@ -41,9 +41,9 @@ class EnvironmentCells:
 
     ``radiance`` (height, width): mean of every cell, float64.  The other arrays (n,) have an entry for every cell that
     is not divided, and for every part of a divided cell.  float64: ``light``: radiance times ``solid_angle``;
-    ``weight`` for samples, about the same.  Integers: ``parent``: the cell, row by row;
-    ``curve``: place along a Morton curve; ``number``: below ``count``, for tables with an entry for each number: the
-    parts of divided cells follow all cells.  The numbers of divided cells are not used.  ``places`` of all these.
+    ``weight`` for samples, about the same.  Integers: ``parent``: the cell, row by row; ``curve``: place along a Morton
+    curve; ``number``: below ``count``, for tables with an entry for each number: the parts of divided cells follow all
+    cells, and the numbers of divided cells are not used.  ``places``: directions of all these.
     """
 
     def __init__(self, environment, most_columns: int = LARGEST_WIDTH):
@@ -105,13 +105,7 @@ class CellPlaces:
 
     def direction(self, number, sample, active):
         """A direction in each cell or part, by two uniform numbers: evenly by solid angle."""
-        row, column, size = self._corner(number, active)
-        step = dr.pi / mi.Float(self._rows)
-        top, bottom = dr.cos(row * step), dr.cos((row + size) * step)
-        cosine = dr.lerp(top, bottom, sample.x)
-        azimuth = dr.two_pi * (column + sample.y * size) / mi.Float(self._columns)
-        sine = dr.safe_sqrt(1 - dr.square(cosine))
-        return mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), cosine)
+        return _direction(*self._corner(number, active), dr.pi / mi.Float(self._rows), sample)
 
     def _corner(self, number, active):
         """(Row, column, size) of cells and parts, in units of cells."""
@@ -140,6 +134,20 @@ class CellPlaces:
             for x, of_cell in ((polar, row), (azimuth, column))
         )
         return dr.select(first > 0, first + row * _PARTS + column, cell)
+
+
+def radiance_from(environment, direction, active=True):
+    """Radiance that arrives from a direction; 0 where it is not finite."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
+    si.wi = -direction
+    return finite_or_zero(mi.unpolarized_spectrum(environment.eval(si, active)))
+
+
+def _direction(row, column, size, step, sample):
+    """A direction in each cell with a corner and a ``size`` in units of ``step``, radians: evenly by solid angle."""
+    cosine = dr.lerp(dr.cos(row * step), dr.cos((row + size) * step), sample.x)
+    sine, azimuth = dr.safe_sqrt(1 - dr.square(cosine)), (column + sample.y * size) * step
+    return mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), cosine)
 
 
 def _table_width(environment) -> int:
@@ -183,16 +191,10 @@ def _seen_by_samples(environment, width: int) -> tuple[np.ndarray, np.ndarray]:
     ds, _ = environment.sample_direction(
         dr.zeros(mi.Interaction3f, _OWN_SAMPLES), independent_sampler(1, _OWN_SAMPLES).next_2d()
     )
-    si = dr.zeros(mi.SurfaceInteraction3f, _OWN_SAMPLES)
-    si.wi = -ds.d
-    radiance = channel_mean(finite_or_zero(mi.unpolarized_spectrum(environment.eval(si))))
-    dr.eval(ds.d, radiance)
-    direction, radiance = download(ds.d).astype(np.float64), download(radiance).astype(np.float64)
-    known = np.isfinite(direction).all(1)
-    direction, radiance = direction[known], radiance[known]
-    row = np.arccos(np.clip(direction[:, 2], -1, 1)) / np.pi * (width // 2)
-    column = np.arctan2(direction[:, 1], direction[:, 0]) % (2 * np.pi) / (2 * np.pi) * width
-    return np.minimum(row.astype(int), width // 2 - 1) * width + np.minimum(column.astype(int), width - 1), radiance
+    cell = CellPlaces(width, width // 2, np.zeros(0, int)).number_of(ds.d, True)
+    radiance = dr.select(dr.all(dr.isfinite(ds.d)), channel_mean(radiance_from(environment, ds.d)), 0)
+    dr.eval(cell, radiance)
+    return download(cell), download(radiance)
 
 
 def _at_edges(radiance: np.ndarray, least: float) -> np.ndarray:
@@ -222,12 +224,6 @@ def _sum_of_evaluations(environment, row, column, step, across, sampler):
     total, k = dr.zeros(mi.Float, dr.width(row)), mi.UInt32(0)
     while dr.hint(k < across * across, exclude=[environment, row, column, step, across]):
         jitter = (mi.Point2f(mi.Float(k % across), mi.Float(k // across)) + sampler.next_2d()) / mi.Float(across)
-        # Evenly by solid angle
-        cosine = dr.lerp(dr.cos(row * step), dr.cos((row + 1) * step), jitter.x)
-        sine = dr.safe_sqrt(1 - dr.square(cosine))
-        around_sine, around_cosine = dr.sincos((column + jitter.y) * step)
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(row))
-        si.wi = -mi.Vector3f(sine * around_cosine, sine * around_sine, cosine)
-        total += channel_mean(finite_or_zero(mi.unpolarized_spectrum(environment.eval(si))))
+        total += channel_mean(radiance_from(environment, _direction(row, column, 1, step, jitter)))
         k += 1
     return total

@@ -16,7 +16,7 @@ from ..core.arrays import finite_or_zero, upload
 from ..core.morton import morton_order
 from ..core.parameters import fingerprint
 from ..core.sampling import RowChoice
-from .environment_cells import LARGEST_WIDTH, EnvironmentCells
+from .environment_cells import LARGEST_WIDTH, EnvironmentCells, radiance_from
 from .environment_strata import cones, stratify
 
 _STRATA_WIDTH = 256  # columns of the grid of the strata
@@ -106,9 +106,7 @@ class EnvironmentRegions:
 
     def radiance(self, direction, active):
         """Incident radiance from a direction."""
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
-        si.wi = -direction
-        return finite_or_zero(mi.unpolarized_spectrum(self.environment.eval(si, active)))
+        return radiance_from(self.environment, direction, active)
 
     def find(self, direction, active):
         """(Region, density of :meth:`sample`) of a direction."""

@@ -84,11 +84,10 @@ class Minorants:
     """
 
     def __init__(self, materials: Materials):
-        diffuse = materials.having(mi.BSDFFlags.DiffuseReflection).bsdfs
-        perturbed = [bsdf for bsdf in diffuse if is_perturbed(bsdf)]
-        able = list(filter(tells_density, perturbed))
-        self._materials = Materials([bsdf for bsdf in diffuse if bsdf not in perturbed or bsdf in able])
-        self.perturbed = Materials(able) if able else None
+        diffuse = materials.having(mi.BSDFFlags.DiffuseReflection)
+        self._materials = diffuse.where(lambda bsdf: tells_density(bsdf) or not is_perturbed(bsdf))
+        perturbed = list(filter(is_perturbed, self._materials.bsdfs))
+        self.perturbed = Materials(perturbed) if perturbed else None
 
     def at(
         self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, side: mi.Float, active: mi.Bool
