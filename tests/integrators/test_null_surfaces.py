@@ -143,7 +143,7 @@ def test_shadow_rays_pass_as_many_surfaces_as_allowed():
         sample = EmitterSample(
             mi.Vector3f(0, 0, -1), mi.UnpolarizedSpectrum(one), one, mi.Bool([is_point] * count), ray, mi.UInt32(0)
         )
-        passed, crossings = sample.arriving(scene, scene_traits(scene), mi.UInt32(range(count)), mi.Bool(True))
+        passed, crossings = sample.arriving(scene, emitter_sampler(scene, 100), mi.UInt32(range(count)), mi.Bool(True))
         np.testing.assert_allclose(np.array(passed)[0], expected, rtol=1e-5)
         assert np.array(crossings)[4] == (0 if is_point else 4)
 

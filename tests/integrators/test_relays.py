@@ -8,7 +8,7 @@ from tests.support.marks import stress
 from tests.support.rendering import plugin_with_model, render, render_with_statistics
 from tests.support.scenes import area_light, closed_box, rgb, wall
 from tests.support.statistics import assert_same_mean
-from vpl.split import start
+from vpl.split import chosen_pilot
 
 CLEAR, FROSTED = {"type": "dielectric"}, {"type": "roughdielectric", "alpha": 0.3}
 PLACES = ([0.45, 0.5, -0.1], [-0.5, 0.3, -0.4])
@@ -120,7 +120,7 @@ def test_seeds_repeat_images():
 
 def test_other_scenes_look_for_no_relays(monkeypatch):
     """Neither without glass, nor where little of the noise comes by way of glass."""
-    monkeypatch.setattr(start, "find_relays", lambda *_: pytest.fail("looked for relays"))
+    monkeypatch.setattr(chosen_pilot, "find_relays", lambda *_: pytest.fail("looked for relays"))
     render(mi.load_dict(closed_box(area_light_and(None), 12)), "manylights", 16)
     render(mi.load_dict(closed_box(area_light_and(ball([0.5, -0.6, 0], 0.2, bsdf=CLEAR)), 12)), "manylights", 16)
 

@@ -11,6 +11,7 @@ from ..core.arrays import ones
 from ..points.camera_paths import SceneTraits
 from ..transport.minorant import Lobe, Minorants, is_diffuse, side_of
 from .contributions import Contributions
+from .emitters.base import EmitterSampler
 from .gather_vertices import Gathered
 from .local_c import LocalC
 from .onward import RelayChoice
@@ -150,6 +151,10 @@ class Path(Edge):
     the path met a surface counted in the film's alpha; ``carried``: β F1 before x2, w β F1 F2 at x2; ``cosine``: cosθ1;
     these two are None for plain paths; ``relayed``: whether the edge begins at a relay (:mod:`vpl.split.relays`) that
     the path met after a surface with a minorant, None if this is not recorded.
+
+    None in scenes without glass (:mod:`vpl.split.emitters.glass`): ``bent``: whether glass has refracted the path since
+    a direction that has a density, with nothing else between; ``opened``: whether the path has passed a null surface
+    since its last vertex; ``toward``: the direction at this vertex, only if shadow rays pass the glass.
     """
 
     depth: mi.UInt32
@@ -159,9 +164,12 @@ class Path(Edge):
     carried: mi.UnpolarizedSpectrum | None = None
     cosine: mi.Float | None = None
     relayed: mi.Bool | None = None
+    bent: mi.Bool | None = None
+    opened: mi.Bool | None = None
+    toward: mi.Vector3f | None = None
 
     @classmethod
-    def of(cls, first: FirstEdge, settings: PathSettings) -> Path:
+    def of(cls, first: FirstEdge, settings: PathSettings, emitters: EmitterSampler) -> Path:
         """Paths on the first edges: copies, because the loop changes the arrays."""
         own = (getattr(first, field.name) for field in fields(Edge))
         copies = (None if value is None else type(value)(value) for value in own)
@@ -169,6 +177,10 @@ class Path(Edge):
         if not settings.plain:
             path.carried, path.cosine = dr.zeros(mi.UnpolarizedSpectrum, dr.width(first.throughput)), mi.Float(1)
             path.relayed = mi.Bool(False) if settings.meets_relays else None
+        if emitters.glass and (emitters.refracts or not settings.plain):
+            path.bent, path.opened = mi.Bool(False), mi.Bool(False)
+        if emitters.refracts:
+            path.vertex, path.toward = mi.Point3f(first.ray.o), mi.Vector3f(first.ray.d)
         return path
 
     def divide_by(self, survival: mi.Float) -> None:
@@ -257,18 +269,20 @@ class Noise:
 
     ``seen``: emission at the end of the first edge; ``difference``: contributions of the emitter samples with even
     numbers at the first scattering vertex less those with odd numbers; ``alone_excess``: radiance with the first of
-    these samples alone, weighted as a single sample, less the radiance; ``relayed``: radiance by way of relays.
+    these samples alone, weighted as a single sample, less the radiance; ``relayed``: radiance by way of relays;
+    ``refracted``: emission that paths meet where glass has bent them, see :class:`Path`.
     """
 
     seen: mi.Float
     difference: mi.Float
     alone_excess: mi.Float
     relayed: mi.Float
+    refracted: mi.Float
 
     @classmethod
     def none(cls, count: int) -> Noise:
         """Paths that have found nothing."""
-        return cls(*(dr.zeros(mi.Float, count) for _ in range(4)))
+        return cls(*(dr.zeros(mi.Float, count) for _ in range(5)))
 
     def add_emission(self, path: Path, arrived, mis, single) -> None:
         """Add the emission that paths hit: radiance ``arrived``, with the weight ``mis``; ``single``: the weight beside
@@ -277,6 +291,8 @@ class Noise:
         self.alone_excess += arrived * (single - mis)
         if path.relayed is not None:
             self.relayed += dr.select(path.relayed, arrived * mis, 0)
+        if path.bent is not None:
+            self.refracted += dr.select(path.bent, arrived * mis, 0)
 
     def add_sample(self, path: Path, level, number, samples, single) -> None:
         """Add the contribution ``level`` of an emitter sample, which has a ``number`` among the ``samples`` of its

@@ -21,6 +21,8 @@ lights: their kernel has no sections for virtual lights and no records for decis
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -29,7 +31,6 @@ from ..core.loops import recorded_once
 from ..core.path_limits import throughput_survival
 from ..core.sampling import SPREAD_STEPS
 from ..direct.emitter_sampling import power_heuristic
-from ..points.camera_paths import SceneTraits
 from ..transport.carried_share import carried_share
 from ..transport.minorant import agrees
 from .contributions import Contributions, LayerSums
@@ -41,6 +42,7 @@ from .onward import RelayChoice, Turned
 from .path_state import FirstEdge, Gathering, Hit, Noise, Path, PathSettings, State, Traced, Vertex
 from .relays import relays_by
 from .roulette import residual_survival
+from .turning import turn
 
 
 @recorded_once
@@ -55,7 +57,7 @@ def trace_paths(
     random numbers; ``sums`` by layer, for camera rays.
     """
     count, records = dr.width(first.throughput), not settings.plain
-    path, found = Path.of(first, settings), Contributions.none(count, sums, draws=records)
+    path, found = Path.of(first, settings, emitters), Contributions.none(count, sums, draws=records)
     gathered, noise = (Gathered.none(count), Noise.none(count)) if records else (None, None)
     lane = dr.arange(mi.UInt32, count)
 
@@ -95,7 +97,7 @@ def trace_paths(
         turned = _sample_emitters(scene, emitters, path, vertex, settings, sampler, found, noise, lane)
 
         # ---------------------- Onward by the sample of the BSDF, or to a relay ----------------------
-        survival = _turn(path, vertex, turned, emitters.traits)
+        survival = turn(path, vertex, turned, emitters)
 
         # ---------------------- Russian roulette: residual of the direction, and throughput ----------------------
         _end_at_direction(path, hit, survival, settings, sampler.next_1d())
@@ -112,13 +114,22 @@ def _add_emission(
     noise: Noise | None, lane,
 ) -> None:  # fmt: skip
     """Add the light of emitters that paths hit to ``found``."""
-    met = emitters.met(path.vertex, path.cell, path.ray, hit.si, ~path.delta, path.active & ~hit.hidden)
+    met = _met(path, hit, emitters, path.active & ~hit.hidden)
     mis = power_heuristic(path.density, met.density * mi.Float(path.emitter_samples))
     arrived = _less_carried(path, met, settings) * met.radiance
     found.add(arrived * mis, path.depth + 1, met.group, _draw(sampler, settings), lane)
     if noise is not None:
         single = power_heuristic(path.density, met.density)
         noise.add_emission(path, channel_mean(arrived), mis, single)
+
+
+def _met(path: Path, hit: Hit, emitters: EmitterSampler, active: mi.Bool) -> MetEmitter:
+    """Emission that paths hit, with the density of the direction at their last vertices."""
+    if not emitters.refracts:
+        return emitters.met(path.vertex, path.cell, path.ray, hit.si, ~path.delta, active)
+    bent = path.bent & active
+    met = emitters.met(path.vertex, path.cell, path.ray, hit.si, ~(path.delta | path.bent), active)
+    return replace(met, density=met.density + emitters.glass.density(emitters.met, path, hit.si, bent))
 
 
 @dr.syntax
@@ -157,9 +168,7 @@ def _sample_emitter(
         path, vertex, emitters.traits.materials, perturbed, toward, lobe, turn
     )
     lit, beyond, single = _lit(path, vertex, sample, value, density, settings, sampler)
-    arriving, crossings = sample.arriving(
-        scene, emitters.traits, settings.max_depth - edges, dr.max(dr.abs(beyond)) > 0
-    )
+    arriving, crossings = sample.arriving(scene, emitters, settings.max_depth - edges, dr.max(dr.abs(beyond)) > 0)
     lit = dr.select(crossings > 0, beyond, lit) * arriving
     found.add(lit, edges + crossings, sample.group, _draw(sampler, settings), lane)
     if noise is not None:
@@ -279,53 +288,6 @@ def _lit(
     mis = dr.select(hit.smooth & (sample.density > 0), share * mis, 0)
     ratio = dr.select(mis > 0, single / mis, 0)
     return value * mis, beyond * mis, ratio
-
-
-def _turn(path: Path, vertex: Vertex, turned: Turned, traits: SceneTraits):
-    """Continue in the directions ``turned``, and carry the weight of gather vertices on; returns the survival
-    probability by the residual.
-
-    A path that passes a null surface keeps the vertex and the density of its direction: next-event estimation passes
-    null surfaces as well.
-    """
-    hit, bs = vertex.hit, turned.sample
-    full = path.throughput * mi.unpolarized_spectrum(turned.weight)
-    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    # Like `path`, by the sampled direction, even if the path ends
-    null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-    path.valid |= path.active & hit.si.is_valid() & ~hit.hidden & ~null
-    path.throughput, path.eta = full, path.eta * bs.eta
-    direction = hit.si.to_world(bs.wo)
-    survival = mi.Float(1) if path.carried is None else _turn_carried(path, vertex, turned, direction, delta)
-    path.ray = hit.si.spawn_ray(dr.select(hit.hidden, path.ray.d, direction))
-    turns = mi.Bool(True)
-    if traits.null:
-        # Some materials do not tell what they transmit, and block shadow rays
-        turns = ~(null & (dr.max(traits.transmission(hit.si, null & path.active)) > 0))
-    path.vertex, path.cell = dr.select(turns, hit.si.p, path.vertex), dr.select(turns, vertex.cell, path.cell)
-    path.emitter_samples = dr.select(turns, vertex.samples, path.emitter_samples)
-    path.density, path.delta = dr.select(turns, bs.pdf, path.density), dr.select(turns, delta, path.delta)
-    path.depth += dr.select(hit.goes_on, 1, 0)
-    return survival
-
-
-def _turn_carried(path: Path, vertex: Vertex, turned: Turned, direction, delta):
-    """Subtract the light that virtual lights carry from the throughput, and carry the weight of gather vertices on, in
-    the world space ``direction``; returns the survival probability by the residual."""
-    hit, gathers, full = vertex.hit, vertex.gathers, path.throughput
-    path.cosine = hit.lobe.cosine(direction)
-    # A Lambertian BSDF of value 1, times the cosine, over the density of the direction
-    lambertian = ~delta & (turned.density > 0)
-    lambertian = dr.select(lambertian, path.cosine / turned.density, 0)
-    path.throughput = full - path.carried * lambertian
-    # At diffuse surfaces the residual is the same in all directions, and has ended paths before
-    judged = (dr.max(dr.abs(path.carried)) > 0) & ~hit.is_diffuse
-    path.carried = vertex.weight * lambertian
-    onward = dr.select(gathers & ~delta, mi.UInt32(State.CONNECTING), mi.UInt32(State.PAST))
-    path.state = dr.select((path.state == State.SEEKING) & ~gathers, mi.UInt32(State.SEEKING), onward)
-    # Where a BSDF is less than the minorant, the path may be all that subtracts light which virtual lights carry
-    left = dr.maximum(dr.abs(path.throughput), dr.abs(path.carried))
-    return residual_survival(left, full, judged)
 
 
 def _end_at_direction(path: Path, hit: Hit, survival, settings: PathSettings, sample) -> None:

@@ -61,6 +61,7 @@ class Pilot:
     first edge; ``difference`` (n,): half of the difference that the choice between two emitter samples at the first
     scattering vertex makes to the radiance; ``alone`` (n,): as ``radiance``, but with the weight of a single emitter
     sample beside the BSDF; ``relayed`` (n,): part of the radiance by way of relays, see :mod:`vpl.split.relays`;
+    ``refracted`` (n,): emission that paths met behind glass, see :class:`vpl.split.path_state.Path`;
     ``indirect`` (n,): part of the radiance through arrivals.  Values may be negative if virtual
     lights carry a part.  ``vertices``: positions and normals (k, 3) of first and second vertices; ``size``: width of
     the image and number of pixels; ``scene``; ``seed`` of the octree.
@@ -75,6 +76,7 @@ class Pilot:
     difference: np.ndarray
     alone: np.ndarray
     relayed: np.ndarray
+    refracted: np.ndarray
     indirect: np.ndarray
     size: tuple[int, int]
     scene: mi.Scene
@@ -94,7 +96,8 @@ class Pilot:
     def of(cls, traced: Traced, view: View, pixel: np.ndarray) -> Pilot:
         """The pilot of traced paths in the pixels ``pixel`` (n,) of a view."""
         radiance, noise = single_sample_radiance(traced), traced.noise
-        seen, difference, relayed = (finite(x) for x in (noise.seen, noise.difference, noise.relayed))
+        seen, difference = finite(noise.seen), finite(noise.difference)
+        relayed, refracted = finite(noise.relayed), finite(noise.refracted)
         both = finite(channel_mean(traced.radiance))
         alone = both + finite(noise.alone_excess)
         edges = download(traced.edges).astype(np.int64)
@@ -103,8 +106,8 @@ class Pilot:
         vertices = np.concatenate([first, arrivals.position]), np.concatenate([facing, arrivals.normal])
         size, seed = (view.width, view.pixels), derived_seed(view.seed, Stream.OCTREE)
         return cls(
-            arrivals, onward, vertices, pixel, radiance, seen, difference, alone, relayed, indirect, size, view.scene,
-            seed, view.model,
+            arrivals, onward, vertices, pixel, radiance, seen, difference, alone, relayed, refracted, indirect, size,
+            view.scene, seed, view.model,
         )  # fmt: skip
 
     @cached_property

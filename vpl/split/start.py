@@ -15,28 +15,16 @@ import numpy as np
 from ..core.arrays import upload
 from ..core.sampling import derived_seed
 from .camera_rays import CameraRays
-from .cost_model import CostModel
+from .chosen_pilot import chosen_pilot
 from .emitter_samples import EmitterSamples, retained_fraction
 from .emitters.base import EmitterSampler
 from .emitters.cell_choice import learning_rays
 from .local_c import LocalC
 from .path_state import Gathering
-from .pilot import (
-    PILOT_SAMPLES,
-    Pilot,
-    kept_of_both,
-    pilot_lanes,
-    relative_errors,
-    relative_variance,
-    single_sample_radiance,
-)
+from .pilot import PILOT_SAMPLES, Pilot, pilot_lanes, single_sample_radiance
 from .plan import Evidence, Option
 from .relays import Relays
-from .relays_found import find_relays
 from .view import Stream, View, ViewLights
-
-# Shadow rays that take the time of a path: about as many as it has edges
-_RAYS_OF_PATH = 4
 
 
 @dataclass(frozen=True)
@@ -92,8 +80,7 @@ def make_start(view: View, virtual_lights: bool) -> Start:
     model = view.model
     if model.most_emitter_samples > 1 and view.learning_count >= model.emitter_samples_from * view.pixels:
         view = replace(view, direct_samples=dr.opaque(mi.UInt32, PILOT_SAMPLES, view.pixels))
-    (pilot, learned), refusal = learning_pilot(view), _refusal(view, virtual_lights)
-    view, pilot = with_relays(view, pilot)
+    (view, pilot, learned), refusal = chosen_pilot(view), _refusal(view, virtual_lights)
     # Single samples, and samples that never differ, tell nothing
     fraction = retained_fraction(view) if pilot.difference.any() else 1.0
     effect = EmitterSamples.of(pilot, pilot, fraction)
@@ -103,66 +90,6 @@ def make_start(view: View, virtual_lights: bool) -> Start:
         if carried is not None:
             effects[True] = EmitterSamples.of(pilot, carried, fraction)
     return Start(pilot, view.emitters, learned, options, refusal, effects, view.learning_count, view.seed, view.relays)
-
-
-def learning_pilot(view: View) -> tuple[Pilot, bool]:
-    """Trace the pilot, train the emitter sampler on the pilot, and trace the pilot again if the sampler learned:
-    (pilot, whether the sampler keeps what it learned).
-
-    The sampler forgets if the second pilot has the greater variance × cost: small shadows and gloss can mislead the
-    sampler.  Emission that is seen directly does not count: no sampler of emitters changes its variance.  If the
-    difference is within the standard error, as it may be in small pilots, the sampler keeps what it learned, because
-    learning pays in most scenes.
-    """
-    pilot = Pilot.trace(view, ViewLights())
-    rays, seed = learning_rays(view.learning_count), derived_seed(view.seed, Stream.LEARNING)
-    if not view.emitters.learn(*pilot.vertices, rays, seed):
-        return pilot, False
-    again = Pilot.trace(view, ViewLights())
-    before, after = unseen_errors(pilot, again)
-    cost = view.model.learned_sky_cost if view.emitters.learns_sky else view.model.learned_cost
-    if is_certain_rise(before, cost * after, view.model):
-        view.emitters.forget()
-        return pilot, False
-    return again, True
-
-
-def with_relays(view: View, pilot: Pilot) -> tuple[View, Pilot]:
-    """The view with the relays of its scene, and its pilot, if samples of relays lower variance × cost; otherwise the
-    arguments.
-
-    Relays are looked for if light by way of glass and mirrors makes a part of the noise.
-    """
-    if not pilot.relayed.any():
-        return view, pilot
-    unseen = pilot.radiance - pilot.seen
-    noise, rest = (relative_variance(x, pilot.brightness, view.model) for x in (unseen, unseen - pilot.relayed))
-    if noise - rest <= view.model.relayed_noise * noise:
-        return view, pilot
-    relays = find_relays(view, pilot, learning_rays(view.learning_count) // _RAYS_OF_PATH)
-    if relays is None:
-        return view, pilot
-    relayed = replace(view, relays=relays)
-    again = Pilot.trace(relayed, ViewLights())
-    before, after = unseen_errors(pilot, again)
-    kept = kept_of_both(before, after, view.model)
-    pays = view.model.relay_cost * np.mean(after[kept]) < np.mean(before[kept])
-    return (relayed, again) if pays else (view, pilot)
-
-
-def unseen_errors(*pilots: Pilot) -> list[np.ndarray]:
-    """Relative errors (n // 2,) of pilots with the same camera rays, without emission that is seen directly, over the
-    brightness of the first."""
-    first = pilots[0]
-    return [relative_errors(x.radiance - x.seen, first.brightness, first.model) for x in pilots]
-
-
-def is_certain_rise(before: np.ndarray, after: np.ndarray, model: CostModel) -> bool:
-    """Whether the mean of ``after`` (n,) exceeds that of ``before`` (n,) by more than a standard error, without the
-    pairs that hold the largest values."""
-    kept = kept_of_both(before, after, model)
-    rise = after[kept] - before[kept]
-    return len(rise) > 1 and bool(rise.mean() > rise.std(ddof=1) / len(rise) ** 0.5)
 
 
 def evidence_of(view: View, start: Start) -> Evidence:

@@ -235,7 +235,7 @@ def test_who_samples_an_emitter_and_who_meets_it_agree_on_what_is_carried(shapes
     sample = emitters.sample(si, cell, *numbers, mi.Bool(True))
     ray = si.spawn_ray(sample.direction)
     met = emitters.met(si.p, cell, ray, scene.ray_intersect(ray), mi.Bool(True), mi.Bool(True))
-    arriving, _ = sample.arriving(scene, emitters.traits, mi.UInt32(0), mi.Bool(True))
+    arriving, _ = sample.arriving(scene, emitters, mi.UInt32(0), mi.Bool(True))
     lit = np.array((dr.max(arriving) > 0) & ~sample.is_point)
     assert lit.sum() > 1000
     # Directions to the edge of a shape may miss it, or meet a ball elsewhere

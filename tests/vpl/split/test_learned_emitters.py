@@ -77,7 +77,7 @@ def test_what_is_drawn_has_the_density_with_which_it_is_met(emitter, learns):
     cell = emitters.cell(si.p, si.n)
     assert np.any(np.array(cell) == 0) and np.any(np.array(cell) > 0) == learns
     sample = emitters.sample(si, cell, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
-    weight = sample.arriving(scene, emitters.traits, mi.UInt32(0), mi.Bool(True))[0]
+    weight = sample.arriving(scene, emitters, mi.UInt32(0), mi.Bool(True))[0]
     ray = si.spawn_ray(sample.direction)
     found = scene.ray_intersect(ray)
     met = emitters.met(si.p, cell, ray, found, mi.Bool(True), mi.Bool(True))

@@ -24,7 +24,7 @@ def drawn(emitters, si, seed):
     cell = emitters.cell(si.p, si.n)
     numbers = sampler.next_1d(), sampler.next_1d(), sampler.next_2d()
     sample = emitters.sample(si, cell, *numbers, mi.Bool(True))
-    return cell, sample, sample.arriving(emitters._scene, emitters.traits, mi.UInt32(0), mi.Bool(True))[0]
+    return cell, sample, sample.arriving(emitters._scene, emitters, mi.UInt32(0), mi.Bool(True))[0]
 
 
 @pytest.mark.parametrize("learns", [False, True])

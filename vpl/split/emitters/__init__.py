@@ -1,6 +1,7 @@
 """Emitter samplers: the choice of an emitter for next-event estimation, and the density.
 
 - ``base``: interface of the samplers, and their results
+- ``glass``: shadow rays through smooth glass
 - ``uniform``: Mitsuba's own choice
 - ``cell_choice``: learned probabilities of sources by spatial cell
 - ``arriving_power``: light of each source that arrives in each cell, from which they are learned

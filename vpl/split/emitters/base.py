@@ -14,6 +14,7 @@ from ...lights.emitter_groups import EmitterGroups
 from ...points.camera_paths import SceneTraits
 from ...transport.contribution import passage, unblocked
 from ..emitter_lights import EmitterLights
+from .glass import Glass
 
 
 @dataclass
@@ -40,13 +41,23 @@ class EmitterSample:
         weight = finite_or_zero(self.weight / probability)
         return replace(self, weight=weight, density=self.density * probability)
 
-    def arriving(self, scene, traits: SceneTraits, most, active: mi.Bool):
-        """The weight times the fraction of the light that arrives, and the number of null surfaces on its way: traces a
-        shadow ray for nonzero weights.
+    def arriving(self, scene, emitters: EmitterSampler, most, active: mi.Bool):
+        """The weight times the fraction of the light that arrives, and the number of surfaces that it passes, null
+        surfaces or glass: traces a shadow ray for nonzero weights.
 
-        ``most``: null surfaces that the light may pass, UInt32.  Null surfaces block points and directions, as in
+        ``most``: surfaces that the light may pass, UInt32.  Null surfaces and glass block points and directions, as in
         ``path``.
         """
+        light, crossings = self._unscattered(scene, emitters.traits, most, active)
+        if emitters.refracts:
+            # Also with the weight 0: the sampled point of an emitter may be black, and the end of the refracted ray not
+            active = active & (self.density > 0) & ~self.is_point & ~(dr.max(light) > 0)
+            radiance, passed = emitters.glass.light(emitters.emitted, self.ray, most, active)
+            light += dr.select(passed > 0, radiance / self.density, 0)
+            crossings = dr.select(active, passed, crossings)
+        return light, crossings
+
+    def _unscattered(self, scene, traits: SceneTraits, most, active: mi.Bool):
         possible = active & (dr.max(self.weight) > 0) & (self.density > 0)
         if not traits.null:
             return dr.select(unblocked(scene, traits, self.ray, possible) > 0, self.weight, 0), mi.UInt32(0)
@@ -69,13 +80,16 @@ class EmitterSampler(Protocol):
     """Choice of emitters for next-event estimation.
 
     ``lights``: virtual lights representing the emitters, or None; ``groups`` of the emitters, or None; ``traits`` of
-    the scene; ``learns_sky``: whether regions of the environment are learned.
+    the scene; ``learns_sky``: whether regions of the environment are learned; ``glass`` of the scene, or None;
+    ``refracts``: whether shadow rays pass the glass.
     """
 
     lights: EmitterLights | None
     groups: EmitterGroups | None
     traits: SceneTraits
     learns_sky: bool
+    glass: Glass | None
+    refracts: bool
 
     def cell(self, position: mi.Point3f, facing: mi.Normal3f) -> mi.UInt32:
         """Number of the spatial cell of each vertex; ``facing``: normal on the visible side."""
@@ -87,6 +101,10 @@ class EmitterSampler(Protocol):
         ``chosen``, ``member``, ``place``: uniform numbers for the choice of a source, a part of the source, and a point
         on the part.  ``chosen``, a multiple of 2^-23 or 2^-24, may choose the part as well.
         """
+        raise NotImplementedError
+
+    def emitted(self, si, active) -> mi.UnpolarizedSpectrum:
+        """Radiance emitted at each hit ``si`` toward the origin of its ray."""
         raise NotImplementedError
 
     def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
@@ -107,4 +125,8 @@ class EmitterSampler(Protocol):
 
     def copy(self) -> EmitterSampler:
         """A sampler of the same emitters that learns independently."""
+        raise NotImplementedError
+
+    def through_glass(self) -> EmitterSampler:
+        """A sampler of the same emitters that has learned nothing and whose shadow rays pass glass."""
         raise NotImplementedError

@@ -11,6 +11,7 @@ import numpy as np
 from ...lights.emitter_groups import EmitterGroups
 from ...points.camera_paths import SceneTraits
 from .cell_choice import CellChoice
+from .glass import Glass
 from .irradiance import irradiance_from_emitters
 
 # Null surfaces on the way to an emitter, at most, while emitters are learned: a bound of the time. The veils of the
@@ -19,14 +20,15 @@ _MOST = 32
 
 
 class CellEmitters:
-    """Shared part of the samplers with a :class:`CellChoice`; ``_scene``, ``choice``, ``groups``, ``traits``: set by
-    the subclass."""
+    """Shared part of the samplers with a :class:`CellChoice`; ``_scene``, ``choice``, ``groups``, ``traits``,
+    ``glass``: set by the subclass."""
 
-    learns_sky = False
+    learns_sky, refracts = False, False
 
     choice: CellChoice
     groups: EmitterGroups | None
     traits: SceneTraits
+    glass: Glass | None
 
     def cell(self, position, facing):
         """See :meth:`vpl.split.emitters.base.EmitterSampler.cell`."""
@@ -56,4 +58,11 @@ class CellEmitters:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.copy`."""
         other = copy(self)
         other.choice = copy(self.choice)
+        return other
+
+    def through_glass(self):
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.through_glass`."""
+        other = self.copy()
+        other.forget()
+        other.refracts = True
         return other

@@ -55,7 +55,7 @@ class Irradiance:
 
     ``irradiance``: an unpolarized spectrum, weighted for multiple importance sampling with cosine-distributed
     directions; ``unoccluded``: mean over channels, without the weight; ``length``: edges of the paths to the emitter,
-    one for each null surface and one more; ``group`` of the emitter.
+    one for each surface passed and one more; ``group`` of the emitter.
     """
 
     irradiance: mi.UnpolarizedSpectrum
@@ -71,19 +71,19 @@ def irradiance_from_emitters(
 ) -> Irradiance:
     """Irradiance by next-event estimation with ``samples`` samples for each of the ``places``.
 
-    ``most``: null surfaces that light may pass.  Where there are groups or null surfaces, the irradiance has the colour
-    of one sample, because light belongs to one group and has one length.  Virtual lights and learning samplers share
-    this kernel, because compiling it takes a good part of a first render.
+    ``most``: surfaces that light may pass.  Where there are groups, or light may pass surfaces, the irradiance has the
+    colour of one sample, because light belongs to one group and has one length.  Virtual lights and learning samplers
+    share this kernel, because compiling it takes a good part of a first render.
     """
     si, sampler, number = places.interaction(), independent_sampler(seed, places.count), mi.UInt32(0)
     wanted = dr.opaque(mi.UInt32, samples)
     found, unoccluded = Contributions.none(places.count), dr.zeros(mi.Float, places.count)
-    draws = emitters.groups is not None or emitters.traits.null
+    draws = emitters.groups is not None or emitters.traits.null or emitters.refracts
     while dr.hint(number < wanted, exclude=[scene, emitters, si, places, cell, wanted, most]):
         sample = emitters.sample(si, cell, sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), mi.Bool(True))
         cosine = places.lobe.cosine(sample.direction)
         mis = dr.select(sample.is_point, 1, power_heuristic(sample.density, cosine * dr.inv_pi))
-        arriving, crossings = sample.arriving(scene, emitters.traits, most, cosine > 0)
+        arriving, crossings = sample.arriving(scene, emitters, most, cosine > 0)
         reached = dr.select(sample.density > 0, arriving * cosine * mis, 0)
         draw = sampler.next_1d() if draws else mi.Float(0)
         found.add(reached, crossings + 1, sample.group, draw)

@@ -8,8 +8,6 @@ samples the window.
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -23,6 +21,7 @@ from ...points.camera_paths import scene_traits
 from .base import EmitterSample, EmitterSampler, MetEmitter
 from .cell_choice import CellChoice
 from .cell_emitters import CellEmitters
+from .glass import Glass
 from .uniform import UniformEmitters
 
 # Regions of the environment: with 1024, learning takes three seconds (decisions.md); columns of the radiance table for
@@ -45,6 +44,7 @@ class LearnedEmitters(CellEmitters):
         order = _reproducible_order(scene.emitters())
         emitters = [scene.emitters()[number] for number in order]
         self._scene, self._count, self.groups, self.traits = scene, len(emitters), groups, scene_traits(scene)
+        self.glass = Glass.of(scene, self.traits)
         self._emitters = dr.gather(mi.EmitterPtr, scene.emitters_dr(), upload(mi.UInt32, order))
         dr.eval(self._emitters)
         # Emitters with a weight of 0 are never sampled, as in Mitsuba
@@ -76,11 +76,10 @@ class LearnedEmitters(CellEmitters):
     def simplest(self) -> EmitterSampler:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.simplest`."""
         # Mitsuba lists several emitters in an order that differs between loads of a scene
-        return self if self._count > 1 or self.choice.has_learned else self._uniform
-
-    @cached_property
-    def _uniform(self) -> UniformEmitters:
-        return UniformEmitters(self._scene, self.groups, self.traits)
+        if self._count > 1 or self.choice.has_learned:
+            return self
+        uniform = UniformEmitters(self._scene, self.groups, self.traits)
+        return uniform.through_glass() if self.refracts else uniform
 
     def _draw(self, si, source, member, place, active) -> EmitterSample:
         """Sample a direction to each source."""
@@ -152,13 +151,18 @@ class LearnedEmitters(CellEmitters):
         """Density of the direction of a ray to the environment."""
         return self._environment_density(cell, direction, self._own_density(origin, direction, True), True)
 
+    def emitted(self, si, active) -> mi.UnpolarizedSpectrum:
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.emitted`."""
+        radiance = si.emitter(self._scene, active).eval(si, active)
+        return finite_or_zero(mi.unpolarized_spectrum(radiance)) & active
+
     def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.met`."""
         origin = dr.zeros(mi.Interaction3f)
         origin.p = vertex
         ds = mi.DirectionSample3f(self._scene, si, origin)
         emitter = si.emitter(self._scene, active)
-        emitted = finite_or_zero(mi.unpolarized_spectrum(emitter.eval(si, active))) & active
+        emitted = self.emitted(si, active)
         wanted = active & has_density & (emitter != None)  # noqa: E711
         found = self._number_of.at(emitter, wanted)
         wanted, number = wanted & (found > 0), found - 1

@@ -22,6 +22,7 @@ from .base import EmitterSample, MetEmitter
 from .cell_choice import CellChoice
 from .cell_emitters import CellEmitters
 from .emitter_tree import EmitterTree, Found
+from .glass import Glass
 
 # Largest number of clusters; their number grows with the root of the rays to learn by, as does the number of cells
 _MOST_CLUSTERS, _CLUSTERS_BY_RAYS = 256, 0.25
@@ -48,6 +49,7 @@ class TreeEmitters(CellEmitters):
     def __init__(self, scene, emitters: Emitters, rays: int, groups: EmitterGroups | None = None):
         self._scene, self._emitters, self._environment = scene, emitters, emitters.environment
         self.traits = scene_traits(scene)
+        self.glass = Glass.of(scene, self.traits)
         self.groups = groups
         omni = VirtualLights.concatenate([emitters.points, emitters.spots])
         # A single kernel for both: the cone of a point emitter holds every direction
@@ -194,6 +196,10 @@ class TreeEmitters(CellEmitters):
             probability = dr.select(near, probability, self._distant_probability(index, cell, active & ~near))
         return self._toward(si, near, found.row, index, place, active).chosen_with(probability)
 
+    def emitted(self, si, active) -> mi.UnpolarizedSpectrum:
+        """See :meth:`vpl.split.emitters.base.EmitterSampler.emitted`."""
+        return emitted_towards(self._emitters, si, active)
+
     def met(self, vertex, cell, ray, si, has_density, active) -> MetEmitter:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.met`."""
         origin = dr.zeros(mi.Interaction3f)
@@ -214,5 +220,4 @@ class TreeEmitters(CellEmitters):
             pdf = finite_or_zero(self._environment.pdf_direction(origin, ds, here))
             probability = self._distant_probability(mi.UInt32(self._distant - 1), cell, here)
             density = dr.select(here, pdf * probability, density)
-        emitted = emitted_towards(self._emitters, si, active)
-        return MetEmitter(emitted, density, self._group_met(si), nearness if self.lights else None)
+        return MetEmitter(self.emitted(si, active), density, self._group_met(si), nearness if self.lights else None)

@@ -1,0 +1,107 @@
+"""Panes, lenses and bulbs of smooth glass: shadow rays of ``manylights`` pass them, and the mean stays that of ``path``."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests.support.marks import not_on_cuda, stress
+from tests.support.rendering import plugin_with_model, render, render_with_statistics
+from tests.support.scenes import area_light, closed_box, image, rgb, wall
+from tests.support.statistics import assert_same_mean
+
+pytestmark = not_on_cuda("kernels trace rays in one scene only")
+
+GLASS = {"type": "dielectric"}
+MASK = {"type": "mask", "opacity": 0.4, "n": {"type": "diffuse"}}
+
+
+def pane(height=0.6, thickness=0.1, turn=0.0, half=1.2):
+    """A slab of glass across the room."""
+    placed = mi.ScalarTransform4f().translate([0, height, 0]).rotate([0, 0, 1], turn)
+    return {"type": "cube", "to_world": placed.scale([half, 0.5 * thickness, half]), "bsdf": GLASS}
+
+
+def tiles(number=9):
+    """Square lamps below the ceiling, enough for a tree of emitters."""
+    turned = mi.ScalarTransform4f().rotate([1, 0, 0], 90).scale(0.07)
+    places = [[x, 0.9, z] for x in np.linspace(-0.8, 0.8, number) for z in np.linspace(-0.8, 0.8, number)]
+    return {
+        f"tile{index}": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate(place) @ turned,
+            "emitter": {"type": "area", "radiance": rgb(2.0)},
+        }
+        for index, place in enumerate(places)
+    }
+
+
+def under_the_sky(**more):
+    """A room whose ceiling is a pane, below a sky with a sun."""
+    pixels = np.full((16, 32, 3), 0.3, np.float32)
+    pixels[3, 6] = 200
+    room = closed_box({"sky": {"type": "envmap", "bitmap": mi.Bitmap(pixels)}}, 12, **more)
+    del room["ceiling"]
+    return room | {"pane": pane(0.9)}
+
+
+def textured_light():
+    pixels = np.zeros((4, 4, 3), np.float32)
+    pixels[::2, ::2] = 16
+    light = area_light()
+    light["emitter"]["radiance"] = image(pixels)
+    return light
+
+
+def bulb():
+    lamp = {"type": "sphere", "center": [0, 0.3, 0], "radius": 0.1, "emitter": {"type": "area", "radiance": rgb(20.0)}}
+    return {"lamp": lamp, "bulb": {"type": "sphere", "center": [0, 0.3, 0], "radius": 0.25, "bsdf": GLASS}}
+
+
+def instanced():
+    group = {"type": "shapegroup", "slab": pane(0.0), "post": wall([0.5, 0.2, 0], [0, 1, 0], 90, 0.1)}
+    placed = mi.ScalarTransform4f().translate([0, 0.6, 0])
+    return {"group": group, "one": {"type": "instance", "to_world": placed, "0": {"type": "ref", "id": "group"}}}
+
+
+ROOMS = {
+    "pane": lambda: closed_box({"light": area_light()}, 12, pane=pane()),
+    "wedge": lambda: closed_box({"light": area_light()}, 12, pane=pane(0.4, 0.2, 20, 0.7), pane2=pane(0.7, 0.02)),
+    "sky": lambda: under_the_sky(),
+    "tiles": lambda: closed_box(tiles(), 12, pane=pane()),
+    "textured": lambda: closed_box({"light": textured_light()}, 12, pane=pane()),
+    "lens": lambda: closed_box(
+        {"light": area_light(), "lens": {"type": "sphere", "center": [0, 0.3, 0], "radius": 0.4, "bsdf": GLASS}}, 12
+    ),
+    "bulb": lambda: closed_box(bulb(), 12, plastic=wall([0, -0.9, 0], [1, 0, 0], -90, 0.9, bsdf={"type": "plastic"})),
+    "mask": lambda: closed_box(
+        {"light": area_light()}, 12, pane=pane(0.5), mask=wall([0.3, 0.7, 0], [1, 0, 0], -90, 0.6, bsdf=MASK),
+        low=wall([-0.3, 0.1, 0], [1, 0, 0], -90, 0.6, bsdf=MASK),
+    ),
+    "two lamps": lambda: closed_box(
+        {"light": area_light(), "low": area_light(0.4) | {"bsdf": {"type": "diffuse"}}}, 12, pane=pane(0.6), pane2=pane(0.1),
+        gloss={"type": "sphere", "center": [0, -0.6, -0.2], "radius": 0.35, "bsdf": {"type": "roughconductor"}},
+    ),
+    "instance": lambda: closed_box({"light": area_light()} | instanced(), 12),
+}  # fmt: skip
+
+
+@pytest.fixture
+def always_refracts():
+    """``manylights`` whose shadow rays pass glass wherever there is some, and without relays."""
+    with plugin_with_model(relayed_noise=0.0, glass_cost=0.0, relay_cost=1e9):
+        yield
+
+
+@pytest.mark.parametrize("name", ROOMS)
+@pytest.mark.parametrize("more", [{}, {"virtual_lights": False, "max_depth": 4}], ids=["lights", "depth 4"])
+def test_mean_is_that_of_path(name, more, always_refracts):
+    scene = mi.load_dict(ROOMS[name]())
+    passed = []
+
+    def pair(seed):
+        found, statistics = render_with_statistics("manylights", scene, 64, seed, **more)
+        passed.append("glass" in statistics)
+        return found, render(scene, "prb", 1024, seed, max_depth=more.get("max_depth", -1))
+
+    assert_same_mean(pair, 8, finds=0.03)
+    assert np.mean(passed) > 0.5
