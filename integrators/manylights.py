@@ -133,10 +133,10 @@ class ManyLightsIntegrator(PassRenderer):
     - Light through masks and thin glass: shadow rays to area emitters and environments pass these surfaces, as far as
       ``max_depth`` allows, and multiple importance sampling combines them with the paths that find the same light.
       Where such light is rare, shadow rays take up to a tenth more time for little.
-    - Lamps in glass: shadow rays do not pass other glass, such as a globe around a lamp, and find no lamp in a mirror.
-      Where such light makes a tenth of the noise, up to five eighths of the paths at a surface go to balls around
-      glass and mirrors (``relays`` in ``statistics``), if variance × time is less with them.  Glass in shape
-      groups and ``principled`` glass are no targets.  Light of points and directions is found as in ``path``.
+    - Panes and lamps in glass: shadow rays pass smooth ``dielectric`` (``glass`` in ``statistics``), or up to five
+      eighths of the paths at a surface go to balls around glass and mirrors (``relays``), where such light makes a
+      tenth of the noise and variance × time is less with them.  Glass in shape groups and ``principled`` glass are no
+      balls.  Shadow rays pass no glass on CUDA.  Light of points and directions is found as in ``path``.
     - Masks: the image is that of ``prb``.  ``path`` (Mitsuba 3.9.1) shows black for samples whose path ends after it
       passed only masks, so it is too dark where nothing is behind a mask.  With ``hide_emitters``, ``path`` hides an
       environment behind a mask, which ``manylights`` shows.  Alpha is that of ``path``.

@@ -1,13 +1,15 @@
-"""Panes, lenses and bulbs of smooth glass: shadow rays of ``manylights`` pass them, and the mean stays that of ``path``."""
+"""Panes, lenses and bulbs of glass: shadow rays of ``manylights`` pass them, and the mean stays that of ``path``."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.integrators.test_light_groups import LENGTHS, assert_sums, layers_of
 from tests.support.marks import not_on_cuda, stress
 from tests.support.rendering import plugin_with_model, render, render_with_statistics
-from tests.support.scenes import area_light, closed_box, image, rgb, wall
+from tests.support.scenes import area_light, closed_box, image, rgb, sensor, wall
 from tests.support.statistics import assert_same_mean
+from vpl.split.emitters.uniform import UniformEmitters
 
 pytestmark = not_on_cuda("kernels trace rays in one scene only")
 
@@ -35,11 +37,11 @@ def tiles(number=9):
     }
 
 
-def under_the_sky(**more):
+def under_the_sky(size=12):
     """A room whose ceiling is a pane, below a sky with a sun."""
     pixels = np.full((16, 32, 3), 0.3, np.float32)
     pixels[3, 6] = 200
-    room = closed_box({"sky": {"type": "envmap", "bitmap": mi.Bitmap(pixels)}}, 12, **more)
+    room = closed_box({"sky": {"type": "envmap", "bitmap": mi.Bitmap(pixels)}}, size)
     del room["ceiling"]
     return room | {"pane": pane(0.9)}
 
@@ -78,7 +80,10 @@ ROOMS = {
         low=wall([-0.3, 0.1, 0], [1, 0, 0], -90, 0.6, bsdf=MASK),
     ),
     "two lamps": lambda: closed_box(
-        {"light": area_light(), "low": area_light(0.4) | {"bsdf": {"type": "diffuse"}}}, 12, pane=pane(0.6), pane2=pane(0.1),
+        {"light": area_light(), "low": area_light(0.4) | {"bsdf": {"type": "diffuse"}}},
+        12,
+        pane=pane(),
+        low_pane=pane(0.1),
         gloss={"type": "sphere", "center": [0, -0.6, -0.2], "radius": 0.35, "bsdf": {"type": "roughconductor"}},
     ),
     "instance": lambda: closed_box({"light": area_light()} | instanced(), 12),
@@ -92,8 +97,17 @@ def always_refracts():
         yield
 
 
-@pytest.mark.parametrize("name", ROOMS)
-@pytest.mark.parametrize("more", [{}, {"virtual_lights": False, "max_depth": 4}], ids=["lights", "depth 4"])
+ALONE = {"virtual_lights": False, "max_depth": 5}
+CASES = [
+    ("pane", {}), ("sky", ALONE), ("tiles", {}), ("mask", ALONE), ("instance", ALONE), ("wedge", {}),
+    *stress(
+        ("pane", ALONE), ("sky", {}), ("tiles", ALONE), ("textured", {}), ("lens", {}),
+        ("lens", ALONE), ("bulb", {}), ("mask", {}), ("two lamps", {}), ("two lamps", ALONE), ("instance", {}),
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "more"), CASES)
 def test_mean_is_that_of_path(name, more, always_refracts):
     scene = mi.load_dict(ROOMS[name]())
     passed = []
@@ -101,7 +115,75 @@ def test_mean_is_that_of_path(name, more, always_refracts):
     def pair(seed):
         found, statistics = render_with_statistics("manylights", scene, 64, seed, **more)
         passed.append("glass" in statistics)
-        return found, render(scene, "prb", 1024, seed, max_depth=more.get("max_depth", -1))
+        return found, render(scene, "prb", 1024, seed + 100, max_depth=more.get("max_depth", -1))
 
     assert_same_mean(pair, 8, finds=0.03)
     assert np.mean(passed) > 0.5
+
+
+def test_little_noise_of_a_sun_behind_a_pane():
+    scene = mi.load_dict(under_the_sky(32))
+    found = [render_with_statistics("manylights", scene, 64, seed) for seed in range(6)]
+    assert all(statistics.get("glass") == "passed" for _, statistics in found)
+    with plugin_with_model(relayed_noise=1e9):
+        others = [render_with_statistics("manylights", scene, 64, seed) for seed in range(6)]
+    assert not any("glass" in statistics for _, statistics in others)
+    noise, before = (np.mean(np.var([image for image, _ in each], axis=0, ddof=1)) for each in (found, others))
+    assert noise < 0.2 * before
+
+
+def test_a_pane_dims_the_sky_by_its_transmittance():
+    """Light from straight above passes two surfaces, each of which reflects 4%: the floor has the radiance of the sky
+    times its reflectance and the transmittance of the pane, as the sun is the only light."""
+    pixels = np.zeros((64, 128, 3), np.float32)
+    pixels[:1] = 1000
+    scene = {
+        "type": "scene",
+        "sensor": sensor(16, 4, fov=10)
+        | {"to_world": mi.ScalarTransform4f().look_at([0, 0.5, 0], [0, 0, 0], [0, 0, 1])},
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(pixels)},
+        "floor": wall([0, 0, 0], [1, 0, 0], -90, 5.0, (0.5, 0.5, 0.5)),
+    }
+
+    def lit(**more):
+        return render(mi.load_dict(scene | more), "manylights", 256, max_depth=4).mean()
+
+    with plugin_with_model(relayed_noise=0.0, glass_cost=0.0, relay_cost=1e9):
+        through = lit(pane=pane(1.0, half=20.0))
+    np.testing.assert_allclose(through / lit(), 0.96**2, rtol=0.01)
+
+
+def test_seeds_repeat_images_and_leave_the_scene_as_it_was():
+    scene = mi.load_dict(under_the_sky(32))
+    before = list(mi.traverse(scene).keys())
+    (first, statistics), (again, _), (other, _) = (
+        render_with_statistics("manylights", scene, 64, seed) for seed in (1, 1, 2)
+    )
+    assert statistics["glass"] == "passed"
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+    assert list(mi.traverse(scene).keys()) == before
+
+
+def test_rooms_without_such_light_are_not_tried(monkeypatch):
+    monkeypatch.setattr(UniformEmitters, "through_glass", lambda _: pytest.fail("tried glass"))
+    render(mi.load_dict(closed_box({"light": area_light()}, 12)), "manylights", 16)
+    below = closed_box({"light": area_light()}, 12, pane=pane(-0.95, 0.02, half=0.03))
+    render(mi.load_dict(below), "manylights", 64)
+
+
+def test_layers_sum_to_the_image_and_keep_their_means():
+    scene = mi.load_dict(ROOMS["pane"]() | {"low": area_light(0.3)})
+
+    def layers(seed, **constants):
+        with plugin_with_model(**constants):
+            image, found, statistics = layers_of(scene, 64, seed, layers=LENGTHS, light_groups="low=low")
+        assert_sums(image, found)
+        assert ("glass" in statistics) == (constants["relay_cost"] > 0)
+        return np.concatenate([found["direct"], found["indirect"]], -1)
+
+    def pair(seed):
+        return layers(seed, relayed_noise=0.0, glass_cost=0.0, relay_cost=1e9), layers(
+            seed + 1000, relayed_noise=1e9, relay_cost=0.0
+        )
+
+    assert_same_mean(pair, 12, finds=0.03)

@@ -208,3 +208,10 @@ def test_the_noise_of_a_lamp_behind_a_sheet_is_that_of_a_lamp_that_is_seen(mater
         images = [render(scene, plugin, 16, seed, max_depth=3).mean(-1)[8:] for seed in range(8)]
         variance[plugin] = np.var(images, axis=0, ddof=1).mean()
     assert variance["manylights"] < 0.05 * variance["prb"]
+
+
+def test_shapes_keep_the_names_of_their_parameters():
+    scene = mi.load_dict(veiled_room())
+    before = list(mi.traverse(scene).keys())
+    render(scene, "manylights", 4)
+    assert list(mi.traverse(scene).keys()) == before

@@ -61,3 +61,16 @@ def _children(group) -> list:
     """(Registry index, shape) of the shapes of a group."""
     shapes = children_of(group, mi.Shape)
     return [(int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]), shape) for shape in shapes]
+
+
+def scene_of(shapes: list) -> mi.Scene:
+    """A scene of some ``shapes`` of another scene, for rays that only these shapes may stop.
+
+    ``mi.load_dict`` gives objects new identifiers, by which ``mi.traverse`` names their parameters: the shapes keep
+    those of their scene.
+    """
+    names = [shape.id() for shape in shapes]
+    scene = mi.load_dict({"type": "scene", **{f"shape_{number}": shape for number, shape in enumerate(shapes)}})
+    for shape, name in zip(shapes, names, strict=True):
+        shape.set_id(name)
+    return scene

@@ -22,7 +22,7 @@ from ..core.morton import morton_order
 from ..core.path_limits import PathLimits
 from ..core.registry import RegistryTable
 from ..core.sampling import derived_seed, independent_sampler
-from ..core.shapes import SceneShapes
+from ..core.shapes import SceneShapes, scene_of
 from ..lights.emitters import Emitters
 from ..lights.perturbed import perturbed_shapes
 from .alpha import opaque_rays
@@ -145,7 +145,7 @@ def scene_traits(scene) -> SceneTraits:
     open_groups = [one for one in shapes.groups if any(index in open_shapes for index, _ in one.shapes)]
     open_instances, open_scene = [index for one in open_groups for index, _ in one.instances], None
     if open_shapes and not open_groups and dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
-        open_scene = mi.load_dict({"type": "scene", **{f"open_{index}": one for index, one in open_shapes.items()}})
+        open_scene = scene_of([*open_shapes.values()])
     listed = *open_shapes, *open_instances
     return SceneTraits(
         *lobes, transmissive, perturbed_shapes(shapes), listed, open_scene, Materials.of(shapes),

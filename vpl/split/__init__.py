@@ -11,7 +11,8 @@ The formula, in the order to read in:
 - :mod:`vpl.transport.carried_share`: the share w of virtual lights
 - :mod:`vpl.transport.minorant`: the Lambertian minorant of a BSDF
 - ``path_tracer``: the paths of Mitsuba's ``path``, minus the part carried by virtual lights
-- ``start``: the pilot, learning, and kinds of lights: shared by the passes of a render
+- ``chosen_pilot``: the pilot, and how its paths find emitters: what is learned, glass, relays
+- ``start``: the pilot and kinds of lights, shared by the passes of a render
 - ``estimator``: the steps from the plan to the image
 
 The terms of the estimator:
@@ -30,6 +31,7 @@ The terms of the estimator:
 - ``lattice``: stratified random numbers for the samples of a pixel
 - ``emitters``: emitter samplers for next-event estimation
 - ``covered``: directions at bump and normal maps, which cover the lobes of virtual lights
+- ``turning``: how paths go on in new directions
 - ``relays``: glass and mirrors by way of which light arrives, as targets of paths
 - ``relays_found``: which glass and mirrors, and how much light arrives by each
 - ``onward``: directions in which paths go on: of the BSDF, or to relays

@@ -24,18 +24,18 @@ _RAYS_OF_PATH = 4
 def chosen_pilot(view: View) -> tuple[View, Pilot, bool]:
     """(View with the emitter sampler and the relays to use, its pilot, whether the sampler learned).
 
-    Light by way of glass may be found by relays or by shadow rays that pass the glass, whichever leaves less variance ×
-    cost.  Relays around lamps in glass leave little, and shadow rays find light behind large panes.
+    Light by way of glass is found by shadow rays that pass the glass or by relays, whichever leaves less variance ×
+    cost.  Shadow rays find light behind large panes, and relays leave less noise of lamps in globes.
     """
     pilot, learned = learning_pilot(view)
-    relayed, of_relays = with_relays(view, pilot)
     refracting, of_glass, learned_again = through_glass(view, pilot, learned)
+    if of_glass is not pilot and not _makes_noise(of_glass, of_glass.relayed):
+        return refracting, of_glass, learned_again
+    relayed, of_relays = with_relays(view, pilot)
     if of_glass is pilot:
         return relayed, of_relays, learned
-    if of_relays is pilot:
-        return *with_relays(refracting, of_glass), learned_again
-    _, by_relays, by_glass = unseen_errors(pilot, of_relays, of_glass)
-    if is_less(view.model.glass_cost * by_glass, view.model.relay_cost * by_relays, view.model):
+    by_relays, by_glass = unseen_errors(of_relays, of_glass)
+    if of_relays is pilot or is_less(view.model.glass_cost * by_glass, view.model.relay_cost * by_relays, view.model):
         return refracting, of_glass, learned_again
     return relayed, of_relays, learned
 

@@ -21,7 +21,6 @@ from .emitter_samples import EmitterSamples, SampleChoice
 from .pilot import Pilot, relative_variance
 from .view import ViewLights
 
-_TINY = np.finfo(np.float64).tiny
 _FEWEST_RAYS = 1e-9  # for a sample; the largest error of cuts limits the rays
 LEAST_VARIANCE = 1e-9  # stands for a relative variance of 0 in ratios
 
@@ -248,6 +247,8 @@ def choose(evidence: Evidence, options: list[Option], measures: bool = True) -> 
     """
     if not options:
         return without_lights("no light comes by way of surfaces that virtual lights could stand for", evidence)
+    if evidence.whole == 0:
+        return without_lights("the paths of the pilot have no noise", evidence)
     most, found = _most_to_pay(evidence), []
     for product, plan, option in sorted(((*priced(evidence, x), x) for x in options), key=lambda one: one[0]):
         if measures and option.to_measure and product <= min([most, *(other for other, _ in found)]):
@@ -255,7 +256,7 @@ def choose(evidence: Evidence, options: list[Option], measures: bool = True) -> 
             product, plan = priced(evidence, option)
         found.append((product, plan))
     product, best = min(found, key=lambda one: one[0])
-    remains = (best.variance + best.of_lights) / max(evidence.whole, _TINY)
+    remains = (best.variance + best.of_lights) / evidence.whole
     if product > most:
         costs = f"virtual lights would cost {best.cost - 1:.2g} times as much as the paths"
         return without_lights(f"{costs} and leave {remains:.0%} of the variance", evidence)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from vpl.split.chosen_pilot import is_certain_rise
 from vpl.split.cost_model import CostModel
 from vpl.split.pilot import means_of_others, pixel_means, relative_variance
-from vpl.split.chosen_pilot import is_certain_rise
 
 MODEL = CostModel()
 

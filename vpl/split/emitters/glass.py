@@ -1,9 +1,9 @@
 """Shadow rays through smooth glass, such as window panes, vitrines and bulbs.
 
 A shadow ray starts in the direction of a sample of an emitter, is refracted at each surface of glass, and finds light
-if it ends at the emitter of the sample.  The ray need not end at the sampled point, as in manifold next event estimation
-[Hanika et al. 2015]: the direction at its first vertex has the density of the sample, as if there were no glass.  A pane
-shifts the end of a ray by less than its thickness.
+if it ends at the emitter of the sample.  The direction at its first vertex has the density of the sample, as if there
+were no glass, so the ray need not end at the sampled point, as it would in manifold next event estimation [Hanika et
+al. 2015].  A pane shifts the end of a ray by less than its thickness.
 
 Samples of the BSDF find the same paths.  Multiple importance sampling weights both by their densities of the direction
 at the vertex.  Both must agree on the density of the emitter sample.  So shadow rays find light only if the straight
@@ -24,7 +24,7 @@ import mitsuba as mi
 from ...core.arrays import finite_or_zero
 from ...core.materials import Materials
 from ...core.registry import RegistryTable
-from ...core.shapes import SceneShapes
+from ...core.shapes import SceneShapes, scene_of
 from ...points.camera_paths import SceneTraits
 
 # The only material of Mitsuba 3.9.1 that refracts without scattering
@@ -74,13 +74,13 @@ class Glass:
     @cached_property
     def _panes(self) -> mi.Scene | None:
         """A scene of the glass alone, None if a shape group has some."""
-        return None if self.instances else _scene_of(shape for _, shape in self.shapes)
+        return None if self.instances else scene_of([shape for _, shape in self.shapes])
 
     @cached_property
     def _sources(self) -> mi.Scene | None:
         """A scene of the emitting surfaces alone, None without such surfaces."""
         shapes = [shape for shape in self.scene.shapes() if shape.is_emitter()]
-        return _scene_of(shapes) if shapes else None
+        return scene_of(shapes) if shapes else None
 
     def refracts(self, si: mi.SurfaceInteraction3f, sample: mi.BSDFSample3f, active: mi.Bool) -> mi.Bool:
         """Whether a ``sample`` of the BSDF at ``si`` passes a surface of glass."""
@@ -167,7 +167,3 @@ def _endless(ray: mi.Ray3f) -> mi.Ray3f:
 
 def _is_glass(shape) -> bool:
     return shape.bsdf().class_name() == _CLASS and not shape.is_emitter()
-
-
-def _scene_of(shapes) -> mi.Scene:
-    return mi.load_dict({"type": "scene", **{f"shape_{number}": one for number, one in enumerate(shapes)}})
