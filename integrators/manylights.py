@@ -135,8 +135,8 @@ class ManyLightsIntegrator(PassRenderer):
       Where such light is rare, shadow rays take up to a tenth more time for little.
     - Panes and lamps in glass: shadow rays pass smooth ``dielectric`` (``glass`` in ``statistics``), or up to five
       eighths of the paths at a surface go to balls around glass and mirrors (``relays``), where such light makes a
-      tenth of the noise and variance × time is less with them.  Glass in shape groups and ``principled`` glass are no
-      balls.  Shadow rays pass no glass on CUDA.  Light of points and directions is found as in ``path``.
+      tenth of the noise and pilots show that they remove it.  Paths do not go to glass in shape groups and
+      ``principled`` glass.  Shadow rays pass no glass on CUDA.  Light of points and directions is found as in ``path``.
     - Masks: the image is that of ``prb``.  ``path`` (Mitsuba 3.9.1) shows black for samples whose path ends after it
       passed only masks, so it is too dark where nothing is behind a mask.  With ``hide_emitters``, ``path`` hides an
       environment behind a mask, which ``manylights`` shows.  Alpha is that of ``path``.

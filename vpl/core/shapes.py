@@ -70,7 +70,8 @@ def scene_of(shapes: list) -> mi.Scene:
     those of their scene.
     """
     names = [shape.id() for shape in shapes]
-    scene = mi.load_dict({"type": "scene", **{f"shape_{number}": shape for number, shape in enumerate(shapes)}})
-    for shape, name in zip(shapes, names, strict=True):
-        shape.set_id(name)
-    return scene
+    try:
+        return mi.load_dict({"type": "scene", **{f"shape_{number}": shape for number, shape in enumerate(shapes)}})
+    finally:
+        for shape, name in zip(shapes, names, strict=True):
+            shape.set_id(name)

@@ -19,6 +19,9 @@ from .view import Stream, View, ViewLights
 
 # Shadow rays that take the time of a path: about as many as it has edges
 _RAYS_OF_PATH = 4
+# Largest fraction of the noise of refracted light that remains with the samples of the BSDF: shadow rays through panes
+# leave less than a fifth, and those through lenses and bottles may find nothing
+_LEFT = 0.5
 
 
 def chosen_pilot(view: View) -> tuple[View, Pilot, bool]:
@@ -63,18 +66,21 @@ def learning_pilot(view: View) -> tuple[Pilot, bool]:
 
 
 def through_glass(view: View, pilot: Pilot, learned: bool) -> tuple[View, Pilot, bool]:
-    """The view with shadow rays that pass glass, its pilot, and whether its emitter sampler learned, unless these
-    shadow rays raise variance × cost by more than a standard error; otherwise the arguments.
+    """The view with shadow rays that pass glass, its pilot, and whether its emitter sampler learned, if these shadow
+    rays find the light that makes the noise, and do not raise variance × cost by more than a standard error; otherwise
+    the arguments.
 
     They are tried if light that glass refracts makes a part of the noise.
     """
     if not _makes_noise(pilot, pilot.refracted):
         return view, pilot, learned
+    noise = _noise_of(pilot, pilot.refracted)
     refracting = replace(view, emitters=view.emitters.through_glass())
     again, learned_again = learning_pilot(refracting)
     # A few paths make much of the noise that such shadow rays remove, so a small pilot may miss what they gain
     before, after = unseen_errors(pilot, again)
-    if is_certain_rise(before, view.model.glass_cost * after, view.model):
+    rises = is_certain_rise(before, view.model.glass_cost * after, view.model)
+    if rises or _noise_of(again, again.refracted) > _LEFT * noise:
         return view, pilot, learned
     return refracting, again, learned_again
 
@@ -99,11 +105,16 @@ def with_relays(view: View, pilot: Pilot) -> tuple[View, Pilot]:
 def _makes_noise(pilot: Pilot, part: np.ndarray) -> bool:
     """Whether a ``part`` (n,) of the radiance of a pilot makes a part of its noise, without emission that is seen
     directly."""
-    if not part.any():
-        return False
+    whole = relative_variance(pilot.radiance - pilot.seen, pilot.brightness, pilot.model)
+    return part.any() and _noise_of(pilot, part) > pilot.model.relayed_noise * whole
+
+
+def _noise_of(pilot: Pilot, part: np.ndarray) -> float:
+    """Relative variance that a ``part`` (n,) of the radiance of a pilot adds to the rest, without emission that is seen
+    directly."""
     unseen = pilot.radiance - pilot.seen
     noise, rest = (relative_variance(x, pilot.brightness, pilot.model) for x in (unseen, unseen - part))
-    return noise - rest > pilot.model.relayed_noise * noise
+    return noise - rest
 
 
 def unseen_errors(*pilots: Pilot) -> list[np.ndarray]:

@@ -73,7 +73,7 @@ class CostModel:
         "64 samples: kitchen_windows 1.15, foliage 1.25, arcade and forest_lights 1.36, living_room 1.40",
     )
     relayed_noise: float = _constant(
-        0.1, "variance", "Least part of the noise by glass and mirrors to sample them.", "staircase2 has 0.36"
+        0.1, "variance", "Least part of the noise by glass and mirrors to look for it.", "staircase2 has 0.36"
     )
     relay_cost: float = _constant(
         1.3, "paths", "Cost of a path that samples glass and mirrors.", "6 to 27 lamps in glass: 1.25 to 1.33"
@@ -138,11 +138,7 @@ class CostModel:
         f"{_LIGHTS} and --parts denoised",
     )
     set_error: float = _constant(
-        0.03,
-        "fraction",
-        "Largest standard error of the image mean due to one light set.",
-        f"{_PRODUCT}, column sets: 0.02 to 0.81%",
-        most=1,
+        0.03, "fraction", "Largest standard error of the mean by one light set.", f"{_PRODUCT}: 0.02 to 0.81%", most=1
     )
     cut_variance: float = _constant(
         0.3,

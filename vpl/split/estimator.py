@@ -78,9 +78,8 @@ def estimate(view: View, start: Start, kept: KeptLights | None, stopped: Callabl
     precision = {"precision": decision.precision(view.samples)}
     # Text, because passes add up numbers
     relays = {"relays": str(start.relays.count)} if start.relays else {}
-    if start.emitters.refracts:
-        relays["glass"] = "passed"
-    statistics = {"plan": decision.plan.reason} | precision | relays | samples | roulette | of_lights | of_image
+    glass = {"glass": "passed"} if start.emitters.refracts else {}
+    statistics = {"plan": decision.plan.reason} | precision | glass | relays | samples | roulette | of_lights | of_image
     return Estimate(radiance, valid, layers, decision, statistics | {"seconds": clock.seconds})
 
 

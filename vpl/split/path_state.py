@@ -152,9 +152,10 @@ class Path(Edge):
     these two are None for plain paths; ``relayed``: whether the edge begins at a relay (:mod:`vpl.split.relays`) that
     the path met after a surface with a minorant, None if this is not recorded.
 
-    None in scenes without glass (:mod:`vpl.split.emitters.glass`): ``bent``: whether glass has refracted the path since
-    a direction that has a density, with nothing else between; ``opened``: whether the path has passed a null surface
-    since its last vertex; ``toward``: the direction at this vertex, only if shadow rays pass the glass.
+    None where they are not needed, as in scenes without glass (:mod:`vpl.split.emitters.glass`): ``bent``: whether
+    glass has refracted the path since a direction that has a density, with nothing else between; ``opened``: whether
+    the path has passed a null surface since its last vertex; ``origin``, ``toward``: the ray from this vertex, only if
+    shadow rays pass the glass.
     """
 
     depth: mi.UInt32
@@ -166,6 +167,7 @@ class Path(Edge):
     relayed: mi.Bool | None = None
     bent: mi.Bool | None = None
     opened: mi.Bool | None = None
+    origin: mi.Point3f | None = None
     toward: mi.Vector3f | None = None
 
     @classmethod
@@ -180,7 +182,7 @@ class Path(Edge):
         if emitters.glass and (emitters.refracts or not settings.plain):
             path.bent, path.opened = mi.Bool(False), mi.Bool(False)
         if emitters.refracts:
-            path.vertex, path.toward = mi.Point3f(first.ray.o), mi.Vector3f(first.ray.d)
+            path.origin, path.toward = mi.Point3f(first.ray.o), mi.Vector3f(first.ray.d)
         return path
 
     def divide_by(self, survival: mi.Float) -> None:

@@ -266,7 +266,8 @@ def _lit(
     path: Path, vertex: Vertex, sample: EmitterSample, value, density, settings: PathSettings, sampler
 ):  # fmt: skip
     """Three factors.  Of the light of the sampled emitters: β f, minus the parts carried by virtual lights.  Of light
-    that passes null surfaces, which virtual lights that represent emitters do not carry: the same without these parts.
+    that passes null surfaces or glass, which virtual lights that represent emitters do not carry: the same without
+    these parts.
     Of the weight of a sample: from one of several to a single sample.
 
     ``value`` of the BSDF; ``density`` with which :mod:`vpl.split.covered` draws the direction.
@@ -279,8 +280,8 @@ def _lit(
         if sample.nearness is not None:
             w = emitter_share(settings.emitters_squared_c, sample.nearness, cosine)
             value = value - dr.select(settings.emitters_carried, vertex.weight * (w * cosine), 0)
-            # Few shadow rays where the residual is small
-            survival = residual_survival(value, full, settings.emitters_carried)
+            # Few shadow rays where the residual is small, unless they may pass glass, behind which nothing is carried
+            survival = residual_survival(value, full, settings.emitters_carried & (path.toward is None))
             survives = sampler.next_1d() < survival
             value, beyond = (dr.select(survives, one / survival, 0) for one in (value, beyond))
     mis, single = (power_heuristic(sample.density, density * number) for number in (share, 1))

@@ -26,7 +26,7 @@ def paths_from(
     cell = emitters.cell(places.position, places.facing) + dr.opaque(mi.UInt32, 0, places.count)
     edge = _edges_from(places, cell, of_relays, relays, sampler)
     dr.eval(cell)
-    # A path to an emitter has an edge and one more for each null surface
+    # A path to an emitter has an edge and one more for each surface that it passes
     most = settings.max_depth - 1
     dr.make_opaque(most)
     near = irradiance_from_emitters(scene, emitters, places, cell, samples, most, derived_seed(seed, 2))

@@ -248,7 +248,7 @@ def choose(evidence: Evidence, options: list[Option], measures: bool = True) -> 
     if not options:
         return without_lights("no light comes by way of surfaces that virtual lights could stand for", evidence)
     if evidence.whole == 0:
-        return without_lights("the paths of the pilot have no noise", evidence)
+        return without_lights("nearly all paths of the pilot have no noise", evidence)
     most, found = _most_to_pay(evidence), []
     for product, plan, option in sorted(((*priced(evidence, x), x) for x in options), key=lambda one: one[0]):
         if measures and option.to_measure and product <= min([most, *(other for other, _ in found)]):

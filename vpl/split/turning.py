@@ -29,10 +29,10 @@ def turn(path: Path, vertex: Vertex, turned: Turned, emitters: EmitterSampler):
     survival = mi.Float(1) if path.carried is None else _turn_carried(path, vertex, turned, direction, delta)
     path.ray = hit.si.spawn_ray(dr.select(hit.hidden, path.ray.d, direction))
     turns = _turns(path, hit, bs, null, emitters)
-    place = path.ray.o if emitters.refracts else hit.si.p
-    path.vertex, path.cell = dr.select(turns, place, path.vertex), dr.select(turns, vertex.cell, path.cell)
+    path.vertex, path.cell = dr.select(turns, hit.si.p, path.vertex), dr.select(turns, vertex.cell, path.cell)
     if emitters.refracts:
-        path.toward = dr.select(turns, direction, path.toward)
+        path.origin = dr.select(turns, path.ray.o, path.origin)
+        path.toward = dr.select(turns, path.ray.d, path.toward)
     path.emitter_samples = dr.select(turns, vertex.samples, path.emitter_samples)
     path.density, path.delta = dr.select(turns, bs.pdf, path.density), dr.select(turns, delta, path.delta)
     path.depth += dr.select(hit.goes_on, 1, 0)
@@ -48,7 +48,7 @@ def _turns(path: Path, hit: Hit, sample: mi.BSDFSample3f, null: mi.Bool, emitter
     if path.bent is None:
         return ~passes
     # Shadow rays pass null surfaces or glass, not both
-    bends = emitters.glass.refracts(hit.si, sample, path.active) & (path.bent | ~(path.delta | path.opened))
+    bends = emitters.glass.is_passed(hit.si, sample, path.active) & (path.bent | ~(path.delta | path.opened))
     passes &= ~path.bent
     turns = ~(passes | bends) if emitters.refracts else ~passes
     path.bent, path.opened = bends, passes | (path.opened & ~turns)

@@ -76,6 +76,12 @@ class MetEmitter:
     nearness: mi.Float | None = None
 
 
+def front_density(ds: mi.DirectionSample3f) -> mi.Float:
+    """Density of sampled directions, 0 toward the back of a surface, as for directions of rays.  Mitsuba's samples of
+    constant area emitters have a weight of 0 there, but a density."""
+    return dr.select(~ds.delta & (dr.dot(ds.d, ds.n) > 0), 0, ds.pdf)
+
+
 class EmitterSampler(Protocol):
     """Choice of emitters for next-event estimation.
 

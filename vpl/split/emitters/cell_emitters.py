@@ -14,8 +14,8 @@ from .cell_choice import CellChoice
 from .glass import Glass
 from .irradiance import irradiance_from_emitters
 
-# Null surfaces on the way to an emitter, at most, while emitters are learned: a bound of the time. The veils of the
-# scene veils are 16
+# Surfaces that light passes on its way from an emitter, at most, while emitters are learned: a bound of the time. The
+# veils of the scene veils are 16
 _MOST = 32
 
 
@@ -64,5 +64,6 @@ class CellEmitters:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.through_glass`."""
         other = self.copy()
         other.forget()
+        other.glass.make_scenes()
         other.refracts = True
         return other

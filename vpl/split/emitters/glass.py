@@ -6,8 +6,8 @@ were no glass, so the ray need not end at the sampled point, as it would in mani
 al. 2015].  A pane shifts the end of a ray by less than its thickness.
 
 Samples of the BSDF find the same paths.  Multiple importance sampling weights both by their densities of the direction
-at the vertex.  Both must agree on the density of the emitter sample.  So shadow rays find light only if the straight
-line in this direction meets the emitter at which the refracted path ends before any other emitter.
+at the vertex.  Both must agree on the density of the emitter sample.  So where the refracted path ends at an emitting
+surface, shadow rays find its light only if this is also the first emitting surface on the straight line.
 
 Only samples of the BSDF find light that glass reflects, light that passes both glass and null surfaces, and light that
 passes rough glass.
@@ -15,74 +15,53 @@ passes rough glass.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import drjit as dr
 import mitsuba as mi
 
 from ...core.arrays import finite_or_zero
-from ...core.materials import Materials
 from ...core.registry import RegistryTable
 from ...core.shapes import SceneShapes, scene_of
 from ...points.camera_paths import SceneTraits
 
 # The only material of Mitsuba 3.9.1 that refracts without scattering
 _CLASS = "SmoothDielectric"
-# Largest relative distance between a sampled point of an emitter and the first emitter on the line to it
-_AT_POINT = 1e-3
+# Largest relative distance between a sampled point of an emitter and the first emitter on the line to it: rounding
+_AT_POINT = 2e-4
 
 
-@dataclass(frozen=True)
 class Glass:
-    """Surfaces of smooth glass in a ``scene`` with ``traits``.
+    """Surfaces of smooth glass in a ``scene`` with ``traits``, those of emitters left out."""
 
-    ``shapes`` (registry index, shape): surfaces of glass that are no emitters, with those of shape groups;
-    ``instances``: registry indices of the instances of groups with such surfaces.
-    """
-
-    scene: mi.Scene
-    traits: SceneTraits
-    shapes: tuple
-    instances: tuple
+    def __init__(self, scene, traits: SceneTraits):
+        shapes = SceneShapes.of(scene)
+        found = {index: shape for index, shape in shapes.of_hits if _is_glass(shape)}
+        groups = [one for one in shapes.groups if any(index in found for index, _ in one.shapes)]
+        instances = [index for one in groups for index, _ in one.instances]
+        self.scene, self.traits = scene, traits
+        self._shapes, self._in_groups = list(found.values()), bool(instances)
+        self._surfaces = RegistryTable(list(found), 1)
+        # On the CPU, an intersection with an instance has no shape
+        self._hits = RegistryTable([*found, *instances], 1)
+        self._materials = traits.materials.where(lambda bsdf: bsdf.class_name() == _CLASS)
+        self._panes = self._sources = None
 
     @classmethod
     def of(cls, scene, traits: SceneTraits) -> Glass | None:
         """The glass of a scene, None without glass, and on CUDA, where a kernel can trace rays in one scene only."""
-        shapes = SceneShapes.of(scene)
-        found = {index: shape for index, shape in shapes.of_hits if _is_glass(shape)}
-        if not found or dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
+        if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
             return None
-        groups = [one for one in shapes.groups if any(index in found for index, _ in one.shapes)]
-        return cls(scene, traits, tuple(found.items()), tuple(index for one in groups for index, _ in one.instances))
+        return cls(scene, traits) if any(bsdf.class_name() == _CLASS for bsdf in traits.materials.bsdfs) else None
 
-    # ---------------------- Surfaces ----------------------
+    def make_scenes(self) -> None:
+        """Make the scenes that shadow rays need: of the glass, unless a shape group has some, and of the emitting
+        surfaces."""
+        if self._panes is None and self._shapes and not self._in_groups:
+            self._panes = scene_of(self._shapes)
+        emitting = [shape for shape in self.scene.shapes() if shape.is_emitter()]
+        if self._sources is None and emitting:
+            self._sources = scene_of(emitting)
 
-    @cached_property
-    def _materials(self) -> Materials:
-        return self.traits.materials.where(lambda bsdf: bsdf.class_name() == _CLASS)
-
-    @cached_property
-    def _surfaces(self) -> RegistryTable:
-        return RegistryTable([index for index, _ in self.shapes], 1)
-
-    @cached_property
-    def _hits(self) -> RegistryTable:
-        """On the CPU, an intersection with an instance has no shape."""
-        return RegistryTable([*(index for index, _ in self.shapes), *self.instances], 1)
-
-    @cached_property
-    def _panes(self) -> mi.Scene | None:
-        """A scene of the glass alone, None if a shape group has some."""
-        return None if self.instances else scene_of([shape for _, shape in self.shapes])
-
-    @cached_property
-    def _sources(self) -> mi.Scene | None:
-        """A scene of the emitting surfaces alone, None without such surfaces."""
-        shapes = [shape for shape in self.scene.shapes() if shape.is_emitter()]
-        return scene_of(shapes) if shapes else None
-
-    def refracts(self, si: mi.SurfaceInteraction3f, sample: mi.BSDFSample3f, active: mi.Bool) -> mi.Bool:
+    def is_passed(self, si: mi.SurfaceInteraction3f, sample: mi.BSDFSample3f, active: mi.Bool) -> mi.Bool:
         """Whether a ``sample`` of the BSDF at ``si`` passes a surface of glass."""
         passes = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaTransmission)
         return passes & (self._surfaces.at(si.shape, passes) == 1)
@@ -99,16 +78,23 @@ class Glass:
             active = active & self._panes.ray_test(ray, active)
         return _refracted(self, emitted, ray, most, active)
 
-    def at_end(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, shape: mi.ShapePtr, active: mi.Bool) -> mi.Bool:
-        """Whether the refracted shadow rays ``ray`` have arrived where they ``hit`` a ``shape``: at the emitter of the
-        sample, if it is the first emitter on the straight line."""
-        endless = ~(dr.isfinite(ray.maxt) & (ray.maxt < dr.largest(mi.Float)))
+    def at_end(
+        self, straight: mi.Ray3f, hit: mi.PreliminaryIntersection3f, shape: mi.ShapePtr, active: mi.Bool
+    ) -> mi.Bool:  # fmt: skip
+        """Whether a refracted ray has arrived where it ``hit`` a ``shape``: at the emitter of the sample.
+
+        ``straight``: the ray to the sampled point, which must lie on the first emitting surface along this ray, or an
+        endless ray.
+        """
+        endless = ~(dr.isfinite(straight.maxt) & (straight.maxt < dr.largest(mi.Float)))
         arrives = active & endless & ~hit.is_valid()
         if self._sources is None:
             return arrives
         near = active & ~endless & hit.is_valid()
-        first = self._sources.ray_intersect_preliminary(_endless(ray), active=near)
-        near &= first.is_valid() & (dr.abs(first.t - ray.maxt) < _AT_POINT * ray.maxt)
+        first = self._sources.ray_intersect_preliminary(_endless(straight), active=near)
+        # Mitsuba ends shadow rays before the sampled point
+        distance = straight.maxt / (1 - mi.math.ShadowEpsilon)
+        near &= first.is_valid() & (dr.abs(first.t - distance) < _AT_POINT * distance)
         return arrives | (near & (first.shape == shape))
 
     def density(self, met, path, end: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
@@ -116,14 +102,14 @@ class Glass:
         method ``met``, where glass has bent the path, which ends at the emitter ``end``."""
         # A branch, because few packets hold a bent path
         return dr.if_stmt(
-            (path.vertex, path.cell, path.toward, path.ray.time, end.shape, end.is_valid()),
+            (path.vertex, path.cell, path.origin, path.toward, path.ray.time, end.shape, end.is_valid()),
             active,
             lambda *bent: self._density(met, *bent),
             lambda *_: mi.Float(0),
         )
 
-    def _density(self, met, vertex, cell, toward, time, shape, on_surface) -> mi.Float:
-        line, hit = mi.Ray3f(vertex, toward, time), dr.zeros(mi.PreliminaryIntersection3f)
+    def _density(self, met, vertex, cell, origin, toward, time, shape, on_surface) -> mi.Float:
+        line, hit = mi.Ray3f(origin, toward, time), dr.zeros(mi.PreliminaryIntersection3f)
         hit.t = dr.inf
         if self._sources is not None:
             hit = self._sources.ray_intersect_preliminary(line, active=on_surface)

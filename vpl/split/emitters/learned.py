@@ -18,7 +18,7 @@ from ...core.registry import RegistryTable
 from ...direct.environment_regions import regions_of
 from ...lights.emitter_groups import EmitterGroups
 from ...points.camera_paths import scene_traits
-from .base import EmitterSample, EmitterSampler, MetEmitter
+from .base import EmitterSample, EmitterSampler, MetEmitter, front_density
 from .cell_choice import CellChoice
 from .cell_emitters import CellEmitters
 from .glass import Glass
@@ -78,7 +78,7 @@ class LearnedEmitters(CellEmitters):
         # Mitsuba lists several emitters in an order that differs between loads of a scene
         if self._count > 1 or self.choice.has_learned:
             return self
-        uniform = UniformEmitters(self._scene, self.groups, self.traits)
+        uniform = UniformEmitters(self._scene, self.groups, self.traits, self.glass)
         return uniform.through_glass() if self.refracts else uniform
 
     def _draw(self, si, source, member, place, active) -> EmitterSample:
@@ -88,7 +88,7 @@ class LearnedEmitters(CellEmitters):
         ds, weight = emitter.sample_direction(si, place, of_emitter)
         weight = finite_or_zero(mi.unpolarized_spectrum(weight)) & of_emitter
         ray = ray_to_emitter(si, ds.d, ds.p, mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite))
-        direction, density, delta = ds.d, ds.pdf, ds.delta & of_emitter
+        direction, density, delta = ds.d, front_density(ds), ds.delta & of_emitter
         if self._regions:
             of_region = active & ~of_emitter
             # A branch, because no region is drawn where nothing is known

@@ -209,6 +209,8 @@ class TreeEmitters(CellEmitters):
         if self._areas:
             after = self._emitters.area.row(si, active & has_density & si.is_valid())
             here, row = active & has_density & si.is_valid() & (after > 0), after - 1
+            # The back of a surface is not sampled
+            here &= dr.dot(ds.d, ds.n) < 0
             pdf = self._emitters.area.on_shape("pdf_direction", row, origin, ds, here)
             leaf = self._tree.leaf(row + self._first_area, here)
             found = self._tree.walk(leaf, 0, vertex, here)

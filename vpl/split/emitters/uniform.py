@@ -11,7 +11,7 @@ from ...core.arrays import finite_or_zero
 from ...core.interactions import ray_to_emitter
 from ...lights.emitter_groups import EmitterGroups
 from ...points.camera_paths import SceneTraits, scene_traits
-from .base import EmitterSample, MetEmitter
+from .base import EmitterSample, MetEmitter, front_density
 from .glass import Glass
 
 
@@ -21,9 +21,12 @@ class UniformEmitters:
 
     lights, learns_sky, refracts = None, False, False
 
-    def __init__(self, scene, groups: EmitterGroups | None = None, traits: SceneTraits | None = None):
+    def __init__(
+        self, scene, groups: EmitterGroups | None = None, traits: SceneTraits | None = None, glass: Glass | None = None
+    ):  # fmt: skip
+        """``traits``, ``glass`` of the scene, if known."""
         self._scene, self.groups, self.traits = scene, groups, traits or scene_traits(scene)
-        self.glass = Glass.of(scene, self.traits)
+        self.glass = glass if traits else Glass.of(scene, self.traits)
         emitters = scene.emitters()
         self._group = dr.opaque(mi.UInt32, groups.number(emitters[0]) if groups and emitters else 0)
 
@@ -35,7 +38,9 @@ class UniformEmitters:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.sample`."""
         ds, weight = self._scene.sample_emitter_direction(si, place, False, active)
         ray = ray_to_emitter(si, ds.d, ds.p, mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite))
-        return EmitterSample(ds.d, finite_or_zero(mi.unpolarized_spectrum(weight)), ds.pdf, ds.delta, ray, self._group)
+        return EmitterSample(
+            ds.d, finite_or_zero(mi.unpolarized_spectrum(weight)), front_density(ds), ds.delta, ray, self._group
+        )
 
     def emitted(self, si, active) -> mi.UnpolarizedSpectrum:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.emitted`."""
@@ -69,5 +74,6 @@ class UniformEmitters:
     def through_glass(self) -> UniformEmitters:
         """See :meth:`vpl.split.emitters.base.EmitterSampler.through_glass`."""
         other = copy(self)
+        other.glass.make_scenes()
         other.refracts = True
         return other
