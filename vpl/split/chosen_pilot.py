@@ -74,15 +74,13 @@ def through_glass(view: View, pilot: Pilot, learned: bool) -> tuple[View, Pilot,
     """
     if not _makes_noise(pilot, pilot.refracted):
         return view, pilot, learned
-    noise = _noise_of(pilot, pilot.refracted)
     refracting = replace(view, emitters=view.emitters.through_glass())
     again, learned_again = learning_pilot(refracting)
     # A few paths make much of the noise that such shadow rays remove, so a small pilot may miss what they gain
     before, after = unseen_errors(pilot, again)
     rises = is_certain_rise(before, view.model.glass_cost * after, view.model)
-    if rises or _noise_of(again, again.refracted) > _LEFT * noise:
-        return view, pilot, learned
-    return refracting, again, learned_again
+    noise, left = (whole - rest for whole, rest in (_noise_without(x, x.refracted) for x in (pilot, again)))
+    return (view, pilot, learned) if rises or left > _LEFT * noise else (refracting, again, learned_again)
 
 
 def with_relays(view: View, pilot: Pilot) -> tuple[View, Pilot]:
@@ -103,18 +101,18 @@ def with_relays(view: View, pilot: Pilot) -> tuple[View, Pilot]:
 
 
 def _makes_noise(pilot: Pilot, part: np.ndarray) -> bool:
-    """Whether a ``part`` (n,) of the radiance of a pilot makes a part of its noise, without emission that is seen
-    directly."""
-    whole = relative_variance(pilot.radiance - pilot.seen, pilot.brightness, pilot.model)
-    return part.any() and _noise_of(pilot, part) > pilot.model.relayed_noise * whole
+    """Whether a ``part`` (n,) of the radiance of a pilot makes a part of its noise."""
+    if not part.any():
+        return False
+    noise, rest = _noise_without(pilot, part)
+    return noise - rest > pilot.model.relayed_noise * noise
 
 
-def _noise_of(pilot: Pilot, part: np.ndarray) -> float:
-    """Relative variance that a ``part`` (n,) of the radiance of a pilot adds to the rest, without emission that is seen
-    directly."""
+def _noise_without(pilot: Pilot, part: np.ndarray) -> list[float]:
+    """Relative variances of the paths of a pilot: of all light but emission that is seen directly, and also without a
+    ``part`` (n,) of it."""
     unseen = pilot.radiance - pilot.seen
-    noise, rest = (relative_variance(x, pilot.brightness, pilot.model) for x in (unseen, unseen - part))
-    return noise - rest
+    return [relative_variance(x, pilot.brightness, pilot.model) for x in (unseen, unseen - part)]
 
 
 def unseen_errors(*pilots: Pilot) -> list[np.ndarray]:
