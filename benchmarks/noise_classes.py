@@ -32,7 +32,9 @@ SPP = 64
 def class_of_met(path) -> mi.UInt32:
     """Class of emission that a path meets."""
     straight = dr.select(path.scattered == 1, mi.UInt32(2), mi.UInt32(5))
-    found = dr.select(path.delta, straight + 1, straight)
+    # Glass that shadow rays pass leaves the density of the direction before
+    via = path.delta if path.bent is None else path.delta | path.bent
+    found = dr.select(via, straight + 1, straight)
     return dr.select(path.scattered == 0, 0, dr.select(path.scattered > 2, _LATER, found))
 
 

@@ -56,6 +56,10 @@ class SceneShapes:
         nested = [row for group in self.groups for row in group.shapes]
         return [row for row in self.own if row[1].class_name() != INSTANCE] + nested
 
+    def groups_with(self, indices) -> list[ShapeGroup]:
+        """The groups with one of the shapes of some registry ``indices``."""
+        return [one for one in self.groups if any(index in indices for index, _ in one.shapes)]
+
 
 def _children(group) -> list:
     """(Registry index, shape) of the shapes of a group."""

@@ -142,7 +142,7 @@ def scene_traits(scene) -> SceneTraits:
     kinds = mi.BSDFFlags
     transmissive = have(int(kinds.DiffuseTransmission) | int(kinds.GlossyTransmission))
     lobes = (have(kind) for kind in (kinds.Delta, kinds.Null, kinds.Smooth, kinds.Glossy))
-    open_groups = [one for one in shapes.groups if any(index in open_shapes for index, _ in one.shapes)]
+    open_groups = shapes.groups_with(open_shapes)
     open_instances, open_scene = [index for one in open_groups for index, _ in one.instances], None
     if open_shapes and not open_groups and dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
         open_scene = scene_of([*open_shapes.values()])

@@ -143,10 +143,10 @@ class View:
 
     def settings(self, lights: ViewLights, least: int = Gathering.NOWHERE) -> PathSettings:
         """Settings of paths of which ``lights`` carry a part; without lights, vertices are gathered by ``least``."""
-        # Without lights on surfaces, lights representing emitters are gathered at x1 only: at the few lit later
-        # vertices, the lights would add more variance than the lights remove
         # The directions to relays take the place of shadow rays that could pass glass
         assert not (self.relays and self.emitters.refracts), "relays exclude shadow rays through glass"
+        # Without lights on surfaces, lights representing emitters are gathered at x1 only: at the few lit later
+        # vertices, the lights would add more variance than the lights remove
         gathering = Gathering.EVERYWHERE if lights.surfaces else Gathering.AT_FIRST if lights.emitters else least
         return PathSettings(
             upload_limit(self.rules.max_depth), dr.opaque(mi.UInt32, self.rules.rr_depth), lights.c,

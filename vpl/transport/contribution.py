@@ -58,6 +58,11 @@ def transmittance(scene, traits, kind: str, ray, most, active):
     return passage(scene, traits, ray, most, active)[0]
 
 
+def has_end(ray: mi.Ray3f) -> mi.Bool:
+    """Whether each shadow ray ends at a point; those to emitters at infinity do not."""
+    return dr.isfinite(ray.maxt) & (ray.maxt < dr.largest(mi.Float))
+
+
 def unblocked(scene, traits, ray, active):
     """1 where no surface blocks the ray, 0 elsewhere and in lanes that are not ``active``."""
     if traits.nearest_hits:
@@ -87,7 +92,7 @@ def _through_null_surfaces(scene, traits, ray, most, active):
     """Walk from surface to surface while surfaces let light pass unscattered, past ``most`` surfaces: (fraction of the
     light, number of surfaces passed)."""
     ray, left = mi.Ray3f(ray), mi.UInt32(most)
-    active, ends = mi.Bool(active), dr.isfinite(ray.maxt) & (ray.maxt < dr.largest(mi.Float))
+    active, ends = mi.Bool(active), has_end(ray)
     end = ray(dr.select(ends, ray.maxt, 0))
     passed = dr.select(active, mi.UnpolarizedSpectrum(1), 0)
     while dr.hint(active, exclude=[traits, ends, end]):

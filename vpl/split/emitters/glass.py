@@ -22,6 +22,7 @@ from ...core.arrays import finite_or_zero
 from ...core.registry import RegistryTable
 from ...core.shapes import SceneShapes, scene_of
 from ...points.camera_paths import SceneTraits
+from ...transport.contribution import has_end
 
 # The only material of Mitsuba 3.9.1 that refracts without scattering
 _CLASS = "SmoothDielectric"
@@ -35,8 +36,7 @@ class Glass:
     def __init__(self, scene, traits: SceneTraits):
         shapes = SceneShapes.of(scene)
         found = {index: shape for index, shape in shapes.of_hits if _is_glass(shape)}
-        groups = [one for one in shapes.groups if any(index in found for index, _ in one.shapes)]
-        instances = [index for one in groups for index, _ in one.instances]
+        instances = [index for one in shapes.groups_with(found) for index, _ in one.instances]
         self.scene, self.traits = scene, traits
         self._shapes, self._in_groups = list(found.values()), bool(instances)
         self._surfaces = RegistryTable(list(found), 1)
@@ -86,11 +86,11 @@ class Glass:
         ``straight``: the ray to the sampled point, which must lie on the first emitting surface along this ray, or an
         endless ray.
         """
-        endless = ~(dr.isfinite(straight.maxt) & (straight.maxt < dr.largest(mi.Float)))
-        arrives = active & endless & ~hit.is_valid()
+        ends = has_end(straight)
+        arrives = active & ~ends & ~hit.is_valid()
         if self._sources is None:
             return arrives
-        near = active & ~endless & hit.is_valid()
+        near = active & ends & hit.is_valid()
         first = self._sources.ray_intersect_preliminary(_endless(straight), active=near)
         # Mitsuba ends shadow rays before the sampled point
         distance = straight.maxt / (1 - mi.math.ShadowEpsilon)
